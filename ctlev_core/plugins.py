@@ -1,0 +1,202 @@
+"""A plug-in is a module: one file in its folder, found by its name. There is no registry.
+
+Each module has `VERSION` (raise it when its output changes) and `class Options(Frozen)`; the functions of each kind
+are the Protocols below. Heavy imports (torch, diffusers, numba) go inside functions, because the plan of an experiment
+loads every plug-in's options and nothing else.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from data_contracts.config import Choice, Frozen
+from data_contracts.events import Events, SensorSize
+from data_contracts.labels import Conditions, History, Labels, Recording
+
+KINDS = ("datasets", "formats", "encodings", "conditions", "generators", "downstream", "metrics")
+
+
+class PluginError(ValueError):
+    """An unknown plug-in or a wrong option."""
+
+
+class Dataset(Protocol):
+    """Where recordings come from. `list_recordings` is cheap and raises before anything long starts."""
+
+    VERSION: int
+    Options: type[Frozen]
+
+    def list_recordings(self, options: Any) -> list[Recording]:
+        """Every recording of every split, in a stable order."""
+        ...
+
+    def read_events(self, recording: Recording, options: Any) -> Events:
+        """The events of one recording, checked. Not called where `recording.has_events` is False."""
+        ...
+
+    def read_labels(self, recording: Recording, options: Any) -> Labels:
+        """The label track of one recording; a class-only dataset returns one row."""
+        ...
+
+
+class Format(Protocol):
+    """A raw event file format."""
+
+    VERSION: int
+    SUFFIXES: tuple[str, ...]
+
+    def sniff(self, path: Path) -> bool:
+        """Does the content look like this format?"""
+        ...
+
+    def read(self, path: Path) -> Events:
+        """The whole file, checked with `check_events`."""
+        ...
+
+
+class Encoding(Protocol):
+    """Events to arrays, arrays to images and back."""
+
+    VERSION: int
+    Options: type[Frozen]
+
+    def encode(self, events: Events, windows: np.ndarray, options: Any) -> np.ndarray:
+        """Counts [N, C, H, W] uint16 of the event index ranges `windows` [N, 2] int64."""
+        ...
+
+    def render_image(self, histogram: np.ndarray, options: Any) -> np.ndarray:
+        """Images [N, H, W, 3] uint8 of the counts."""
+        ...
+
+    def map_points(self, points: np.ndarray, sensor_size: SensorSize, options: Any) -> np.ndarray:
+        """Points [..., 2] in sensor pixels to image pixels."""
+        ...
+
+
+class Condition(Protocol):
+    """Labels to what the generator is asked for."""
+
+    VERSION: int
+    Options: type[Frozen]
+
+    def render(self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int]) -> Conditions:
+        """One condition a row; `seeds` (one a row) feeds what is drawn at random, for example a class synonym."""
+        ...
+
+
+class Generator(Protocol):
+    """Learns frames from conditions, then makes new frames for new conditions."""
+
+    VERSION: int
+    Options: type[Frozen]
+    SampleOptions: type[Frozen]
+
+    def train(
+        self, frames: np.ndarray, conditions: Conditions, prior: Path, options: Any, *, seed: int, out: Path, work: Path
+    ) -> History:
+        """Write a checkpoint folder to `out`; keep resumable state in `work`."""
+        ...
+
+    def sample(
+        self, checkpoint: Path, conditions: Conditions, options: Any, *, seeds: Sequence[int], work: Path
+    ) -> np.ndarray:
+        """Frames [N, H, W, 3] uint8; row i depends on conditions[i] and seeds[i] alone."""
+        ...
+
+
+class Downstream(Protocol):
+    """A model of the task the synthetic data is for."""
+
+    VERSION: int
+    Options: type[Frozen]
+
+    def train(self, frames: np.ndarray, labels: Labels, options: Any, *, seed: int, out: Path, work: Path) -> History:
+        """Write a model folder to `out`; keep resumable state in `work`."""
+        ...
+
+    def predict(self, model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+        """Named predictions, one row a frame."""
+        ...
+
+
+class Metric(Protocol):
+    """A score. `INPUT` names what it compares: `joints2d`, `classes` or `features`."""
+
+    VERSION: int
+    INPUT: str
+    Options: type[Frozen]
+
+    def compute(self, predicted: Any, target: Any, options: Any) -> dict[str, float]:
+        """Named scores; units in the names."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A loaded plug-in together with its validated options."""
+
+    kind: str
+    name: str
+    module: Any
+    options: Any
+
+    @property
+    def version(self) -> int:
+        """The module's VERSION."""
+        return self.module.VERSION
+
+
+def names(kind: str) -> list[str]:
+    """Names of all plug-ins of a kind, sorted."""
+    if kind not in KINDS:
+        raise PluginError(f"unknown plug-in kind {kind!r}; known kinds: {', '.join(KINDS)}")
+    package = importlib.import_module(f"ctlev_core.{kind}")
+    return sorted(module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_"))
+
+
+def load(kind: str, name: str) -> ModuleType:
+    """Import the module `ctlev_core.<kind>.<name>`.
+
+    Raises:
+        PluginError: there is no such plug-in; the message lists the known ones.
+    """
+    known = names(kind)
+    if name not in known:
+        raise PluginError(f"unknown plug-in {name!r} in {kind}; known: {', '.join(known)}")
+    return importlib.import_module(f"ctlev_core.{kind}.{name}")
+
+
+def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: str) -> Any:
+    """Validate `values` against an options model; every problem becomes one line of one error."""
+    try:
+        return model(**values)
+    except ValidationError as error:
+        known = ", ".join(model.model_fields)
+        lines = []
+        for problem in error.errors():
+            option = ".".join(str(part) for part in problem["loc"])
+            if problem["type"] == "extra_forbidden":
+                lines.append(f"unknown option {option!r}; known: {known}")
+            else:
+                lines.append(f"option {option!r}: {problem['msg'].lower()}, got {problem['input']!r}")
+        raise PluginError(f"{where}: " + "; ".join(lines)) from None
+
+
+def load_options(choice: Choice) -> Plugin:
+    """Load the plug-in a preset names and validate its options.
+
+    Raises:
+        PluginError: unknown plug-in, unknown option or a wrong value, before anything is computed.
+    """
+    module = load(choice.KIND, choice.name)
+    options = validate_options(module.Options, choice.options, f"{choice.KIND} {choice.name!r}")
+    return Plugin(choice.KIND, choice.name, module, options)

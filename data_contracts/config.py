@@ -1,0 +1,79 @@
+"""Configuration base classes. Everything a user can set is a frozen pydantic model that refuses unknown names."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Frozen(BaseModel):
+    """Base of every options model: immutable, and an unknown or misspelt option is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+RUN_SETTING = {"run_setting": True}
+"""Pass as `Field(json_schema_extra=RUN_SETTING)`: the field (a path, a device, a worker count) must not
+change any result and therefore stays outside the cache key."""
+
+
+def cache_material(options: BaseModel) -> dict[str, Any]:
+    """The options as JSON-ready values, without the run settings: what the cache key is made of."""
+    excluded = {
+        name
+        for name, info in type(options).model_fields.items()
+        if isinstance(info.json_schema_extra, dict) and info.json_schema_extra.get("run_setting")
+    }
+    material: dict[str, Any] = {}
+    for name in type(options).model_fields:
+        if name in excluded:
+            continue
+        value = getattr(options, name)
+        material[name] = cache_material(value) if isinstance(value, BaseModel) else options.model_dump(mode="json")[name]
+    return material
+
+
+class Choice(Frozen):
+    """A plug-in by name, with its options. Subclasses say the kind, so that a preset names plug-ins only."""
+
+    KIND: ClassVar[str] = ""
+
+    name: str
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+class DatasetChoice(Choice):
+    """A module of `ctlev_core/datasets`."""
+
+    KIND = "datasets"
+
+
+class EncodingChoice(Choice):
+    """A module of `ctlev_core/encodings`."""
+
+    KIND = "encodings"
+
+
+class ConditionChoice(Choice):
+    """A module of `ctlev_core/conditions`."""
+
+    KIND = "conditions"
+
+
+class GeneratorChoice(Choice):
+    """A module of `ctlev_core/generators`."""
+
+    KIND = "generators"
+
+
+class DownstreamChoice(Choice):
+    """A module of `ctlev_core/downstream`."""
+
+    KIND = "downstream"
+
+
+class MetricChoice(Choice):
+    """A module of `ctlev_core/metrics`."""
+
+    KIND = "metrics"
