@@ -100,8 +100,12 @@ class Generator(Protocol):
     Options: type[Frozen]
     SampleOptions: type[Frozen]
 
+    def prior_folder(self, options: Any) -> Path:
+        """The folder of the pre-trained weights, checked to be there; its content enters the cache key."""
+        ...
+
     def train(
-        self, frames: np.ndarray, conditions: Conditions, prior: Path, options: Any, *, seed: int, out: Path, work: Path
+        self, frames: np.ndarray, conditions: Conditions, options: Any, *, seed: int, out: Path, work: Path
     ) -> History:
         """Write a checkpoint folder to `out`; keep resumable state in `work`."""
         ...
@@ -198,5 +202,6 @@ def load_options(choice: Choice) -> Plugin:
         PluginError: unknown plug-in, unknown option or a wrong value, before anything is computed.
     """
     module = load(choice.KIND, choice.name)
-    options = validate_options(module.Options, choice.options, f"{choice.KIND} {choice.name!r}")
+    model = getattr(module, choice.OPTIONS)
+    options = validate_options(model, choice.options, f"{choice.KIND} {choice.name!r}")
     return Plugin(choice.KIND, choice.name, module, options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -35,9 +35,10 @@ def cache_material(options: BaseModel) -> dict[str, Any]:
 
 
 class Choice(Frozen):
-    """A plug-in by name, with its options. Subclasses say the kind, so that a preset names plug-ins only."""
+    """A plug-in by name, with its options. Subclasses say its kind and which options model of the module applies."""
 
     KIND: ClassVar[str] = ""
+    OPTIONS: ClassVar[str] = "Options"
 
     name: str
     options: dict[str, Any] = Field(default_factory=dict)
@@ -67,6 +68,13 @@ class GeneratorChoice(Choice):
     KIND = "generators"
 
 
+class SamplingChoice(Choice):
+    """How a generator of `ctlev_core/generators` samples: its `SampleOptions`."""
+
+    KIND = "generators"
+    OPTIONS = "SampleOptions"
+
+
 class DownstreamChoice(Choice):
     """A module of `ctlev_core/downstream`."""
 
@@ -77,3 +85,13 @@ class MetricChoice(Choice):
     """A module of `ctlev_core/metrics`."""
 
     KIND = "metrics"
+
+
+class Windows(Frozen):
+    """How a recording is cut into windows; each window becomes one frame."""
+
+    method: Literal["count", "duration", "whole"] = Field("count", description="what every window has the same of")
+    num_events: int = Field(7500, gt=0, description="events a window (count); DHP19's mean per camera")
+    duration_us: int = Field(8333, gt=0, description="length of a window (duration); CDEHP's 120 frames a second")
+    max_windows: int | None = Field(None, gt=0, description="at most so many per recording, evenly spread")
+    min_events: int = Field(1, ge=1, description="drop windows with fewer events (duration, whole)")

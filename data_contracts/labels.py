@@ -15,28 +15,35 @@ SPLITS = ("train", "validation", "test", "condition")
 
 
 @dataclass(frozen=True)
+class Part:
+    """A stretch of a recording and the split it belongs to; `start` and `stop` are fractions of its events."""
+
+    split: str
+    start: float = 0.0
+    stop: float = 1.0
+
+
+@dataclass(frozen=True)
 class Recording:
     """One recording of a dataset, before anything but its existence is known.
 
     Attributes:
         recording_id: unique within the dataset; letters, digits, `.`, `_`, `-` and `/`.
         subject: who or what was recorded; splits are by subject wherever a dataset names subjects.
-        split: one of `SPLITS`.
+        parts: which split the recording belongs to; more than one part where a recording is split in time.
         class_name: class or motion, empty where the dataset has none.
         sensor_size: (width, height) px; None when only the file itself tells.
         has_events: False for recordings that carry labels only.
         files: raw files the recording is read from; their content enters the cache key.
-        time_range: the part of the recording that belongs to `split`, as fractions of its events.
     """
 
     recording_id: str
     subject: str
-    split: str
+    parts: tuple[Part, ...]
     class_name: str = ""
     sensor_size: SensorSize | None = None
     has_events: bool = True
     files: tuple[Path, ...] = ()
-    time_range: tuple[float, float] = (0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,47 @@
+"""From the label track of a recording to one label per window of events."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from data_contracts.labels import Labels
+
+
+def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarray) -> Labels:
+    """One label row per window: the mean position of each joint over the window.
+
+    Args:
+        labels: the track, times ascending; a single row without joints labels every window.
+        t_start_us: [N] int64, first event of each window.
+        t_end_us: [N] int64, last event of each window.
+    Returns:
+        N rows at the windows' ends. A window between two labels takes the nearest one. A joint is visible when it is
+        visible in at least half of the rows averaged.
+    Source: DHP19 labels a frame with the NaN-mean of the Vicon rows in its window
+        (SensorsINI/DHP19, ExtractEventsToFramesAndMeanLabels.m); it has no visibility flags.
+    """
+    t_start_us, t_end_us = np.asarray(t_start_us, np.int64), np.asarray(t_end_us, np.int64)
+    first = np.searchsorted(labels.t_us, t_start_us, side="left")
+    last = np.searchsorted(labels.t_us, t_end_us, side="right")
+    empty = first >= last
+    nearest = _nearest(labels.t_us, (t_start_us + t_end_us) // 2)
+    first, last = np.where(empty, nearest, first), np.where(empty, nearest + 1, last)
+    names = tuple(labels.class_names[row] for row in last - 1)
+    if labels.joints2d is None or labels.visible is None:
+        return Labels(names, t_end_us)
+    joints = np.empty((len(names), *labels.joints2d.shape[1:]), np.float32)
+    visible = np.empty((len(names), labels.visible.shape[1]), bool)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # the mean of NaN alone is NaN, which is what we mean
+        for row, (start, stop) in enumerate(zip(first, last, strict=True)):
+            joints[row] = np.nanmean(labels.joints2d[start:stop].astype(np.float64), axis=0)
+            visible[row] = labels.visible[start:stop].mean(axis=0) >= 0.5
+    return Labels(names, t_end_us, joints, visible & np.isfinite(joints).all(axis=-1), labels.joint_set)
+
+
+def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    right = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(np.abs(times[left] - wanted) <= np.abs(times[right] - wanted), left, right)

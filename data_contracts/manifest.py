@@ -1,0 +1,243 @@
+"""Manifests on disk: one Parquet table per artefact, with the digests of all files beside it.
+
+An artefact is a folder. `manifest.parquet` holds its rows and, in the Parquet metadata, size and SHA-256 of every other
+file of the folder, so the digest of the manifest vouches for the whole artefact. Arrays lie beside it as .npy files and
+are memory-mapped; row i of an array belongs to row i of the table.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from data_contracts.config import Frozen
+from data_contracts.events import DataError
+from data_contracts.labels import Conditions, History, Labels
+from data_contracts.tables import TABLES, TableSchema, check_table
+
+MANIFEST_FILE = "manifest.parquet"
+RUN_FILE = "run.json"
+_FILES_KEY = b"ctlev.files"
+_SCHEMA_KEY = b"ctlev.schema"
+
+
+class ManifestRef(Frozen):
+    """What stages hand to one another: where an artefact is and what its manifest's digest must be.
+
+    Attributes:
+        key: the cache key of the stage that made it; names the artefact in the store.
+        path: the artefact's folder.
+        digest: SHA-256 of manifest.parquet; empty while only planned.
+        rows: rows of the table; -1 while only planned.
+    """
+
+    key: str
+    path: Path
+    digest: str = ""
+    rows: int = -1
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def artefact_files(folder: Path) -> list[Path]:
+    """Every file of an artefact except the manifest and the provenance record, sorted."""
+    special = {folder / MANIFEST_FILE, folder / RUN_FILE}
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path not in special)
+
+
+def write_manifest(folder: Path, table: pa.Table, schema: TableSchema) -> ManifestRef:
+    """Check `table` and write it as the manifest of `folder`, which already holds every other file.
+
+    Returns:
+        The reference, with `key` = the folder's name.
+    Raises:
+        DataError: the table breaks its schema.
+    """
+    table = check_table(table, schema, str(folder))
+    files = {
+        path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+        for path in artefact_files(folder)
+    }
+    metadata = {
+        _SCHEMA_KEY: json.dumps({"name": schema.name, "version": schema.version}).encode(),
+        _FILES_KEY: json.dumps(files, sort_keys=True).encode(),
+    }
+    path = folder / MANIFEST_FILE
+    pq.write_table(table.replace_schema_metadata(metadata), path, compression="zstd")
+    return ManifestRef(key=folder.name, path=folder, digest=file_digest(path), rows=table.num_rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """An opened artefact: its table, and its files by name."""
+
+    ref: ManifestRef
+    schema: TableSchema
+    table: pa.Table
+    files: dict[str, dict]
+
+    def __len__(self) -> int:
+        return self.table.num_rows
+
+    def path(self, name: str) -> Path:
+        """A file of the artefact that the manifest lists."""
+        if name not in self.files:
+            raise DataError(f"{self.ref.path}: holds no file {name!r}; it has {sorted(self.files) or 'none'}")
+        return self.ref.path / name
+
+    def array(self, name: str) -> np.ndarray:
+        """The array `<name>.npy`, memory-mapped read-only."""
+        return np.load(self.path(f"{name}.npy"), mmap_mode="r", allow_pickle=False)
+
+    def attached(self, schema: TableSchema) -> pa.Table:
+        """The table `<schema.name>.parquet` that lies beside the manifest, checked."""
+        path = self.path(f"{schema.name}.parquet")
+        return check_table(pq.read_table(path).replace_schema_metadata(None), schema, str(path))
+
+    def column(self, name: str) -> list:
+        """A column as Python values."""
+        return self.table[name].to_pylist()
+
+    def rows_where(self, **values: str) -> np.ndarray:
+        """Indices of the rows whose columns equal the given values."""
+        keep = np.ones(len(self), dtype=bool)
+        for name, value in values.items():
+            keep &= np.array([item == value for item in self.column(name)], dtype=bool)
+        return np.flatnonzero(keep)
+
+    @cached_property
+    def labels(self) -> Labels:
+        """The label columns of the table."""
+        return labels_of(self.table)
+
+
+def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
+    """Open an artefact and verify it.
+
+    Args:
+        ref: from the stage that made it.
+        full: hash every file again; otherwise the manifest is hashed and the other files are checked by size.
+    Raises:
+        DataError: a file is missing or has changed, or the schema version is not the one this code reads.
+    """
+    path = ref.path / MANIFEST_FILE
+    if not path.is_file():
+        raise DataError(f"{ref.path}: manifest is missing; run the flow again to make it anew")
+    digest = file_digest(path)
+    if ref.digest and digest != ref.digest:
+        raise DataError(f"{path}: content has changed; expected digest {ref.digest[:12]}, got {digest[:12]}")
+    table = pq.read_table(path)
+    metadata = table.schema.metadata or {}
+    if _SCHEMA_KEY not in metadata or _FILES_KEY not in metadata:
+        raise DataError(f"{path}: is not a ctlev manifest; its metadata names no schema")
+    declared = json.loads(metadata[_SCHEMA_KEY])
+    schema = TABLES.get(declared["name"])
+    if schema is None or schema.version != declared["version"]:
+        known = f"version {schema.version}" if schema else f"one of {sorted(TABLES)}"
+        raise DataError(f"{path}: table {declared['name']!r} version {declared['version']}; this code reads {known}")
+    files = json.loads(metadata[_FILES_KEY])
+    for name, expected in files.items():
+        _check_file(ref.path / name, expected, full)
+    checked = check_table(table.replace_schema_metadata(None), schema, str(path))
+    return Manifest(ManifestRef(key=ref.key, path=ref.path, digest=digest, rows=len(checked)), schema, checked, files)
+
+
+def _check_file(path: Path, expected: dict, full: bool) -> None:
+    if not path.is_file():
+        raise DataError(f"{path}: file is missing")
+    size = path.stat().st_size
+    if size != expected["bytes"]:
+        raise DataError(f"{path}: expected {expected['bytes']} bytes, got {size}")
+    if full and file_digest(path) != expected["sha256"]:
+        raise DataError(f"{path}: content has changed since it was written")
+
+
+def label_columns(labels: Labels) -> dict[str, pa.Array]:
+    """The columns `joint_set`, `joints2d_px` and `visible` of a table, from labels."""
+    count = len(labels)
+    joint_set = pa.array([labels.joint_set] * count, pa.string())
+    if labels.joints2d is None or labels.visible is None:
+        return {
+            "joint_set": joint_set,
+            "joints2d_px": pa.nulls(count, pa.list_(pa.float32())),
+            "visible": pa.nulls(count, pa.list_(pa.bool_())),
+        }
+
+    def flat(values: np.ndarray, dtype: pa.DataType) -> pa.Array:
+        width = int(np.prod(values.shape[1:]))
+        offsets = pa.array(np.arange(count + 1, dtype=np.int32) * width)
+        return pa.ListArray.from_arrays(offsets, pa.array(values.reshape(-1), dtype))
+
+    return {
+        "joint_set": joint_set,
+        "joints2d_px": flat(labels.joints2d, pa.float32()),
+        "visible": flat(labels.visible, pa.bool_()),
+    }
+
+
+def labels_of(table: pa.Table) -> Labels:
+    """Inverse of `label_columns`, for any table with label columns."""
+    count = table.num_rows
+    class_names = tuple(table["class_name"].to_pylist())
+    times = "t_us" if "t_us" in table.column_names else "t_end_us"
+    t_us = table[times].to_numpy() if times in table.column_names else np.zeros(count, np.int64)
+    joints = table["joints2d_px"].combine_chunks()
+    joint_sets = set(table["joint_set"].to_pylist())
+    if count == 0 or joints.null_count == count:
+        return Labels(class_names, t_us.astype(np.int64))
+    if joints.null_count or len(joint_sets) != 1:
+        raise DataError(f"rows must share one joint set and all have joints, got {sorted(joint_sets)}")
+    joints2d = joints.flatten().to_numpy(zero_copy_only=False).reshape(count, -1, 2)
+    visible = table["visible"].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(count, -1)
+    return Labels(class_names, t_us.astype(np.int64), joints2d, visible.astype(bool), joint_sets.pop())
+
+
+def concat_labels(parts: Iterable[Labels]) -> Labels:
+    """Stack label rows; all parts must carry the same kind of labels."""
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return Labels((), np.zeros(0, np.int64))
+    if len({(part.joint_set, part.joints2d is None) for part in parts}) != 1:
+        raise DataError(f"cannot mix labels of joint sets {sorted({part.joint_set for part in parts})}")
+    names = tuple(name for part in parts for name in part.class_names)
+    t_us = np.concatenate([part.t_us for part in parts])
+    if parts[0].joints2d is None:
+        return Labels(names, t_us)
+    joints2d = np.concatenate([part.joints2d for part in parts if part.joints2d is not None])
+    visible = np.concatenate([part.visible for part in parts if part.visible is not None])
+    return Labels(names, t_us, joints2d, visible, parts[0].joint_set)
+
+
+def conditions_of(manifest: Manifest) -> Conditions:
+    """The conditions of a manifest of conditions; row i is row i of its table."""
+    images = manifest.array("images") if "images.npy" in manifest.files else None
+    return Conditions(tuple(manifest.column("prompt")), images)
+
+
+def history_table(history: History) -> pa.Table:
+    """The loss curves of a training run as rows of the table `training`."""
+    curves = (
+        ("training", history.step, history.loss),
+        ("validation", history.validation_step, history.validation_loss),
+        ("shuffled", history.validation_step, history.shuffled_loss),
+    )
+    rows = [(name, step, loss) for name, steps, losses in curves for step, loss in zip(steps, losses, strict=False)]
+    return pa.table(
+        {
+            "curve": pa.array([row[0] for row in rows], pa.string()),
+            "step": pa.array([row[1] for row in rows], pa.int64()),
+            "loss": pa.array([row[2] for row in rows], pa.float64()),
+        }
+    )

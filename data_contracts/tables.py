@@ -1,0 +1,249 @@
+"""The Arrow schemas of every manifest, with versions, units and allowed ranges.
+
+A stage writes exactly one of these as its manifest; `check_table` holds on every write and every read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from data_contracts.events import DataError
+from data_contracts.labels import SPLITS
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table.
+
+    Attributes:
+        name: column name; a unit is its suffix (`_us`, `_px`, `_mm`, `_rad`).
+        type: Arrow type.
+        doc: what it holds.
+        minimum: smallest allowed value (also of list elements), inclusive.
+        maximum: largest allowed value, inclusive.
+        choices: the allowed values, or None for any.
+        nullable: may values be missing?
+        finite: must floating-point values be finite?
+    """
+
+    name: str
+    type: pa.DataType
+    doc: str
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] | None = None
+    nullable: bool = False
+    finite: bool = True
+
+
+@dataclass(frozen=True)
+class TableSchema:
+    """A named, versioned table. `key` is the column whose values are unique, or None."""
+
+    name: str
+    version: int
+    key: str | None
+    columns: tuple[Column, ...]
+
+    def arrow(self) -> pa.Schema:
+        """The Arrow schema, with the documentation as field metadata."""
+        fields = [pa.field(c.name, c.type, nullable=c.nullable, metadata={"doc": c.doc}) for c in self.columns]
+        return pa.schema(fields)
+
+
+_SPLIT = Column("split", pa.string(), "which part of the experiment the row belongs to", choices=SPLITS)
+_RECORDING = Column("recording_id", pa.string(), "recording the row was made from")
+_SUBJECT = Column("subject", pa.string(), "who or what was recorded")
+_CLASS = Column("class_name", pa.string(), "class or motion; empty without classes")
+_LABELS = (
+    Column("joint_set", pa.string(), "joint order (ctlev_core.skeletons); empty without joints"),
+    Column("joints2d_px", pa.list_(pa.float32()), "J x (x, y), flattened; NaN = unknown", nullable=True, finite=False),
+    Column("visible", pa.list_(pa.bool_()), "J flags", nullable=True),
+)
+
+RECORDINGS = TableSchema(
+    "recordings",
+    1,
+    "recording_id",
+    (
+        _RECORDING,
+        _SUBJECT,
+        _CLASS,
+        Column("splits", pa.string(), "the splits its parts belong to, joined by +"),
+        Column("sensor_width_px", pa.int32(), "sensor width; 0 without events", minimum=0),
+        Column("sensor_height_px", pa.int32(), "sensor height; 0 without events", minimum=0),
+        Column("num_events", pa.int64(), "events in the whole recording", minimum=0),
+        Column("num_positive", pa.int64(), "ON events", minimum=0),
+        Column("num_negative", pa.int64(), "OFF events", minimum=0),
+        Column("t_first_us", pa.int64(), "time stamp of the first event", minimum=0),
+        Column("t_last_us", pa.int64(), "time stamp of the last event", minimum=0),
+        Column("duration_us", pa.int64(), "t_last_us - t_first_us", minimum=0),
+        Column("events_file", pa.string(), "Parquet file of the events; empty without events"),
+    ),
+)
+PARTS = TableSchema(
+    "parts",
+    1,
+    None,
+    (
+        _RECORDING,
+        _SPLIT,
+        Column("event_start", pa.int64(), "first event of the part", minimum=0),
+        Column("event_stop", pa.int64(), "one past its last event", minimum=0),
+    ),
+)
+LABELS = TableSchema(
+    "labels",
+    1,
+    None,
+    (_RECORDING, _SUBJECT, _CLASS, Column("t_us", pa.int64(), "time of the label on the clock of the events"), *_LABELS),
+)
+FRAMES = TableSchema(
+    "frames",
+    1,
+    "sample_id",
+    (
+        Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),
+        _RECORDING,
+        _SUBJECT,
+        _SPLIT,
+        _CLASS,
+        Column("t_start_us", pa.int64(), "first event of the window", minimum=0),
+        Column("t_end_us", pa.int64(), "last event of the window", minimum=0),
+        Column("num_events", pa.int64(), "events in the window", minimum=0),
+        *_LABELS,
+    ),
+)
+CONDITIONS = TableSchema(
+    "conditions",
+    1,
+    "sample_id",
+    (
+        Column("sample_id", pa.string(), "the join key"),
+        Column("source_id", pa.string(), "the frame or label moment the condition was rendered from"),
+        _SUBJECT,
+        _CLASS,
+        Column("prompt", pa.string(), "text prompt"),
+        *_LABELS,
+    ),
+)
+TRAINING = TableSchema(
+    "training",
+    1,
+    None,
+    (
+        Column("curve", pa.string(), "which loss", choices=("training", "validation", "shuffled")),
+        Column("step", pa.int64(), "optimiser step", minimum=0),
+        Column("loss", pa.float64(), "mean loss since the last logged step"),
+    ),
+)
+SYNTHETIC = TableSchema(
+    "synthetic",
+    1,
+    "sample_id",
+    (
+        Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),
+        Column("recording_id", pa.string(), "always `synthetic`"),
+        Column("condition_id", pa.string(), "sample_id of the condition it was made from"),
+        Column("source_id", pa.string(), "the frame or label moment behind the condition"),
+        _SUBJECT,
+        _SPLIT,
+        _CLASS,
+        Column("prompt", pa.string(), "text prompt"),
+        Column("generator", pa.string(), "generator plug-in and its VERSION"),
+        Column("checkpoint_digest", pa.string(), "digest of the checkpoint's manifest"),
+        Column("scheduler", pa.string(), "sampler"),
+        Column("num_inference_steps", pa.int32(), "network evaluations per image", minimum=1),
+        Column("guidance_scale", pa.float64(), "classifier-free guidance; 1 = none", minimum=0),
+        Column("seed", pa.int64(), "seed of this row alone", minimum=0),
+        *_LABELS,
+    ),
+)
+SCORES = TableSchema(
+    "scores",
+    1,
+    None,
+    (
+        Column("task", pa.string(), "what was scored"),
+        Column("setting", pa.string(), "what the model was trained on, or which images were compared"),
+        Column("seed", pa.int64(), "seed of the downstream training", minimum=0),
+        Column("group", pa.string(), "`all`, or the subset of the test data"),
+        Column("metric", pa.string(), "score, with its unit"),
+        Column("value", pa.float64(), "the score"),
+        Column("low", pa.float64(), "lower end of the 95 % interval over recordings", nullable=True),
+        Column("high", pa.float64(), "upper end of the 95 % interval over recordings", nullable=True),
+        Column("num_samples", pa.int64(), "test samples", minimum=1),
+        Column("num_train", pa.int64(), "training samples", minimum=0),
+        Column("model_digest", pa.string(), "manifest digest of the model that was scored"),
+        Column("data_digest", pa.string(), "manifest digest of the data it was scored on"),
+    ),
+)
+REPORT = TableSchema(
+    "report",
+    1,
+    None,
+    (Column("table", pa.string(), "name of a table of the report"), Column("file", pa.string(), "its Parquet file")),
+)
+TABLES = {
+    t.name: t for t in (RECORDINGS, PARTS, LABELS, FRAMES, CONDITIONS, TRAINING, SYNTHETIC, SCORES, REPORT)
+}  # fmt: skip
+
+
+def check_table(table: pa.Table, schema: TableSchema, where: str) -> pa.Table:
+    """Raise `DataError` naming table, column and row unless `table` keeps `schema`.
+
+    Returns:
+        The table, cast to the schema's exact column order and types without losing a value.
+    """
+    label = f"{where}: table {schema.name!r}"
+    expected = [c.name for c in schema.columns]
+    missing = [name for name in expected if name not in table.column_names]
+    extra = [name for name in table.column_names if name not in expected]
+    if missing or extra:
+        raise DataError(f"{label}: missing columns {missing}, unknown columns {extra}; expected {expected}")
+    columns = []
+    for column in schema.columns:
+        values = table[column.name].combine_chunks()
+        if values.type != column.type:
+            raise DataError(f"{label}, column {column.name!r}: expected type {column.type}, got {values.type}")
+        _check_values(values, column, label)
+        columns.append(values)
+    if schema.key is not None:
+        _check_unique(columns[expected.index(schema.key)], schema.key, label)
+    return pa.table(columns, schema=schema.arrow())
+
+
+def _check_values(values: pa.Array, column: Column, label: str) -> None:
+    """Missing values, ranges, choices and finiteness of one column."""
+
+    def refuse(wrong: pa.Array, expected: str) -> None:
+        row = pc.index(wrong, True).as_py()
+        if row >= 0:
+            raise DataError(f"{label}, column {column.name!r}, row {row}: expected {expected}, got {values[row].as_py()!r}")
+
+    if not column.nullable and values.null_count:
+        refuse(values.is_null(), "a value")
+    if pa.types.is_list(column.type):
+        return
+    if pa.types.is_floating(column.type) and column.finite:
+        refuse(pc.fill_null(pc.invert(pc.is_finite(values)), False), "a finite number")
+    if column.minimum is not None:
+        refuse(pc.fill_null(pc.less(values, column.minimum), False), f"at least {column.minimum:g}")
+    if column.maximum is not None:
+        refuse(pc.fill_null(pc.greater(values, column.maximum), False), f"at most {column.maximum:g}")
+    if column.choices is not None:
+        refuse(pc.invert(pc.is_in(values, value_set=pa.array(column.choices))), f"one of {', '.join(column.choices)}")
+
+
+def _check_unique(values: pa.Array, name: str, label: str) -> None:
+    """The key column holds no value twice."""
+    if len(pc.unique(values)) == len(values):
+        return
+    seen: set[str] = set()
+    for row, value in enumerate(values.to_pylist()):
+        if value in seen:
+            raise DataError(f"{label}, column {name!r}, row {row}: {value!r} occurs twice")
+        seen.add(value)

@@ -1,0 +1,100 @@
+"""Prefect without a server of the user's own: one private server for the life of one script.
+
+Prefect would start such a server itself, but only when the first flow is called, with a 20 s limit that a busy machine
+exceeds, and it outlives a killed script. Here it starts before anything heavy is imported, so that its start-up overlaps
+ours, and it dies with the script, whatever ends the script.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+START_TIMEOUT_S = 300.0
+_QUIET = {
+    "DO_NOT_TRACK": "1",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
+    "PREFECT_CLI_PROMPT": "false",
+    "PREFECT_LOGGING_TO_API_ENABLED": "false",
+}
+_server: subprocess.Popen[bytes] | None = None
+
+
+def configure(home: Path, *, verbose: bool) -> None:
+    """Point Prefect at `home` and keep it quiet. Must run before Prefect is imported; what the user set stays."""
+    settings = {"PREFECT_HOME": str(home / "prefect"), "PREFECT_LOGGING_LEVEL": "INFO" if verbose else "CRITICAL"}
+    for name, value in {**_QUIET, **settings}.items():
+        os.environ.setdefault(name, value)
+
+
+def start(home: Path) -> None:
+    """Start the private server in the background, unless the user named a server in PREFECT_API_URL."""
+    global _server
+    if os.environ.get("PREFECT_API_URL"):
+        return
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    log = home / "logs" / "prefect_server.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]
+    command += ["--host", "127.0.0.1", "--port", str(port), "--log-level", "error", "--timeout-keep-alive", "30"]
+    environment = {**os.environ, "PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"}
+    with log.open("wb") as file:
+        _server = subprocess.Popen(
+            command, env=environment, stdout=file, stderr=file, stdin=subprocess.DEVNULL, preexec_fn=_die_with_parent
+        )
+    atexit.register(stop)
+    os.environ["PREFECT_API_URL"] = f"http://127.0.0.1:{port}/api"
+
+
+def wait() -> None:
+    """Return when the server answers.
+
+    Raises:
+        RuntimeError: it ended or did not answer in time; the message names its log.
+    """
+    if _server is None:
+        return
+    url = os.environ["PREFECT_API_URL"] + "/health"
+    log = Path(os.environ["PREFECT_HOME"]).parent / "logs" / "prefect_server.log"
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < deadline:
+        if _server.poll() is not None:
+            raise RuntimeError(f"the local Prefect server ended with code {_server.returncode}; see {log}")
+        try:
+            with urllib.request.urlopen(url, timeout=5) as response:
+                if response.status == 200:
+                    return
+        except (urllib.error.URLError, OSError):
+            time.sleep(0.05)
+    raise RuntimeError(f"the local Prefect server did not answer within {START_TIMEOUT_S:.0f} s; see {log}")
+
+
+def stop() -> None:
+    """End the private server; called at exit."""
+    global _server
+    if _server is not None and _server.poll() is None:
+        _server.terminate()
+        try:
+            _server.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            _server.kill()
+    _server = None
+
+
+def _die_with_parent() -> None:
+    """Ask the Linux kernel to end the server when this process ends, even by SIGKILL."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG = 1
+    os.setpgid(0, 0)

@@ -1,0 +1,116 @@
+"""Labels to conditions: what the generator learns from, and what it is then asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core import plugins
+from data_contracts import tables
+from data_contracts.config import ConditionChoice, EncodingChoice
+from data_contracts.labels import Labels
+from data_contracts.manifest import Manifest, label_columns, labels_of
+from tasks.stage import Output, stage
+
+
+@stage(version=1, schema=tables.CONDITIONS)
+def condition_frames(out: Output, frames: Manifest, *, condition: ConditionChoice, seed: int) -> pa.Table:
+    """Render the condition of every training frame; rows join the frames on `sample_id`."""
+    rows = frames.rows_where(split="train")
+    names = [frames.column("sample_id")[row] for row in rows]
+    subjects = [frames.column("subject")[row] for row in rows]
+    return _render(out, names, names, subjects, frames.labels.take(rows), condition, _image_size(frames), seed)
+
+
+@stage(version=1, schema=tables.CONDITIONS)
+def condition_samples(
+    out: Output,
+    recordings: Manifest,
+    frames: Manifest,
+    *,
+    condition: ConditionChoice,
+    encoding: EncodingChoice,
+    count: int,
+    seed: int,
+) -> pa.Table:
+    """Choose `count` labels to sample from and render them.
+
+    They come from the label-only recordings (split `condition`: poses no frame was trained on) where the dataset has
+    such, and otherwise from the training frames. Classes take turns; within a class the order is random, and starts
+    over when it is used up.
+    """
+    names, subjects, labels = _label_only(recordings, frames, encoding)
+    if not names:
+        rows = frames.rows_where(split="train")
+        names = [frames.column("sample_id")[row] for row in rows]
+        subjects = [frames.column("subject")[row] for row in rows]
+        labels = frames.labels.take(rows)
+    chosen = balanced_choice(labels.class_names, count, seed)
+    sample_ids = [f"condition/{number:06d}" for number in range(count)]
+    source_ids, subjects = [names[row] for row in chosen], [subjects[row] for row in chosen]
+    return _render(out, sample_ids, source_ids, subjects, labels.take(chosen), condition, _image_size(frames), seed)
+
+
+def balanced_choice(class_names: tuple[str, ...], count: int, seed: int) -> np.ndarray:
+    """`count` row indices in which the classes take turns, each class in a random order of its own."""
+    classes = sorted(set(class_names))
+    names = np.array(class_names)
+    queues: list[np.ndarray] = []
+    for number, name in enumerate(classes):
+        rows = np.flatnonzero(names == name)
+        rounds = -(-count // (len(classes) * len(rows)))
+        random = np.random.default_rng([seed, number])
+        queues.append(np.concatenate([random.permutation(rows) for _ in range(rounds)]))
+    return np.array([queues[i % len(classes)][i // len(classes)] for i in range(count)], dtype=np.int64)
+
+
+def _label_only(
+    recordings: Manifest, frames: Manifest, encoding: EncodingChoice
+) -> tuple[list[str], list[str], Labels]:
+    """Every label moment of the recordings in split `condition`, in image pixels."""
+    wanted = set(np.array(recordings.column("recording_id"))[recordings.rows_where(splits="condition")].tolist())
+    table = recordings.attached(tables.LABELS)
+    table = table.filter(pa.array([name in wanted for name in table["recording_id"].to_pylist()], pa.bool_()))
+    times = table["t_us"].to_pylist()
+    names = [f"{name}:{t_us}" for name, t_us in zip(table["recording_id"].to_pylist(), times, strict=True)]
+    labels = labels_of(table)
+    if labels.joints2d is not None:
+        plugin = plugins.load_options(encoding)
+        # A label-only recording has no sensor of its own: its labels are in the frame of the dataset's sensor.
+        with_events = recordings.table.to_pylist()
+        size = next((r["sensor_width_px"], r["sensor_height_px"]) for r in with_events if r["sensor_width_px"])
+        mapped = plugin.module.map_points(labels.joints2d, size, plugin.options).astype(np.float32)
+        labels = Labels(labels.class_names, labels.t_us, mapped, labels.visible, labels.joint_set)
+    return names, table["subject"].to_pylist(), labels
+
+
+def _image_size(frames: Manifest) -> tuple[int, int]:
+    _, height, width, _ = frames.array("frames").shape
+    return width, height
+
+
+def _render(
+    out: Output,
+    sample_ids: list[str],
+    source_ids: list[str],
+    subjects: list[str],
+    labels: Labels,
+    condition: ConditionChoice,
+    image_size: tuple[int, int],
+    seed: int,
+) -> pa.Table:
+    plugin = plugins.load_options(condition)
+    seeds = [int(np.random.SeedSequence([seed, row]).generate_state(1)[0]) for row in range(len(labels))]
+    rendered = plugin.module.render(labels, image_size, plugin.options, seeds)
+    if rendered.images is not None:
+        out.write_array("images", rendered.images)
+    return pa.table(
+        {
+            "sample_id": sample_ids,
+            "source_id": source_ids,
+            "subject": subjects,
+            "class_name": pa.array(labels.class_names, pa.string()),
+            "prompt": pa.array(rendered.prompts, pa.string()),
+            **label_columns(labels),
+        }
+    )

@@ -1,0 +1,138 @@
+"""Score downstream models on held-out real frames, and synthetic frames against real ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core import plugins
+from ctlev_core.intervals import cluster_bootstrap
+from data_contracts import tables
+from data_contracts.config import DownstreamChoice, MetricChoice
+from data_contracts.events import DataError
+from data_contracts.manifest import Manifest
+from tasks.stage import Output, stage
+
+
+@stage(version=1, schema=tables.SCORES)
+def score_model(
+    out: Output,
+    model: Manifest,
+    data: Manifest,
+    training_sets: list[Manifest],
+    *,
+    downstream: DownstreamChoice,
+    metrics: list[MetricChoice],
+    setting: str,
+    split: str,
+    seed: int,
+) -> pa.Table:
+    """Every metric on one split, for all rows and for each class, with an interval over recordings."""
+    plugin = plugins.load_options(downstream)
+    rows = data.rows_where(split=split)
+    if len(rows) == 0:
+        raise DataError(f"{data.ref.path}: no rows in split {split!r} to score on")
+    _refuse_overlap(data, rows, training_sets, split)
+    prediction = plugin.module.predict(model.ref.path / "model", np.asarray(data.array("frames")[rows]))
+    labels = data.labels.take(rows)
+    recordings = np.array(data.column("recording_id"))[rows]
+    num_train = sum(len(training_set.rows_where(split="train")) for training_set in training_sets)
+    same = {
+        "task": plugin.name,
+        "setting": setting,
+        "seed": seed,
+        "num_train": num_train,
+        "model_digest": model.ref.digest,
+        "data_digest": data.ref.digest,
+    }
+    found: list[dict[str, Any]] = []
+    for choice in metrics:
+        metric = plugins.load_options(choice)
+        for group, members in _groups(labels.class_names):
+            scores, low, high = _score(metric, prediction, labels.take(members), members, recordings[members])
+            found += [
+                {
+                    **same,
+                    "group": group,
+                    "metric": name,
+                    "value": value,
+                    "low": low.get(name),
+                    "high": high.get(name),
+                    "num_samples": len(members),
+                }
+                for name, value in scores.items()
+            ]
+    return pa.Table.from_pylist(found, schema=tables.SCORES.arrow())
+
+
+def _groups(class_names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
+    names = np.array(class_names)
+    classes = [name for name in dict.fromkeys(class_names) if name]
+    return [("all", np.arange(len(names))), *((name, np.flatnonzero(names == name)) for name in sorted(classes))]
+
+
+def _score(
+    metric: plugins.Plugin, prediction: Any, labels: Any, members: np.ndarray, recordings: np.ndarray
+) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """The scores of some rows, and the ends of their intervals."""
+
+    def compute(chosen: np.ndarray) -> dict[str, float]:
+        picked = {
+            name: values if name == "classes" else np.asarray(values)[members[chosen]]
+            for name, values in prediction.items()
+        }
+        return metric.module.compute(picked, labels.take(chosen), metric.options)
+
+    scores = compute(np.arange(len(members)))
+    low, high = cluster_bootstrap(compute, recordings)
+    return scores, low, high
+
+
+def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manifest], split: str) -> None:
+    """No row may be both learnt from and tested on."""
+    if split == "train":
+        return
+    tested = {data.column("sample_id")[row] for row in rows}
+    for training_set in training_sets:
+        learnt = {training_set.column("sample_id")[row] for row in training_set.rows_where(split="train")}
+        if shared := sorted(tested & learnt):
+            raise DataError(f"{data.ref.path}: sample {shared[0]!r} is in the training data and in split {split!r}")
+
+
+@stage(version=1, schema=tables.SCORES)
+def score_distance(
+    out: Output, extractor: Manifest, real: Manifest, other: Manifest, *, downstream: DownstreamChoice, setting: str, split: str
+) -> pa.Table:
+    """Frechet distance between the features of real training frames and of another set of frames.
+
+    The features are those of a classifier trained on real events, so the score is named after that classifier and
+    never `fid`. Values depend on the number of samples: compare rows of equal `num_samples` only, and read them
+    against the row of held-out real frames.
+    """
+    plugin = plugins.load_options(downstream)
+    frechet = plugins.load("metrics", "frechet")
+    folder = extractor.ref.path / "model"
+    learnt, compared = real.rows_where(split="train"), other.rows_where(split=split)
+    features = [
+        plugin.module.features(folder, np.asarray(data.array("frames")[rows]))
+        for data, rows in ((real, learnt), (other, compared))
+    ]
+    value = frechet.compute(features[1], features[0], frechet.Options())["fd"]
+    row = {
+        "task": "distance",
+        "setting": setting,
+        "seed": 0,
+        "group": "all",
+        "metric": f"fd_event_{plugin.name}_{extractor.ref.digest[:8]}",
+        "value": value,
+        "low": None,
+        "high": None,
+        "num_samples": len(compared),
+        "num_train": len(learnt),
+        "model_digest": extractor.ref.digest,
+        "data_digest": other.ref.digest,
+    }
+    return pa.Table.from_pylist([row], schema=tables.SCORES.arrow())

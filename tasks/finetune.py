@@ -1,0 +1,48 @@
+"""Fine-tune a generator on labelled event images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core import plugins
+from data_contracts import tables
+from data_contracts.config import GeneratorChoice
+from data_contracts.events import DataError
+from data_contracts.manifest import Manifest, conditions_of, history_table
+from tasks.stage import Output, stage
+
+
+def _prior_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
+    plugin = plugins.load_options(arguments["generator"])
+    folder = plugin.module.prior_folder(plugin.options)
+    return [(path.relative_to(folder).as_posix(), path) for path in sorted(folder.rglob("*")) if path.is_file()]
+
+
+@stage(version=1, schema=tables.TRAINING, raw_files=_prior_files)
+def finetune(out: Output, frames: Manifest, conditions: Manifest, *, generator: GeneratorChoice, seed: int) -> pa.Table:
+    """Tune the prior on the training frames; the artefact's `checkpoint/` is an ordinary diffusers folder."""
+    plugin = plugins.load_options(generator)
+    rows = matching_rows(frames, conditions)
+    history = plugin.module.train(
+        np.asarray(frames.array("frames")[rows]),
+        conditions_of(conditions),
+        plugin.options,
+        seed=seed,
+        out=out.folder / "checkpoint",
+        work=out.work,
+    )
+    return history_table(history)
+
+
+def matching_rows(frames: Manifest, conditions: Manifest) -> np.ndarray:
+    """Row of the frame that each condition row describes, joined on `sample_id`."""
+    position = {name: row for row, name in enumerate(frames.column("sample_id"))}
+    wanted = conditions.column("sample_id")
+    missing = [name for name in wanted if name not in position]
+    if missing:
+        raise DataError(f"{conditions.ref.path}: condition {missing[0]!r} has no frame in {frames.ref.path}")
+    return np.array([position[name] for name in wanted], dtype=np.int64)

@@ -1,0 +1,262 @@
+"""A stage is a cached task: a plain function that turns manifests into one new manifest.
+
+    @stage(version=1, schema=tables.FRAMES)
+    def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice) -> pa.Table: ...
+
+    frames = encode(recordings_ref, encoding=experiment.encoding)      # a ManifestRef
+
+Calling a stage computes its key from everything that can change its result: its name and version, the plug-ins it uses
+with their versions and options, seeds, the keys of its inputs and the digests of its raw files. Keys need no data, so
+the whole plan of an experiment, with every key, is known before anything runs. An artefact made from inputs whose
+content has since changed (a training run that was repeated on another machine, say) is recognised by the digests in its
+provenance record and made anew. Paths, devices and worker counts never enter a key.
+
+This is the only file that knows about caching.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib.metadata
+import inspect
+import json
+import os
+import platform
+import resource
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import BaseModel
+
+from ctlev_core import plugins
+from data_contracts.config import Choice, cache_material
+from data_contracts.events import DataError
+from data_contracts.manifest import Manifest, ManifestRef, read_manifest, write_manifest
+from data_contracts.tables import TableSchema
+from tasks.store import RawFileDigests, Store
+
+RawFiles = Callable[[dict[str, Any]], Sequence[tuple[str, Path]]]
+"""From the stage's arguments to (name, path) of the raw files it will read; the names enter the key too."""
+
+
+@dataclasses.dataclass
+class PlannedStage:
+    """One line of a plan."""
+
+    stage: str
+    label: str
+    key: str
+    cached: bool
+
+
+@dataclasses.dataclass
+class _Plan:
+    rows: list[PlannedStage] = dataclasses.field(default_factory=list)
+
+
+_plan: ContextVar[_Plan | None] = ContextVar("ctlev_plan", default=None)
+
+
+@contextlib.contextmanager
+def planning() -> Iterator[list[PlannedStage]]:
+    """Inside this block stages and flows only note what they would do; nothing is computed or written."""
+    plan = _Plan()
+    token = _plan.set(plan)
+    try:
+        yield plan.rows
+    finally:
+        _plan.reset(token)
+
+
+def call_flow(flow: Any, *arguments: Any) -> Any:
+    """Call a Prefect flow, or only its wiring while planning."""
+    return flow.fn(*arguments) if _plan.get() is not None else flow(*arguments)
+
+
+class Output:
+    """Where a stage writes. Files in `folder` become the artefact; files in `work` survive a killed run."""
+
+    def __init__(self, folder: Path, work: Path) -> None:
+        self.folder = folder
+        self.work = work
+
+    def write_array(self, name: str, array: np.ndarray) -> None:
+        """Attach the array `<name>.npy`; row i belongs to row i of the manifest."""
+        np.save(self.folder / f"{name}.npy", array, allow_pickle=False)
+
+    def write_table(self, table: pa.Table, schema: TableSchema) -> None:
+        """Attach a second table beside the manifest."""
+        pq.write_table(table.cast(schema.arrow()), self.folder / f"{schema.name}.parquet", compression="zstd")
+
+
+class Stage:
+    """See the module's docstring. Made by the decorator `stage`."""
+
+    def __init__(
+        self, function: Callable[..., pa.Table], version: int, schema: TableSchema, raw_files: RawFiles | None
+    ) -> None:
+        self.function = function
+        self.name = function.__name__
+        self.version = version
+        self.schema = schema
+        self.raw_files = raw_files
+        self.signature = inspect.signature(function)
+        self.__doc__ = function.__doc__
+
+    def __call__(self, *inputs: Any, label: str = "", **settings: Any) -> ManifestRef:
+        """Plan or run the stage.
+
+        Args:
+            inputs: manifest references (or lists of them), in the order of the function's parameters after `out`.
+            label: shown in the plan and in Prefect; changes nothing.
+            settings: the function's keyword parameters.
+        """
+        bound = self.signature.bind(None, *inputs, **settings)
+        bound.apply_defaults()
+        arguments = dict(list(bound.arguments.items())[1:])
+        store = Store()
+        key = self.key(arguments, store)
+        label = f"{self.name}: {label}" if label else self.name
+        plan = _plan.get()
+        if plan is not None:
+            cached = store.find(self.name, key) is not None
+            plan.rows.append(PlannedStage(self.name, label, key, cached))
+            return ManifestRef(key=key, path=store.folder(self.name, key))
+        return _run_as_task(self, label, key, arguments)
+
+    def key(self, arguments: dict[str, Any], store: Store) -> str:
+        """The cache key: 32 hexadecimal digits of a SHA-256."""
+        material: dict[str, Any] = {"stage": self.name, "version": self.version, "table": self.schema.version}
+        material["arguments"] = {name: _material(value) for name, value in arguments.items()}
+        if self.raw_files is not None:
+            digests = RawFileDigests(store.home)
+            material["raw_files"] = [[name, digests.digest(path)] for name, path in self.raw_files(arguments)]
+            digests.save()
+        return hashlib.sha256(json.dumps(material, sort_keys=True).encode()).hexdigest()[:32]
+
+    def run(self, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
+        """Return the artefact and whether it was already there."""
+        store = Store()
+        upstream = {ref.key: ref.digest for value in arguments.values() for ref in _references(value)}
+        found = self._find(store, key, upstream)
+        if found is not None:
+            return found, True
+        with store.lock(key):
+            found = self._find(store, key, upstream)  # another process may have just finished it
+            if found is not None:
+                return found, True
+            return self._compute(store, key, arguments, upstream), False
+
+    def _find(self, store: Store, key: str, upstream: dict[str, str]) -> ManifestRef | None:
+        found = store.find(self.name, key)
+        if found is None or store.upstream_digests(self.name, key) == upstream:
+            return found
+        store.set_aside(found.path)
+        return None
+
+    def _compute(self, store: Store, key: str, arguments: dict[str, Any], upstream: dict[str, str]) -> ManifestRef:
+        folder, work = store.temporary_folder(key), store.work_folder(key)
+        # We hold the lock of this key: whatever lies here was left by a process that died.
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        work.mkdir(parents=True, exist_ok=True)
+        opened = {name: _opened(value) for name, value in arguments.items()}
+        started, wall, cpu = time.time(), time.perf_counter(), time.process_time()
+        table = self.function(Output(folder, work), **opened)
+        write_manifest(folder, table, self.schema)
+        record = {
+            "stage": self.name,
+            "stage_version": self.version,
+            "key": key,
+            "arguments": {name: _material(value) for name, value in arguments.items()},
+            "upstream": upstream,
+            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
+            "wall_seconds": round(time.perf_counter() - wall, 3),
+            "cpu_seconds": round(time.process_time() - cpu, 3),
+            # Highest of the process so far, which is what decides whether a machine is large enough.
+            "process_peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "versions": _versions(),
+        }
+        return store.publish(self.name, key, folder, record)
+
+
+def stage(
+    *, version: int, schema: TableSchema, raw_files: RawFiles | None = None
+) -> Callable[[Callable[..., pa.Table]], Stage]:
+    """Make a function a stage.
+
+    Args:
+        version: raise it when the function's output changes for the same inputs.
+        schema: of the table the function returns.
+        raw_files: names the files from outside the store that the stage reads.
+    """
+    return lambda function: Stage(function, version, schema, raw_files)
+
+
+def _run_as_task(stage: Stage, label: str, key: str, arguments: dict[str, Any]) -> ManifestRef:
+    """Run through Prefect, so that the run, its state (Completed or Cached) and its time are recorded there."""
+    from prefect import task
+    from prefect.cache_policies import NO_CACHE
+    from prefect.states import Completed
+
+    # The store decides what is cached. Prefect's own cache would be a second, weaker opinion.
+    @task(name=stage.name, task_run_name=label, cache_policy=NO_CACHE, persist_result=False)
+    def run() -> Any:
+        ref, cached = stage.run(key, arguments)
+        return Completed(data=ref, name="Cached" if cached else "Completed", message=f"{ref.rows} rows, key {key[:12]}")
+
+    return run(return_state=True).result()
+
+
+def _references(value: Any) -> list[ManifestRef]:
+    if isinstance(value, ManifestRef):
+        return [value]
+    if isinstance(value, list | tuple):
+        return [ref for item in value for ref in _references(item)]
+    return []
+
+
+def _opened(value: Any) -> Any:
+    if isinstance(value, ManifestRef):
+        return read_manifest(value)
+    if isinstance(value, list | tuple):
+        return [_opened(item) for item in value]
+    return value
+
+
+def _material(value: Any) -> Any:
+    """What of an argument decides the result, ready for JSON."""
+    if isinstance(value, ManifestRef):
+        return {"manifest": value.key}
+    if isinstance(value, Choice):
+        plugin = plugins.load_options(value)
+        return {
+            "plugin": f"{plugin.kind}/{plugin.name}",
+            "version": plugin.version,
+            "options": cache_material(plugin.options),
+        }
+    if isinstance(value, BaseModel):
+        return cache_material(value)
+    if isinstance(value, list | tuple):
+        return [_material(item) for item in value]
+    if value is None or isinstance(value, str | int | float | bool):
+        return value
+    raise DataError(f"a stage argument must be a manifest, options or a plain value, got {type(value).__name__}")
+
+
+def _versions() -> dict[str, str]:
+    packages = ("ctlev", "torch", "numpy", "diffusers", "transformers", "numba", "pyarrow", "prefect")
+    found = {"python": platform.python_version(), "platform": platform.platform(), "cores": str(os.cpu_count())}
+    for package in packages:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[package] = importlib.metadata.version(package)
+    return found
