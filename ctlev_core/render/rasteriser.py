@@ -1,0 +1,199 @@
+"""A z-buffer on the CPU: triangles with attributes to an image, exact coverage, perspective-correct, float throughout.
+
+OpenCV camera frame (x right, y down, z forward, m); pixel (row, column) samples the point (column + 0.5, row + 0.5).
+Depth is kept as 1 / z: linear on the screen, so interpolating it is exact, and 0 means "nothing here".
+Edges that two triangles share are covered without gaps: their edge functions are exact negatives of each other.
+
+Source: Pineda, A parallel algorithm for polygon rasterization, SIGGRAPH 1988.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from data_contracts.events import DataError
+
+NEAR_M = 0.05
+
+
+def render_attributes(
+    vertices_cam: np.ndarray,
+    faces: np.ndarray,
+    attributes: np.ndarray,
+    K: np.ndarray,
+    image_size: tuple[int, int],
+    out: np.ndarray | None = None,
+    *,
+    near_m: float = NEAR_M,
+    cull_back: bool = True,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rasterise a mesh with interpolated vertex attributes.
+
+    Triangles that cross the near plane are clipped; triangles with a vertex that is not finite are left out.
+
+    Args:
+        vertices_cam: [V, 3] float32 or float64, m, camera frame.
+        faces: [F, 3] integer.
+        attributes: [V, C] values to interpolate, for example colours or normals (which come out unnormalised).
+        K: [3, 3] px, without skew.
+        image_size: (width, height) px.
+        out: [H, W, C] background to draw over, of the dtype of `vertices_cam`; zeros when None.
+        near_m: nothing nearer than this is drawn.
+        cull_back: leave out triangles that face away (clockwise on the screen as seen from outside).
+    Returns:
+        image: [H, W, C], `out` itself where given.
+        depth_inverse: [H, W], 1 / m; 0 where there is no surface.
+    Raises:
+        DataError: shapes or dtypes disagree, or a face names a vertex that does not exist.
+    """
+    dtype = np.dtype(np.float32) if vertices_cam.dtype == np.float32 else np.dtype(np.float64)
+    width, height = image_size
+    if vertices_cam.ndim != 2 or vertices_cam.shape[1] != 3:
+        raise DataError(f"vertices_cam must be [V, 3], got {vertices_cam.shape}")
+    if attributes.ndim != 2 or len(attributes) != len(vertices_cam):
+        raise DataError(f"attributes must be [{len(vertices_cam)}, C], got {attributes.shape}")
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise DataError(f"faces must be [F, 3], got {faces.shape}")
+    if len(faces) and not (0 <= faces.min() and faces.max() < len(vertices_cam)):
+        raise DataError(f"faces must name vertices 0 .. {len(vertices_cam) - 1}, got {faces.min()} .. {faces.max()}")
+    if near_m <= 0.0:
+        raise DataError(f"near_m must be positive, got {near_m}")
+    shape = (height, width, attributes.shape[1])
+    image = np.zeros(shape, dtype) if out is None else out
+    if image.shape != shape or image.dtype != dtype:
+        raise DataError(f"out must be {shape} {dtype}, got {image.shape} {image.dtype}")
+    depth_inverse = np.zeros((height, width), dtype)
+    rasterise(
+        np.ascontiguousarray(vertices_cam, dtype),
+        np.ascontiguousarray(faces, np.int32),
+        np.ascontiguousarray(attributes, dtype),
+        np.ascontiguousarray(K, np.float64),
+        near_m,
+        cull_back,
+        image,
+        depth_inverse,
+    )
+    return image, depth_inverse
+
+
+@numba.njit(cache=True, nogil=True)
+def rasterise(vertices, faces, attributes, K, near, cull_back, image, depth_inverse):
+    """The kernel behind `render_attributes`, without checks: draws over `image` and `depth_inverse`."""
+    screen = np.empty((vertices.shape[0], 3))
+    for i in range(vertices.shape[0]):
+        _project(vertices[i, 0], vertices[i, 1], vertices[i, 2], K, near, screen[i])
+    clipped_points = np.empty((4, 3))
+    clipped_screen = np.empty((4, 3))
+    clipped_attributes = np.empty((4, attributes.shape[1]), dtype=attributes.dtype)
+    for f in range(faces.shape[0]):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        in_front = (screen[a, 2] > 0.0) + (screen[b, 2] > 0.0) + (screen[c, 2] > 0.0)
+        if in_front == 3:
+            _fill(screen, attributes, a, b, c, cull_back, image, depth_inverse)
+        elif in_front > 0:
+            corners = _clip_near(vertices, attributes, faces[f], near, clipped_points, clipped_attributes)
+            for i in range(corners):
+                # A corner cut off exactly on the plane must count as in front of it.
+                _project(clipped_points[i, 0], clipped_points[i, 1], clipped_points[i, 2], K, 0.0, clipped_screen[i])
+            for i in range(1, corners - 1):
+                _fill(clipped_screen, clipped_attributes, 0, i, i + 1, cull_back, image, depth_inverse)
+
+
+@numba.njit(cache=True, nogil=True)
+def vertex_normals(vertices, faces):
+    """Unit vertex normals [V, 3], area-weighted over the faces; 0 for a vertex without a face of positive area.
+
+    Args:
+        vertices: [V, 3] float.
+        faces: [F, 3] int32.
+    """
+    normals = np.zeros_like(vertices)
+    for f in range(faces.shape[0]):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        wx, wy, wz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+        for vertex in (a, b, c):
+            normals[vertex, 0] += nx
+            normals[vertex, 1] += ny
+            normals[vertex, 2] += nz
+    for i in range(vertices.shape[0]):
+        length = np.sqrt(normals[i, 0] ** 2 + normals[i, 1] ** 2 + normals[i, 2] ** 2)
+        if length > 0.0:
+            normals[i, 0] /= length
+            normals[i, 1] /= length
+            normals[i, 2] /= length
+    return normals
+
+
+@numba.njit(cache=True, nogil=True)
+def _project(x, y, z, K, near, out):
+    """Screen position and 1 / z; 1 / z is -1 nearer than `near`, behind the camera, or at NaN."""
+    if z > near:
+        inverse = 1.0 / z
+        out[0] = K[0, 0] * x * inverse + K[0, 2]
+        out[1] = K[1, 1] * y * inverse + K[1, 2]
+        out[2] = inverse
+    else:
+        out[2] = -1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _clip_near(vertices, attributes, face, near, points, values):
+    """Sutherland-Hodgman against z = near; writes the 3 or 4 corners left and returns how many."""
+    corners = 0
+    for i in range(3):
+        current, following = face[i], face[(i + 1) % 3]
+        z, z_following = vertices[current, 2], vertices[following, 2]
+        if not (np.isfinite(z) and np.isfinite(z_following)):
+            return 0
+        if z > near:
+            for k in range(3):
+                points[corners, k] = vertices[current, k]
+            for k in range(attributes.shape[1]):
+                values[corners, k] = attributes[current, k]
+            corners += 1
+        if (z > near) != (z_following > near):
+            cut = (near - z) / (z_following - z)
+            for k in range(3):
+                points[corners, k] = vertices[current, k] + cut * (vertices[following, k] - vertices[current, k])
+            points[corners, 2] = near
+            for k in range(attributes.shape[1]):
+                values[corners, k] = attributes[current, k] + cut * (attributes[following, k] - attributes[current, k])
+            corners += 1
+    return corners
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(screen, attributes, a, b, c, cull_back, image, depth_inverse):
+    ax, ay, bx, by, cx, cy = screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1]
+    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    # y points down, so a face that is counter-clockwise from outside has a negative area here. NaN fails both tests.
+    if not (area < 0.0 or (area > 0.0 and not cull_back)) or abs(area) == np.inf:
+        return
+    height, width = depth_inverse.shape
+    # Clamped on both sides before the cast: far outside the image a position need not fit an integer.
+    left = int(min(max(np.ceil(min(ax, bx, cx) - 0.5), 0.0), float(width)))
+    right = int(max(min(np.floor(max(ax, bx, cx) - 0.5), width - 1.0), -1.0))
+    top = int(min(max(np.ceil(min(ay, by, cy) - 0.5), 0.0), float(height)))
+    bottom = int(max(min(np.floor(max(ay, by, cy) - 0.5), height - 1.0), -1.0))
+    za, zb, zc = screen[a, 2], screen[b, 2], screen[c, 2]
+    sign = 1.0 if area > 0.0 else -1.0
+    for row in range(top, bottom + 1):
+        y = row + 0.5
+        for column in range(left, right + 1):
+            x = column + 0.5
+            wa = sign * ((bx - x) * (cy - y) - (by - y) * (cx - x))
+            wb = sign * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
+            wc = sign * ((ax - x) * (by - y) - (ay - y) * (bx - x))
+            if wa < 0.0 or wb < 0.0 or wc < 0.0:
+                continue
+            total = wa + wb + wc
+            inverse = (wa * za + wb * zb + wc * zc) / total
+            if inverse > depth_inverse[row, column]:
+                depth_inverse[row, column] = inverse
+                scale = 1.0 / (inverse * total)
+                wa, wb, wc = wa * za * scale, wb * zb * scale, wc * zc * scale
+                for k in range(attributes.shape[1]):
+                    image[row, column, k] = wa * attributes[a, k] + wb * attributes[b, k] + wc * attributes[c, k]

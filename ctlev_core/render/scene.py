@@ -1,0 +1,270 @@
+"""Random people, light, cameras and backgrounds, and the pictures of them: what `studio` and the prior share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+
+from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, shape_vertices, skin
+from ctlev_core.camera import Camera, project
+from ctlev_core.render.rasteriser import NEAR_M, rasterise
+from ctlev_core.skeletons import SMPL_JOINTS
+from data_contracts.events import DataError
+
+__all__ = [
+    "Camera", "CameraRange", "Light", "Subject", "project", "render_body_frames", "render_person",
+    "sample_background", "sample_betas", "sample_camera", "sample_light", "sample_subject",
+]  # fmt: skip
+
+SUPERSAMPLING = 2
+BOUNCE_LIGHT = 0.15
+"""Share of the direct light that reaches the side turned away."""
+DARKEST = 0.02
+
+SKIN, TROUSERS, SHIRT, SHOES, HAIR = range(5)
+_SIDES = ("left", "right")
+_SHIRT_JOINTS = (
+    "spine1", "spine2", "spine3", *(f"{side}_{name}" for side in _SIDES for name in ("collar", "shoulder")),
+)  # fmt: skip
+_SHOE_JOINTS = tuple(f"{side}_{name}" for side in _SIDES for name in ("ankle", "foot"))
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A person: the shape `betas` [10] and the reflectance `albedo` [V, C] float32 of each vertex, C = 1 or 3."""
+
+    betas: np.ndarray
+    albedo: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """One distant lamp and ambient light; `direction` [3] points to the lamp, camera frame, unit length."""
+
+    direction: np.ndarray
+    ambient: float
+
+
+@dataclass(frozen=True)
+class CameraRange:
+    """What `sample_camera` draws from, uniformly.
+
+    Attributes:
+        distance_m: of the camera from the middle of the person.
+        pitch_rad: positive looks down on the person.
+        yaw_rad: turn around the person; 0 sees the front of somebody who faces +z.
+        offset_m: largest shift of the person to the side and up or down.
+        focal_per_side: focal length over the shorter side of the image; above 2 the person is cropped.
+    """
+
+    distance_m: tuple[float, float] = (3.2, 4.0)
+    pitch_rad: tuple[float, float] = (-0.15, 0.3)
+    yaw_rad: tuple[float, float] = (0.0, 2 * np.pi)
+    offset_m: tuple[float, float] = (0.18, 0.12)
+    focal_per_side: tuple[float, float] = (1.5, 1.5)
+
+
+def sample_betas(rng: np.random.Generator) -> np.ndarray:
+    """A random body shape [10], two and a half standard deviations at most."""
+    return np.clip(1.2 * rng.normal(size=10), -2.5, 2.5)
+
+
+def sample_subject(rng: np.random.Generator, colour: bool, body: BodyModel | None = None) -> Subject:
+    """A random person: shape, skin, hair, clothes with a pattern; grey when not `colour`."""
+    body = body or load_body()
+    betas = sample_betas(rng)
+    parts = _clothing(rng, body)
+    base = rng.uniform(0.06, 0.85, (5, 3))
+    base[SKIN] = rng.uniform(0.45, 1.1) * np.array([0.8, 0.6, 0.5])
+    base[HAIR] = rng.uniform(0.04, 0.35) * np.array([1.0, 0.8, 0.6])
+    if not colour:
+        base = base.mean(axis=1, keepdims=True)
+    pattern = np.zeros(len(body.v_template))
+    for _ in range(3):
+        wave = rng.normal(size=3) * rng.uniform(15.0, 60.0)
+        pattern += rng.uniform(0.0, 0.35) * np.sin(body.v_template @ wave + rng.uniform(0.0, 2 * np.pi))
+    strength = np.where(np.isin(parts, (TROUSERS, SHIRT)), 1.0, 0.25)
+    albedo = base[parts] * np.exp(strength * pattern)[:, None]
+    return Subject(betas, np.clip(albedo, 0.03, 0.95).astype(np.float32))
+
+
+def _clothing(rng: np.random.Generator, body: BodyModel) -> np.ndarray:
+    """Part [V] of each vertex, by the joint that moves it most; sleeves and trouser legs are short at random."""
+    owner = np.array(SMPL_JOINTS)[body.weight_indices[:, 0]]
+    shirt = _SHIRT_JOINTS + (("left_elbow", "right_elbow") if rng.random() < 0.5 else ())
+    trousers = ("pelvis", "left_hip", "right_hip") + (("left_knee", "right_knee") if rng.random() < 0.6 else ())
+    parts = np.full(len(owner), SKIN)
+    for part, joints in ((TROUSERS, trousers), (SHIRT, shirt), (SHOES, _SHOE_JOINTS)):
+        parts[np.isin(owner, joints)] = part
+    up, forward = (body.v_template - body.joints[SMPL_JOINTS.index("head")])[:, 1:].T
+    parts[np.isin(owner, ("head", "neck")) & (up > 0.067) & ((up > 0.147) | (forward < -0.035))] = HAIR
+    return parts
+
+
+def sample_light(rng: np.random.Generator) -> Light:
+    """A lamp above and in front of the person."""
+    direction = np.array([rng.uniform(-0.8, 0.8), rng.uniform(-1.0, -0.2), -1.0])
+    return Light(direction / np.linalg.norm(direction), rng.uniform(0.3, 0.55))
+
+
+def sample_background(rng: np.random.Generator, image_size: tuple[int, int], colour: bool) -> np.ndarray:
+    """A random wall with stains of several sizes, often with a floor: [H, W, 3 or 1] float32 in (0, 1]."""
+    width, height = image_size
+    channels = 3 if colour else 1
+    wall = np.empty((height, width, channels))
+    wall[:] = rng.uniform(0.15, 0.7, channels)
+    if not (colour and rng.random() < 0.3):
+        for cells, amplitude in ((4, 0.35), (10, 0.2), (28, 0.12)):
+            noise = rng.normal(size=(cells, cells, channels)) * amplitude * rng.uniform(0.2, 1.0)
+            wall *= np.exp(cv2.resize(noise, image_size, interpolation=cv2.INTER_CUBIC).reshape(wall.shape))
+        if rng.random() < 0.5:
+            wall[int(rng.uniform(0.6, 0.95) * height) :] *= rng.uniform(0.6, 1.5)
+    return np.clip(wall, DARKEST, 1.0).astype(np.float32)
+
+
+def sample_camera(
+    rng: np.random.Generator,
+    joints: np.ndarray,
+    image_size: tuple[int, int],
+    ranges: CameraRange | None = None,
+) -> Camera:
+    """A camera that looks at a person from a random side.
+
+    Args:
+        rng: source of the randomness.
+        joints: [..., 3] m, world; the middle of their bounding box is what the camera looks at.
+        image_size: (width, height) px.
+        ranges: what to draw from.
+    Raises:
+        DataError: no joints, or joints that are not finite.
+    """
+    ranges = ranges or CameraRange()
+    points = joints.reshape(-1, 3)
+    if len(points) == 0 or not np.isfinite(points).all():
+        raise DataError(f"a camera needs finite joints to look at, got {points.shape[0]} points")
+    pitch, yaw = rng.uniform(*ranges.pitch_rad), rng.uniform(*ranges.yaw_rad)
+    turn_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    turn_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
+    # World y points up and people face +z; the camera has y down and looks along +z: half a turn about x.
+    R = np.diag([1.0, -1.0, -1.0]) @ turn_x @ turn_y
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    side, up = ranges.offset_m
+    offset = np.array([rng.uniform(-side, side), rng.uniform(-up, up), rng.uniform(*ranges.distance_m)])
+    width, height = image_size
+    focal = rng.uniform(*ranges.focal_per_side) * min(width, height)
+    K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(K, R, offset - R @ middle, image_size)
+
+
+def render_body_frames(
+    subject: Subject,
+    rotations: np.ndarray,
+    transl: np.ndarray,
+    camera: Camera,
+    background: np.ndarray,
+    light: Light,
+    body: BodyModel | None = None,
+) -> np.ndarray:
+    """Linear-intensity pictures of a moving person: skin, shade (Lambert), rasterise at twice the size, average.
+
+    Args:
+        subject: the person.
+        rotations: [T, 24, 3, 3] relative to the parent.
+        transl: [T, 3] m.
+        camera: the view; its image size is the size of the result.
+        background: [H, W, C] float32 in (0, 1], C as in `subject.albedo`.
+        light: the lamp.
+        body: the bundled body when None.
+    Returns:
+        [T, H, W, C] float32 in (0, 1].
+    Raises:
+        DataError: the background does not fit the camera or the subject.
+    """
+    body = body or load_body()
+    width, height = camera.image_size
+    shape = (height, width, subject.albedo.shape[1])
+    if background.shape != shape:
+        raise DataError(f"background must be {shape} for this camera and subject, got {background.shape}")
+    transforms, _ = joint_transforms(body, rotations, subject.betas, transl)
+    in_camera = camera.R @ transforms
+    in_camera[..., 3] += camera.translation
+    out = np.empty((len(transforms), *shape), dtype=np.float32)
+    _render_frames(
+        shape_vertices(body, subject.betas),
+        body.normals,
+        body.weight_indices,
+        body.weight_values,
+        in_camera.astype(np.float32),
+        body.faces,
+        subject.albedo,
+        camera.scaled(SUPERSAMPLING).K,
+        light.direction,
+        light.ambient,
+        np.ascontiguousarray(background, dtype=np.float32),
+        out,
+    )
+    return out
+
+
+def render_person(
+    rng: np.random.Generator,
+    subject: Subject,
+    rotations: np.ndarray,
+    transl: np.ndarray,
+    camera: Camera,
+    background: np.ndarray,
+    image_size: tuple[int, int],
+) -> np.ndarray:
+    """One picture [H, W, 3 or 1] float32 in (0, 1], linear, of one pose under random light.
+
+    Args:
+        rng: draws the light.
+        subject: the person.
+        rotations: [24, 3, 3]; transl: [3] m.
+        transl: see above.
+        camera: the view.
+        background: [H, W, C].
+        image_size: (width, height) px; must be the camera's.
+    Raises:
+        DataError: sizes disagree.
+    """
+    if image_size != camera.image_size:
+        raise DataError(f"the camera makes images of {camera.image_size} px, asked for {image_size}")
+    return render_body_frames(subject, rotations[None], transl[None], camera, background, sample_light(rng))[0]
+
+
+@numba.njit(cache=True, nogil=True)
+def _render_frames(
+    rest, normals, weight_indices, weight_values, transforms, faces, albedo, K, lamp, ambient, background, out
+):
+    frames, height, width, channels = out.shape
+    vertices, turned = np.empty_like(rest), np.empty_like(rest)
+    colours = np.empty_like(albedo)
+    image = np.empty((SUPERSAMPLING * height, SUPERSAMPLING * width, channels), dtype=np.float32)
+    depth_inverse = np.empty(image.shape[:2], dtype=np.float32)
+    for t in range(frames):
+        skin(rest, normals, weight_indices, weight_values, transforms[t], vertices, turned)
+        for i in range(rest.shape[0]):
+            x, y, z = turned[i, 0], turned[i, 1], turned[i, 2]
+            length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+            cosine = (x * lamp[0] + y * lamp[1] + z * lamp[2]) / length
+            light = ambient + (1.0 - ambient) * (cosine if cosine > 0.0 else -BOUNCE_LIGHT * cosine)
+            for k in range(channels):
+                colours[i, k] = albedo[i, k] * light
+        for row in range(image.shape[0]):
+            for column in range(image.shape[1]):
+                for k in range(channels):
+                    image[row, column, k] = background[row // SUPERSAMPLING, column // SUPERSAMPLING, k]
+        depth_inverse[:] = 0.0
+        rasterise(vertices, faces, colours, K, NEAR_M, True, image, depth_inverse)
+        for row in range(height):
+            for column in range(width):
+                for k in range(channels):
+                    total = np.float32(0.0)
+                    for dy in range(SUPERSAMPLING):
+                        for dx in range(SUPERSAMPLING):
+                            total += image[SUPERSAMPLING * row + dy, SUPERSAMPLING * column + dx, k]
+                    out[t, row, column, k] = total / (SUPERSAMPLING * SUPERSAMPLING)
