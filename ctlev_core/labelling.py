@@ -16,6 +16,7 @@ def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarr
         labels: the track, times ascending; a single row without joints labels every window.
         t_start_us: [N] int64, first event of each window.
         t_end_us: [N] int64, last event of each window.
+
     Returns:
         N rows at the windows' ends. A window between two labels takes the nearest one. A joint is visible when it is
         visible in at least half of the rows averaged.

@@ -19,9 +19,7 @@ class JointSet:
 
 
 def _joint_set(*joints: str) -> JointSet:
-    swapped = [
-        name.replace("left_", "#_").replace("right_", "left_").replace("#_", "right_") for name in joints
-    ]
+    swapped = [name.replace("left_", "#_").replace("right_", "left_").replace("#_", "right_") for name in joints]
     return JointSet(joints, tuple(joints.index(name) for name in swapped))
 
 

@@ -30,7 +30,9 @@ def cache_material(options: BaseModel) -> dict[str, Any]:
         if name in excluded:
             continue
         value = getattr(options, name)
-        material[name] = cache_material(value) if isinstance(value, BaseModel) else options.model_dump(mode="json")[name]
+        material[name] = (
+            cache_material(value) if isinstance(value, BaseModel) else options.model_dump(mode="json")[name]
+        )
     return material
 
 

@@ -60,6 +60,7 @@ def check_events(events: Events, where: str) -> Events:
     Args:
         events: what a reader or a simulator returned.
         where: names the recording in the message, for example the file.
+
     Returns:
         The same object, so that a reader can end in `return check_events(...)`.
     """

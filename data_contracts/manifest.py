@@ -62,6 +62,7 @@ def write_manifest(folder: Path, table: pa.Table, schema: TableSchema) -> Manife
 
     Returns:
         The reference, with `key` = the folder's name.
+
     Raises:
         DataError: the table breaks its schema.
     """
@@ -129,6 +130,7 @@ def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
     Args:
         ref: from the stage that made it.
         full: hash every file again; otherwise the manifest is hashed and the other files are checked by size.
+
     Raises:
         DataError: a file is missing or has changed, or the schema version is not the one this code reads.
     """

@@ -99,7 +99,13 @@ LABELS = TableSchema(
     "labels",
     1,
     None,
-    (_RECORDING, _SUBJECT, _CLASS, Column("t_us", pa.int64(), "time of the label on the clock of the events"), *_LABELS),
+    (
+        _RECORDING,
+        _SUBJECT,
+        _CLASS,
+        Column("t_us", pa.int64(), "time of the label on the clock of the events"),
+        *_LABELS,
+    ),
 )
 FRAMES = TableSchema(
     "frames",
@@ -222,7 +228,9 @@ def _check_values(values: pa.Array, column: Column, label: str) -> None:
     def refuse(wrong: pa.Array, expected: str) -> None:
         row = pc.index(wrong, True).as_py()
         if row >= 0:
-            raise DataError(f"{label}, column {column.name!r}, row {row}: expected {expected}, got {values[row].as_py()!r}")
+            raise DataError(
+                f"{label}, column {column.name!r}, row {row}: expected {expected}, got {values[row].as_py()!r}"
+            )
 
     if not column.nullable and values.null_count:
         refuse(values.is_null(), "a value")

@@ -13,7 +13,9 @@ from tasks.stage import Output, stage
 
 
 @stage(version=1, schema=tables.TRAINING)
-def train_downstream(out: Output, training_sets: list[Manifest], *, downstream: DownstreamChoice, seed: int) -> pa.Table:
+def train_downstream(
+    out: Output, training_sets: list[Manifest], *, downstream: DownstreamChoice, seed: int
+) -> pa.Table:
     """Train on the rows of split `train` of all given sets; the artefact's `model/` holds the weights.
 
     The number of optimiser steps is an option of the model, so that it is the same for every setting.

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from ctlev_core.intervals import cluster_bootstrap
 
 from ctlev_core import plugins
-from ctlev_core.intervals import cluster_bootstrap
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.events import DataError
@@ -104,7 +104,14 @@ def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manife
 
 @stage(version=1, schema=tables.SCORES)
 def score_distance(
-    out: Output, extractor: Manifest, real: Manifest, other: Manifest, *, downstream: DownstreamChoice, setting: str, split: str
+    out: Output,
+    extractor: Manifest,
+    real: Manifest,
+    other: Manifest,
+    *,
+    downstream: DownstreamChoice,
+    setting: str,
+    split: str,
 ) -> pa.Table:
     """Frechet distance between the features of real training frames and of another set of frames.
 

@@ -90,7 +90,11 @@ def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ing
             event_files.write_events_parquet(finished, events)
         os.link(finished, out.folder / name)
         row |= event_files.summarise(events)
-        row |= {"events_file": name, "sensor_width_px": events.sensor_size[0], "sensor_height_px": events.sensor_size[1]}
+        row |= {
+            "events_file": name,
+            "sensor_width_px": events.sensor_size[0],
+            "sensor_height_px": events.sensor_size[1],
+        }
     count = row["num_events"]
     parts = [
         {

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from data_contracts import tables
-from data_contracts.config import GeneratorChoice, SamplingChoice
+from data_contracts.config import SamplingChoice
 from data_contracts.manifest import Manifest, conditions_of
 from tasks.stage import Output, stage
 

@@ -1,9 +1,9 @@
 """The content-addressed store: where artefacts live, how they appear all at once, and who may write.
 
-    <home>/artefacts/<stage>/<key>/   finished artefacts: manifest.parquet, run.json, arrays, checkpoints
-    <home>/work/<key>/                resumable state of a stage that is running or was interrupted
-    <home>/tmp/<key>/                 an artefact being put together; renamed into place when complete
-    <home>/locks/<key>                held (flock) while a process makes the artefact; freed by the kernel on death
+<home>/artefacts/<stage>/<key>/   finished artefacts: manifest.parquet, run.json, arrays, checkpoints
+<home>/work/<key>/                resumable state of a stage that is running or was interrupted
+<home>/tmp/<key>/                 an artefact being put together; renamed into place when complete
+<home>/locks/<key>                held (flock) while a process makes the artefact; freed by the kernel on death
 """
 
 from __future__ import annotations

@@ -1,0 +1,134 @@
+"""The command line that every flow script shares: choose a preset, change options, see the plan, run."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from ctlev_core import plugins
+from ctlev_core.plugins import PluginError, validate_options
+from data_contracts.events import DataError
+from data_contracts.experiment import Experiment
+from flows import local_server
+from tasks.stage import PlannedStage, planning
+
+PRESETS = Path(__file__).resolve().parent / "presets"
+
+
+def preset_names() -> list[str]:
+    """Names of the bundled presets."""
+    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+
+
+def load_experiment(preset: str, overrides: list[str]) -> Experiment:
+    """Read a preset, apply `key=value` overrides and validate everything, plug-in options included.
+
+    Args:
+        preset: name of a bundled preset, or path of a YAML file.
+        overrides: dotted names, for example `encoding.options.polarity=false`; values are YAML.
+
+    Raises:
+        PluginError: unknown preset, option or plug-in, or a wrong value.
+    """
+    path = Path(preset) if preset.endswith((".yaml", ".yml")) else PRESETS / f"{preset}.yaml"
+    if not path.is_file():
+        raise PluginError(f"unknown preset {preset!r}; known: {', '.join(preset_names())}, or the path of a .yaml file")
+    values = yaml.safe_load(path.read_text())
+    if not isinstance(values, dict):
+        raise PluginError(f"{path}: a preset is a mapping of options, got {type(values).__name__}")
+    for override in overrides:
+        _apply(values, override)
+    experiment = validate_options(Experiment, values, f"preset {preset!r}")
+    for choice in experiment.choices:
+        plugins.load_options(choice)
+    return experiment
+
+
+def _apply(values: dict[str, Any], override: str) -> None:
+    name, separator, text = override.partition("=")
+    if not separator or not name:
+        raise PluginError(f"--set expects key=value, got {override!r}")
+    *parents, last = name.split(".")
+    target = values
+    for parent in parents:
+        target = target.setdefault(parent, {})
+        if not isinstance(target, dict):
+            raise PluginError(f"--set {name}: {parent!r} is not a group of options")
+    try:
+        target[last] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise PluginError(f"--set {name}: {text!r} is not YAML: {error}") from None
+
+
+def print_plan(rows: list[PlannedStage]) -> None:
+    """One line per stage: cached or to run, and its key."""
+    width = max(len(row.label) for row in rows)
+    for row in rows:
+        print(f"{'cached' if row.cached else 'to run':7} {row.label:{width}}  {row.key}")
+    print(f"{sum(row.cached for row in rows)} of {len(rows)} stages are cached")
+
+
+def main(flow: Any, describe: Callable[[Any], str], *, default_preset: str = "demo") -> int:
+    """Run a flow as a script.
+
+    Args:
+        flow: a Prefect flow of one parameter, an `Experiment`.
+        describe: from the flow's result to the lines printed at the end.
+        default_preset: used without `--preset`.
+
+    Returns:
+        Exit status: 0 done, 2 wrong input, 130 interrupted.
+    """
+    arguments = _parse(flow, default_preset)
+    started = time.perf_counter()
+    try:
+        experiment = load_experiment(arguments.preset, arguments.set)
+        if not arguments.dry_run:
+            local_server.start(Path(os.environ["CTLEV_HOME"]))
+        with planning() as rows:
+            flow.fn(experiment)
+        if arguments.dry_run:
+            print_plan(rows)
+            return 0
+        _use_cores(rows)
+        local_server.wait()
+        result = flow(experiment)
+    except (DataError, PluginError, ValidationError, FileNotFoundError, PermissionError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted; finished stages and checkpoints are kept", file=sys.stderr)
+        return 130
+    cached = sum(row.cached for row in rows)
+    print(describe(result))
+    print(f"{len(rows)} stages, {cached} of them cached, in {time.perf_counter() - started:.1f} s")
+    return 0
+
+
+def _use_cores(rows: list[PlannedStage]) -> None:
+    """Torch on all cores, unless everything is cached and torch is not needed at all."""
+    if all(row.cached for row in rows):
+        return
+    import torch
+
+    torch.set_num_threads(os.cpu_count() or 1)
+
+
+def _parse(flow: Any, default_preset: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=(flow.__doc__ or "").strip().splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--preset", default=default_preset, help=f"one of {', '.join(preset_names())}, or a .yaml file")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change an option; repeatable")
+    parser.add_argument("--dry-run", action="store_true", help="print the plan and run nothing")
+    parser.add_argument("--home", help="folder of all state [CTLEV_HOME or .ctlev]")
+    parser.add_argument("--verbose", action="store_true", help="show Prefect's log")
+    return parser.parse_args()

@@ -1,0 +1,48 @@
+"""The whole experiment: recordings in, a scored report out.
+
+python flows/full_experiment.py [--preset NAME] [--set key=value ...] [--dry-run]
+"""
+
+from __future__ import annotations
+
+import sys
+
+from tasks.report import publish_report, report
+
+from data_contracts.experiment import Experiment
+from data_contracts.manifest import ManifestRef
+from flows.command_line import main
+from flows.evaluate import evaluate
+from flows.prepare_dataset import prepare_dataset
+from flows.settings import HOME, flow
+from flows.synthesize import synthesize
+from flows.train_generator import train_generator
+from tasks.stage import call_flow
+
+
+@flow(name="full-experiment")
+def full_experiment(experiment: Experiment) -> ManifestRef:
+    """Every stage from recordings to the report; what is in the store already is not computed again."""
+    dataset = call_flow(prepare_dataset, experiment)
+    checkpoint = call_flow(train_generator, experiment, dataset)
+    synthetic = call_flow(synthesize, experiment, dataset, checkpoint)
+    evaluation = call_flow(evaluate, experiment, dataset, synthetic)
+    return report(
+        dataset.recordings,
+        dataset.frames,
+        dataset.sample_conditions,
+        checkpoint,
+        synthetic,
+        evaluation.scores,
+        evaluation.models,
+        experiment=experiment,
+        label=experiment.name,
+    )
+
+
+def _describe(made: ManifestRef) -> str:
+    return publish_report(made, HOME)
+
+
+if __name__ == "__main__":
+    sys.exit(main(full_experiment, _describe))

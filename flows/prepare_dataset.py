@@ -1,0 +1,59 @@
+"""Ingest recordings, encode them as event images and render the conditions to train on and to sample from."""
+
+from __future__ import annotations
+
+import sys
+
+from data_contracts.config import Frozen
+from data_contracts.experiment import Experiment
+from data_contracts.manifest import ManifestRef
+from flows.command_line import main
+from flows.settings import flow
+from tasks.condition import condition_frames, condition_samples
+from tasks.encode import encode
+from tasks.ingest import ingest
+
+
+class PreparedDataset(Frozen):
+    """Manifests of a dataset ready for training and sampling."""
+
+    recordings: ManifestRef
+    frames: ManifestRef
+    frame_conditions: ManifestRef
+    sample_conditions: ManifestRef
+
+
+@flow(name="prepare-dataset")
+def prepare_dataset(experiment: Experiment) -> PreparedDataset:
+    """Ingest, encode and condition one dataset."""
+    recordings = ingest(dataset=experiment.dataset, label=experiment.dataset.name)
+    frames = encode(
+        recordings, encoding=experiment.encoding, windows=experiment.windows, label=experiment.encoding.name
+    )
+    frame_conditions = condition_frames(
+        frames, condition=experiment.condition, seed=experiment.seed, label=f"{experiment.condition.name}, training"
+    )
+    sample_conditions = condition_samples(
+        recordings,
+        frames,
+        condition=experiment.condition,
+        encoding=experiment.encoding,
+        count=experiment.num_synthetic,
+        seed=experiment.seed,
+        label=f"{experiment.condition.name}, to sample",
+    )
+    return PreparedDataset(
+        recordings=recordings, frames=frames, frame_conditions=frame_conditions, sample_conditions=sample_conditions
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(
+        main(
+            prepare_dataset,
+            lambda dataset: (
+                f"recordings: {dataset.recordings.rows} in {dataset.recordings.path}\n"
+                f"frames:     {dataset.frames.rows} in {dataset.frames.path}"
+            ),
+        )
+    )

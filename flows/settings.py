@@ -1,0 +1,45 @@
+"""Environment of every flow, set before Prefect is imported: `from flows.settings import flow`.
+
+All state lies under one folder: `--home`, else the variable CTLEV_HOME, else `.ctlev` in the working directory.
+Nothing here reaches out: telemetry and update checks are off, and model hubs are never asked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from flows import local_server
+
+_OFFLINE = {
+    "HF_HUB_OFFLINE": "1",
+    "HF_HUB_DISABLE_TELEMETRY": "1",
+    "TRANSFORMERS_VERBOSITY": "error",
+    "DIFFUSERS_VERBOSITY": "error",
+    "TOKENIZERS_PARALLELISM": "false",
+}
+
+
+def _configure() -> Path:
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--home", type=Path)
+    parser.add_argument("--verbose", action="store_true")
+    known, _ = parser.parse_known_args(sys.argv[1:])
+    home = (known.home or Path(os.environ.get("CTLEV_HOME", ".ctlev"))).absolute()
+    os.environ["CTLEV_HOME"] = str(home)
+    for name, value in _OFFLINE.items():
+        os.environ.setdefault(name, value)
+    local_server.configure(home, verbose=known.verbose)
+    # `python flows/full_experiment.py` puts this folder on the path, where evaluate.py would hide packages of that name.
+    folder = str(Path(__file__).resolve().parent)
+    sys.path[:] = [entry for entry in sys.path if not entry or str(Path(entry).resolve()) != folder]
+    return home
+
+
+HOME = _configure()
+
+from prefect import flow  # noqa: E402  (Prefect reads its settings when it is imported)
+
+__all__ = ["HOME", "flow"]

@@ -1,0 +1,34 @@
+"""Sample labelled synthetic event images from a fine-tuned generator; what a schedule runs."""
+
+from __future__ import annotations
+
+import sys
+
+from data_contracts.experiment import Experiment
+from data_contracts.manifest import ManifestRef
+from flows.command_line import main
+from flows.prepare_dataset import PreparedDataset, prepare_dataset
+from flows.settings import flow
+from flows.train_generator import train_generator
+from tasks.sample import sample
+from tasks.stage import call_flow
+
+
+@flow(name="synthesize")
+def synthesize(
+    experiment: Experiment, dataset: PreparedDataset | None = None, checkpoint: ManifestRef | None = None
+) -> ManifestRef:
+    """Sample the experiment's synthetic frames; dataset and checkpoint are made first unless they are given."""
+    dataset = dataset or call_flow(prepare_dataset, experiment)
+    checkpoint = checkpoint or call_flow(train_generator, experiment, dataset)
+    return sample(
+        checkpoint,
+        dataset.sample_conditions,
+        sampling=experiment.sampling_choice,
+        seed=experiment.seed,
+        label=experiment.generator.name,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(synthesize, lambda synthetic: f"synthetic frames: {synthetic.rows} in {synthetic.path}"))

@@ -1,0 +1,30 @@
+"""Fine-tune one generator on labelled event images."""
+
+from __future__ import annotations
+
+import sys
+
+from data_contracts.experiment import Experiment
+from data_contracts.manifest import ManifestRef
+from flows.command_line import main
+from flows.prepare_dataset import PreparedDataset, prepare_dataset
+from flows.settings import flow
+from tasks.finetune import finetune
+from tasks.stage import call_flow
+
+
+@flow(name="train-generator")
+def train_generator(experiment: Experiment, dataset: PreparedDataset | None = None) -> ManifestRef:
+    """Fine-tune the experiment's generator; the dataset is prepared first unless it is given."""
+    dataset = dataset or call_flow(prepare_dataset, experiment)
+    return finetune(
+        dataset.frames,
+        dataset.frame_conditions,
+        generator=experiment.generator,
+        seed=experiment.seed,
+        label=experiment.generator.name,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(train_generator, lambda checkpoint: f"checkpoint: {checkpoint.path / 'checkpoint'}"))

@@ -1,0 +1,46 @@
+"""Shared fixtures. Nothing here starts Prefect: only tests/flows does, and it runs the scripts as a user would."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+for _name, _value in {"HF_HUB_OFFLINE": "1", "DO_NOT_TRACK": "1", "TRANSFORMERS_VERBOSITY": "error"}.items():
+    os.environ.setdefault(_name, _value)
+
+from data_contracts.events import Events
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+REAL_DATA = REPOSITORY.parent / "shared" / "real"
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty home folder for the store."""
+    monkeypatch.setenv("CTLEV_HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+@pytest.fixture
+def real_recordings() -> Path:
+    """Three real recordings in class folders; they are not part of the repository."""
+    folder = REAL_DATA / "events"
+    if not folder.is_dir():
+        pytest.skip("the real recordings are not beside this checkout")
+    return folder
+
+
+@pytest.fixture
+def random_events() -> Events:
+    """2,000 valid events on a 32 x 24 sensor."""
+    random = np.random.default_rng(0)
+    return Events(
+        np.sort(random.integers(0, 100_000, 2000)).astype(np.int64),
+        random.integers(0, 32, 2000).astype(np.uint16),
+        random.integers(0, 24, 2000).astype(np.uint16),
+        random.integers(0, 2, 2000).astype(np.uint8),
+        (32, 24),
+    )

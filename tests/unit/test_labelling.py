@@ -1,0 +1,55 @@
+"""One label per window: against a plain loop, and at the edges."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctlev_core.labelling import labels_at_windows
+from data_contracts.labels import Labels
+
+
+def track(times, joints, visible=None):
+    joints = np.asarray(joints, np.float32)
+    visible = np.isfinite(joints).all(-1) if visible is None else np.asarray(visible)
+    return Labels(("walk",) * len(times), np.asarray(times, np.int64), joints, visible, "dhp19")
+
+
+def test_mean_over_the_window_ignores_unknown_positions():
+    labels = track([0, 10, 20, 30], [[[0, 0]], [[2, 4]], [[np.nan, np.nan]], [[100, 100]]])
+    found = labels_at_windows(labels, np.array([5]), np.array([25]))
+    assert found.joints2d[0, 0].tolist() == [2, 4]
+    assert found.visible[0, 0]  # visible in one of two rows
+
+
+def test_window_between_labels_takes_the_nearest():
+    labels = track([0, 100], [[[0, 0]], [[9, 9]]])
+    found = labels_at_windows(labels, np.array([40, 60, 300, -50]), np.array([45, 65, 310, -40]))
+    assert found.joints2d[:, 0, 0].tolist() == [0, 9, 9, 0]
+
+
+def test_joint_never_known_is_invisible():
+    found = labels_at_windows(track([0, 1], [[[np.nan, 1]], [[np.nan, 1]]]), np.array([0]), np.array([1]))
+    assert not found.visible.any()
+
+
+def test_class_only_track_labels_every_window():
+    labels = Labels(("spot",), np.array([1000], np.int64))
+    found = labels_at_windows(labels, np.array([0, 5000]), np.array([10, 6000]))
+    assert found.class_names == ("spot", "spot") and found.joints2d is None
+
+
+@given(st.integers(1, 30), st.integers(1, 20), st.integers(0, 2**32 - 1))
+def test_equals_a_plain_loop(num_labels, num_windows, seed):
+    random = np.random.default_rng(seed)
+    times = np.sort(random.choice(1000, num_labels, replace=False))
+    joints = random.uniform(-5, 70, (num_labels, 3, 2))
+    labels = track(times, joints)
+    start = random.integers(0, 1000, num_windows)
+    end = start + random.integers(0, 200, num_windows)
+    found = labels_at_windows(labels, start, end)
+    for row in range(num_windows):
+        inside = [i for i in range(num_labels) if start[row] <= times[i] <= end[row]]
+        if inside:
+            expected = sum(labels.joints2d[i].astype(float) for i in inside) / len(inside)
+            assert found.joints2d[row] == pytest.approx(expected, rel=1e-5, abs=1e-4)

@@ -1,0 +1,222 @@
+"""Keys, caching, crashes and provenance of a stage, without Prefect."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pydantic import Field
+
+from ctlev_core.plugins import PluginError
+from data_contracts import tables
+from data_contracts.config import RUN_SETTING, DatasetChoice, Frozen, Windows, cache_material
+from data_contracts.events import DataError
+from data_contracts.manifest import read_manifest
+from tasks.stage import planning, stage
+from tasks.store import Store
+
+
+def curve(losses):
+    steps = range(len(losses))
+    return pa.table(
+        {
+            "curve": pa.array(["training"] * len(losses)),
+            "step": pa.array(list(steps), pa.int64()),
+            "loss": pa.array([float(loss) for loss in losses], pa.float64()),
+        }
+    )
+
+
+calls = []
+
+
+@stage(version=1, schema=tables.TRAINING)
+def first(out, *, windows, seed=0):
+    """Writes an array and a table."""
+    calls.append("first")
+    out.write_array("frames", np.full((2, 3), seed))
+    return curve([seed, windows.num_events])
+
+
+@stage(version=1, schema=tables.TRAINING)
+def second(out, source):
+    """Depends on `first`."""
+    calls.append("second")
+    return curve([sum(source.column("loss"))])
+
+
+def run(a_stage, *inputs, **settings):
+    """What a Prefect task does, without Prefect."""
+    bound = a_stage.signature.bind(None, *inputs, **settings)
+    bound.apply_defaults()
+    arguments = dict(list(bound.arguments.items())[1:])
+    return a_stage.run(a_stage.key(arguments, Store()), arguments)
+
+
+@pytest.fixture(autouse=True)
+def _forget(home):
+    calls.clear()
+
+
+def test_second_run_is_cached_and_equal():
+    ref, cached = run(first, windows=Windows())
+    again, cached_again = run(first, windows=Windows())
+    assert (cached, cached_again) == (False, True)
+    assert again == ref and calls == ["first"]
+
+
+def test_key_depends_on_options_seed_version_and_upstream():
+    def key(a_stage, *inputs, **settings):
+        with planning() as rows:
+            a_stage(*inputs, **settings)
+        return rows[0].key
+
+    base = key(first, windows=Windows())
+    assert key(first, windows=Windows()) == base
+    assert key(first, windows=Windows(num_events=1)) != base
+    assert key(first, windows=Windows(), seed=1) != base
+    first.version = 2
+    try:
+        assert key(first, windows=Windows()) != base
+    finally:
+        first.version = 1
+    ref, _ = run(first, windows=Windows())
+    other, _ = run(first, windows=Windows(num_events=1))
+    assert key(second, ref) != key(second, other)
+
+
+def test_run_settings_stay_outside_the_key():
+    class Options(Frozen):
+        path: str = Field("a", json_schema_extra=RUN_SETTING)
+        size: int = 1
+
+    assert cache_material(Options(path="b")) == cache_material(Options(path="a")) == {"size": 1}
+
+
+def test_planning_computes_nothing_and_knows_every_key():
+    with planning() as rows:
+        second(first(windows=Windows()))
+    assert calls == [] and [row.cached for row in rows] == [False, False]
+    ref, _ = run(first, windows=Windows())
+    done, _ = run(second, ref)
+    with planning() as rows_after:
+        second(first(windows=Windows()))
+    assert [row.cached for row in rows_after] == [True, True]
+    assert [row.key for row in rows_after] == [row.key for row in rows] == [ref.key, done.key]
+
+
+def test_damaged_artefact_is_set_aside_and_made_anew(home):
+    ref, _ = run(first, windows=Windows())
+    (ref.path / "frames.npy").write_bytes(b"short")
+    again, cached = run(first, windows=Windows())
+    assert not cached and again.digest == ref.digest
+    assert len(list((home / "damaged" / "first").iterdir())) == 1
+
+
+def test_artefact_of_changed_input_is_made_anew():
+    source, _ = run(first, windows=Windows(), seed=1)
+    run(second, source)
+    record = source.path / "run.json"
+    # The input is repeated and comes out differently, as a training run may on another machine.
+    manifest = source.path / "manifest.parquet"
+    manifest.unlink()
+    from data_contracts.manifest import write_manifest
+
+    changed = write_manifest(source.path, curve([7, 7]), tables.TRAINING)
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"digest": changed.digest}))
+    repeated, cached = run(first, windows=Windows(), seed=1)
+    assert cached and repeated.digest != source.digest
+    made, cached = run(second, repeated)
+    assert not cached and read_manifest(made).column("loss") == [14.0]
+
+
+def test_failure_publishes_nothing(home):
+    @stage(version=1, schema=tables.TRAINING)
+    def fails(out):
+        """Breaks its schema."""
+        (out.work / "state").write_text("kept")
+        return curve([float("nan")])
+
+    with pytest.raises(DataError, match="column 'loss', row 0: expected a finite number"):
+        run(fails)
+    assert not (home / "artefacts" / "fails").exists()
+    assert [path.read_text() for path in (home / "work").rglob("state")] == ["kept"]
+
+
+def test_provenance_record():
+    source, _ = run(first, windows=Windows(num_events=5), seed=3)
+    ref, _ = run(second, source)
+    record = json.loads((ref.path / "run.json").read_text())
+    assert record["upstream"] == {source.key: source.digest}
+    assert record["digest"] == ref.digest and record["stage_version"] == 1
+    assert record["wall_seconds"] >= 0 and record["process_peak_memory_mib"] > 1
+    assert record["versions"]["numpy"] == np.__version__
+    arguments = json.loads((source.path / "run.json").read_text())["arguments"]
+    assert arguments["seed"] == 3 and arguments["windows"]["num_events"] == 5
+
+
+def test_stage_argument_of_unknown_kind_is_refused():
+    with pytest.raises(DataError, match="must be a manifest, options or a plain value, got set"):
+        run(second, {1, 2})
+
+
+def test_unknown_plugin_in_an_argument_is_refused():
+    @stage(version=1, schema=tables.TRAINING)
+    def uses(out, *, dataset):
+        """Names a plug-in."""
+        return curve([0])
+
+    with pytest.raises(PluginError, match="unknown plug-in 'nonesuch' in datasets; known: folder"):
+        run(uses, dataset=DatasetChoice(name="nonesuch"))
+
+
+SLOW_STAGE = """
+    import sys, time
+    import numpy as np, pyarrow as pa
+    from data_contracts import tables
+    from tasks.stage import stage
+    from tasks.store import Store
+
+    @stage(version=1, schema=tables.TRAINING)
+    def slow(out, *, seed=0):
+        out.write_array("frames", np.zeros(1000))
+        (out.work / "checkpoint").write_text("half way")
+        print("started", flush=True)
+        time.sleep(float(sys.argv[1]))
+        return pa.table({"curve": ["training"], "step": pa.array([0], pa.int64()), "loss": pa.array([0.0])})
+
+    ref, cached = slow.run(slow.key({"seed": 0}, Store()), {"seed": 0})
+    print(ref.digest, cached, flush=True)
+"""
+
+
+def start_slow(seconds):
+    command = [sys.executable, "-c", textwrap.dedent(SLOW_STAGE), str(seconds)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ)
+
+
+def test_killed_stage_leaves_no_artefact_and_can_be_run_again(home):
+    process = start_slow(60)
+    assert process.stdout.readline() == "started\n"
+    process.kill()
+    process.wait()
+    assert not (home / "artefacts").exists()
+    assert [path.read_text() for path in (home / "work").rglob("checkpoint")] == ["half way"]
+    process = start_slow(0)
+    output, _ = process.communicate(timeout=60)
+    assert output.splitlines()[1].endswith("False")
+    assert not list((home / "tmp").iterdir()) and not list((home / "work").iterdir())
+
+
+def test_two_processes_make_an_artefact_once():
+    started = time.monotonic()
+    processes = [start_slow(2), start_slow(2)]
+    outputs = [process.communicate(timeout=60)[0].splitlines() for process in processes]
+    assert sorted(line.split()[1] for lines in outputs for line in lines if line != "started") == ["False", "True"]
+    assert sum(lines.count("started") for lines in outputs) == 1
+    assert time.monotonic() - started < 50
