@@ -13,7 +13,7 @@ class Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-RUN_SETTING = {"run_setting": True}
+RUN_SETTING: dict[str, Any] = {"run_setting": True}
 """Pass as `Field(json_schema_extra=RUN_SETTING)`: the field (a path, a device, a worker count) must not
 change any result and therefore stays outside the cache key."""
 

@@ -1,0 +1,62 @@
+"""Event files of any known format: which format a file has, its events, and what the manifest says of them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import ModuleType
+
+from ctlev_core import plugins
+from data_contracts.events import DataError, Events
+
+
+def find_format(path: Path) -> ModuleType:
+    """The format plug-in whose `sniff` recognises the file's content; the suffix is not asked.
+
+    Raises:
+        DataError: no such file, or no format recognises it; the message lists the known formats.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: expected an event file, got {'a folder' if path.is_dir() else 'nothing there'}")
+    formats = {name: plugins.load("formats", name) for name in plugins.names("formats")}
+    for module in formats.values():
+        if module.sniff(path):
+            return module
+    known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in formats.items())
+    raise DataError(
+        f"{path}: not an event file of a known format ({path.stat().st_size} bytes); known formats: {known}"
+    )
+
+
+def read_events_file(path: Path) -> Events:
+    """All events of a file of any known format, checked.
+
+    Raises:
+        DataError: see `find_format` and the format's own `read`.
+    """
+    return find_format(path).read(path)
+
+
+def write_events_parquet(path: Path, events: Events) -> None:
+    """Write events in the project's own format; the file appears under its name only when it is complete."""
+    partial = path.with_name(path.name + ".partial")
+    plugins.load("formats", "parquet").write(partial, events)
+    os.replace(partial, path)
+
+
+def summarise(events: Events) -> dict[str, int]:
+    """What a manifest says of a recording.
+
+    Returns:
+        num_events, duration_us, t_first_us, t_last_us, num_positive, num_negative; times are 0 without events.
+    """
+    num_events = len(events)
+    num_positive = int(events.p.sum(dtype="int64"))
+    return {
+        "num_events": num_events,
+        "duration_us": events.duration_us,
+        "t_first_us": int(events.t[0]) if num_events else 0,
+        "t_last_us": int(events.t[-1]) if num_events else 0,
+        "num_positive": num_positive,
+        "num_negative": num_events - num_positive,
+    }

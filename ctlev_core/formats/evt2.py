@@ -1,0 +1,42 @@
+"""Prophesee EVT 2.0: a text header, then one 32-bit word an event.
+
+Time stamps are the file's own, not shifted to zero. The sensor size is the header's; older recordings state none, then
+the camera named there decides (third generation 640 x 480, fourth 1280 x 720 px), and without a known camera the
+smallest of 304 x 240, 320 x 320, 640 x 480 and 1280 x 720 px that holds all events.
+
+Source: Prophesee, "EVT 2.0 format", docs.prophesee.ai.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ctlev_core import prophesee
+from data_contracts.events import Events
+
+VERSION = 1
+SUFFIXES = (".raw", ".evt2")
+
+
+def sniff(path: Path) -> bool:
+    """Does the header say EVT 2.0?"""
+    return prophesee.sniff(path, "EVT2")
+
+
+def read(path: Path) -> Events:
+    """The whole file.
+
+    Raises:
+        DataError: a header without words, a cut word, an unknown sensor size, events outside the sensor, or time
+            that runs backwards (an overflow of the 34-bit clock is not).
+    """
+    return prophesee.read(path, "EVT2")
+
+
+def write(path: Path, events: Events) -> None:
+    """Write events so that `read` returns them unchanged.
+
+    Raises:
+        DataError: the sensor has more than 2048 px a side, or time stamps past 65,536 overflows of the clock.
+    """
+    prophesee.write(path, events, "EVT2")

@@ -1,0 +1,42 @@
+"""Prophesee EVT 3.0: a text header, then 16-bit words that change a state (time, row) or add events to it.
+
+Time stamps are the file's own, not shifted to zero. The sensor size is found as in EVT 2.0: the header's geometry, else
+the camera named there (third generation 640 x 480, fourth 1280 x 720 px), else the smallest of 304 x 240, 320 x 320,
+640 x 480 and 1280 x 720 px that holds all events.
+
+Source: Prophesee, "EVT 3.0 format", docs.prophesee.ai.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ctlev_core import prophesee
+from data_contracts.events import Events
+
+VERSION = 1
+SUFFIXES = (".raw", ".evt3")
+
+
+def sniff(path: Path) -> bool:
+    """Does the header say EVT 3.0?"""
+    return prophesee.sniff(path, "EVT3")
+
+
+def read(path: Path) -> Events:
+    """The whole file.
+
+    Raises:
+        DataError: a header without words, a cut word, an unknown sensor size, events outside the sensor, or time
+            that runs backwards (an overflow of the 24-bit clock is not).
+    """
+    return prophesee.read(path, "EVT3")
+
+
+def write(path: Path, events: Events) -> None:
+    """Write events, one word each, so that `read` returns them unchanged.
+
+    Raises:
+        DataError: the sensor has more than 2048 px a side, or time stamps past 65,536 overflows of the clock.
+    """
+    prophesee.write(path, events, "EVT3")
