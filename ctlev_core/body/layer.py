@@ -1,6 +1,7 @@
 """Linear blend skinning of any body with SMPL's interface: 24 joints, 10 shape directions.
 
-World frame: metres, y up, the rest pose (a T) faces +z, the person's left is +x. Pose-corrective shapes are not applied.
+World frame: metres, y up, the rest pose (a T) faces +z, the person's left is +x. Pose-dependent corrective shapes are
+not applied.
 
 Source: Loper et al., SMPL, ACM TOG 2015, eq. 2-10 without B_P.
 """
@@ -78,7 +79,7 @@ def make_body(
             raise DataError(f"body model: {name} must have the shape {shape}, got {array.shape}")
         if not np.isfinite(array).all():
             raise DataError(f"body model: {name} holds values that are not finite")
-    if len(faces) and not (0 <= faces.min() and faces.max() < count):
+    if len(faces) and (faces.min() < 0 or faces.max() >= count):
         raise DataError(f"body model: faces must name vertices 0 .. {count - 1}, got {faces.min()} .. {faces.max()}")
     indices = np.argsort(-weights, axis=1, kind="stable")[:, :BONES_PER_VERTEX]
     values = np.take_along_axis(weights.astype(np.float64), indices, axis=1)

@@ -320,7 +320,7 @@ def main() -> None:
     arrays = build_arrays()
     integer = ("f", "kintree_table")
     stored = {name: array.astype(np.int32 if name in integer else np.float32) for name, array in arrays.items()}
-    np.savez_compressed(BUNDLED_BODY, **stored)
+    np.savez_compressed(BUNDLED_BODY, **stored)  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ def render_attributes(
         raise DataError(f"attributes must be [{len(vertices_cam)}, C], got {attributes.shape}")
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise DataError(f"faces must be [F, 3], got {faces.shape}")
-    if len(faces) and not (0 <= faces.min() and faces.max() < len(vertices_cam)):
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices_cam)):
         raise DataError(f"faces must name vertices 0 .. {len(vertices_cam) - 1}, got {faces.min()} .. {faces.max()}")
     if near_m <= 0.0:
         raise DataError(f"near_m must be positive, got {near_m}")

@@ -247,24 +247,36 @@ def _render_frames(
     depth_inverse = np.empty(image.shape[:2], dtype=np.float32)
     for t in range(frames):
         skin(rest, normals, weight_indices, weight_values, transforms[t], vertices, turned)
-        for i in range(rest.shape[0]):
-            x, y, z = turned[i, 0], turned[i, 1], turned[i, 2]
-            length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
-            cosine = (x * lamp[0] + y * lamp[1] + z * lamp[2]) / length
-            light = ambient + (1.0 - ambient) * (cosine if cosine > 0.0 else -BOUNCE_LIGHT * cosine)
-            for k in range(channels):
-                colours[i, k] = albedo[i, k] * light
+        _shade(turned, albedo, lamp, ambient, colours)
         for row in range(image.shape[0]):
             for column in range(image.shape[1]):
                 for k in range(channels):
                     image[row, column, k] = background[row // SUPERSAMPLING, column // SUPERSAMPLING, k]
         depth_inverse[:] = 0.0
         rasterise(vertices, faces, colours, K, NEAR_M, True, image, depth_inverse)
-        for row in range(height):
-            for column in range(width):
-                for k in range(channels):
-                    total = np.float32(0.0)
-                    for dy in range(SUPERSAMPLING):
-                        for dx in range(SUPERSAMPLING):
-                            total += image[SUPERSAMPLING * row + dy, SUPERSAMPLING * column + dx, k]
-                    out[t, row, column, k] = total / (SUPERSAMPLING * SUPERSAMPLING)
+        _average_blocks(image, out[t])
+
+
+@numba.njit(cache=True, nogil=True)
+def _shade(normals, albedo, lamp, ambient, colours):
+    """Lambert's law at each vertex."""
+    for i in range(normals.shape[0]):
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+        cosine = (x * lamp[0] + y * lamp[1] + z * lamp[2]) / length
+        light = ambient + (1.0 - ambient) * (cosine if cosine > 0.0 else -BOUNCE_LIGHT * cosine)
+        for k in range(albedo.shape[1]):
+            colours[i, k] = albedo[i, k] * light
+
+
+@numba.njit(cache=True, nogil=True)
+def _average_blocks(image, out):
+    """Mean over blocks of SUPERSAMPLING x SUPERSAMPLING pixels."""
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            for k in range(out.shape[2]):
+                total = np.float32(0.0)
+                for dy in range(SUPERSAMPLING):
+                    for dx in range(SUPERSAMPLING):
+                        total += image[SUPERSAMPLING * row + dy, SUPERSAMPLING * column + dx, k]
+                out[row, column, k] = total / np.float32(SUPERSAMPLING * SUPERSAMPLING)
