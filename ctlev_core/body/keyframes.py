@@ -223,9 +223,9 @@ MOTIONS: dict[str, Motion] = {
         (
             (0.00, _GUARD),
             (0.25, {**_GUARD, "yaw": -120, "twist": -30, "r_hip": 20, "r_knee": 80}),
-            (0.45, {"yaw": -235, "roll": -38, "r_spread": 88, "r_hip": 12, "r_knee": 15, "l_spread": -34, "l_knee":
+            (0.45, {"yaw": -235, "roll": -38, "r_spread": 75, "r_hip": 12, "r_knee": 15, "l_spread": 34, "l_knee":
                     14, "abduct": 50, "elbow": 80}),
-            (0.60, {"yaw": -310, "roll": -30, "r_spread": 72, "r_hip": 30, "r_knee": 30, "l_spread": -26, "l_knee":
+            (0.60, {"yaw": -310, "roll": -30, "r_spread": 60, "r_hip": 30, "r_knee": 30, "l_spread": 26, "l_knee":
                     14, "abduct": 45, "elbow": 80}),
             (0.85, {**_GUARD, "yaw": -360, "r_knee": 45}),
             (1.00, {**_GUARD, "yaw": -360}),

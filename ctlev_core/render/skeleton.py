@@ -73,7 +73,8 @@ def draw_skeleton(joints2d: np.ndarray, visible: np.ndarray, joint_set: str, ima
         if start in positions and end in positions:
             ends = _clip_segment(positions[start], positions[end], image_size)
             if ends is not None:
-                cv2.line(canvas, *map(_fixed_point, ends), colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+                tips = _fixed_point(ends[0]), _fixed_point(ends[1])
+                cv2.line(canvas, tips[0], tips[1], colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
     radius = round(JOINT_RADIUS * side * 2**SUBPIXEL_BITS)
     for colour, name in zip(COLOURS, OPENPOSE_JOINTS, strict=False):
         if name in positions and _clip_segment(positions[name], positions[name], image_size) is not None:
