@@ -1,0 +1,124 @@
+"""Wrong input ends in one clear line and status 2, before anything long starts; what was computed stays."""
+
+import time
+
+import numpy as np
+import pytest
+
+from data_contracts.events import Events
+
+from .conftest import digests, run_script
+
+
+def refused(home, *arguments, preset="folder"):
+    started = time.monotonic()
+    finished = run_script("full_experiment", "--preset", preset, *arguments, home=home)
+    assert finished.status == 2, finished.errors
+    (line,) = [line for line in finished.errors.splitlines() if line.startswith("error: ")]
+    assert "Traceback" not in finished.errors
+    assert time.monotonic() - started < 60
+    return line, finished.errors
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--preset", "nonesuch"), "unknown preset 'nonesuch'; known: demo, folder, smoke"),
+        (("--set", "nonesuch=1"), "unknown option 'nonesuch'; known: name,"),
+        (("--set", "windows.num_events=0"), "option 'windows.num_events': input should be greater than 0, got 0"),
+        (("--set", "dataset.options.colour=red"), "datasets 'studio': unknown option 'colour'; known: "),
+        (("--set", "dataset.name=dhp91"), "unknown plug-in 'dhp91' in datasets; known: folder, studio"),
+        (("--set", "generator.options.num_steps=many"), "generators 'controlnet': option 'num_steps'"),
+        (("--set", "sampling.num_inference_steps=0"), "option 'num_inference_steps': input should be greater"),
+        (("--set", "novalue"), "--set expects key=value, got 'novalue'"),
+        (("--set", "generator.options.prior=/does/not/exist"), "/does/not/exist"),
+    ],
+)
+def test_wrong_command_line(tmp_path, arguments, expected):
+    line, _ = refused(tmp_path, *arguments, preset="smoke")
+    assert expected in line
+    assert not (tmp_path / "artefacts").exists()
+
+
+def make_recording(path, *, t=None, x=None):
+    from ctlev_core.formats import evt2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    count = 5000
+    random = np.random.default_rng(1)
+    events = Events(
+        np.arange(count, dtype=np.int64) * 10 if t is None else t,
+        random.integers(0, 320, count).astype(np.uint16) if x is None else x,
+        random.integers(0, 240, count).astype(np.uint16),
+        random.integers(0, 2, count).astype(np.uint8),
+        (320, 240),
+    )
+    evt2.write(path, events)
+
+
+def test_missing_root_and_empty_folder(tmp_path):
+    line, errors = refused(tmp_path / "home", "--set", f"dataset.options.root={tmp_path / 'absent'}")
+    assert "absent" in line and "person/" in errors  # shows the tree that is expected
+    (tmp_path / "empty").mkdir()
+    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={tmp_path / 'empty'}")
+    assert "no class folders" in line
+
+
+def test_unknown_extension_and_truncated_file(tmp_path):
+    root = tmp_path / "data"
+    make_recording(root / "a" / "one.raw")
+    (root / "b").mkdir()
+    (root / "b" / "notes.docx").write_bytes(b"not events")
+    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}")
+    assert "notes.docx" in line and "known formats" in line
+    (root / "b" / "notes.docx").unlink()
+    make_recording(root / "b" / "two.raw")
+    content = (root / "b" / "two.raw").read_bytes()
+    (root / "b" / "two.raw").write_bytes(content[:-3])
+    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}")
+    assert "two.raw" in line
+
+
+def parquet_recording(path, **changed):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from ctlev_core.formats import parquet
+
+    make_recording(path.with_suffix(".raw"))
+    from ctlev_core import event_files
+
+    events = event_files.read_events_file(path.with_suffix(".raw"))
+    path.with_suffix(".raw").unlink()
+    parquet.write(path, events)
+    table = pq.read_table(path)
+    for name, values in changed.items():
+        table = table.set_column(table.column_names.index(name), name, pa.array(values, table[name].type))
+    pq.write_table(table, path)
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "expected"),
+    [
+        ("t", lambda t: t[::-1].copy(), "t decreases at event 1"),
+        ("t", lambda t: t - 100, "time stamps must not be negative, got t = -100 us at event 0"),
+        ("x", lambda x: x + 320, "x must be below 320"),
+    ],
+)
+def test_events_that_break_their_promises(tmp_path, column, change, expected):
+    root = tmp_path / "data"
+    make_recording(root / "a" / "one.raw")
+    parquet_recording(root / "b" / "two.parquet")
+    import pyarrow.parquet as pq
+
+    values = pq.read_table(root / "b" / "two.parquet")[column].to_numpy()
+    parquet_recording(root / "b" / "two.parquet", **{column: change(values)})
+    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}")
+    assert expected in line and "two" in line
+
+
+def test_what_was_computed_stays(smoke_home):
+    before = digests(smoke_home)
+    refused(smoke_home, "--set", "generator.options.batch_size=0", preset="smoke")
+    refused(smoke_home, "--set", "encoding.options.image_size=[48,48]", preset="smoke")
+    assert before.items() <= digests(smoke_home).items()

@@ -1,0 +1,189 @@
+"""The whole chain, run as a user would."""
+
+import json
+import os
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from data_contracts.manifest import MANIFEST_FILE, ManifestRef, read_manifest
+
+from .conftest import REPOSITORY, digests, run_script, script
+
+# Everything but the report is a pure function of options and data: on one machine, digests must repeat exactly.
+# The report's digest covers the time each stage took.
+DETERMINISTIC = (
+    "ingest", "encode", "condition_frames", "condition_samples", "finetune", "sample", "train_downstream",
+    "score_model", "score_distance",
+)  # fmt: skip
+
+
+def artefacts(home, stage):
+    folders = sorted((home / "artefacts" / stage).iterdir())
+    return [read_manifest(ManifestRef(key=folder.name, path=folder), full=True) for folder in folders]
+
+
+def test_smoke_ends_in_a_report(smoke_home):
+    (report,) = (smoke_home / "reports").glob("*.html")
+    text = report.read_text()
+    assert "far too small to learn from" in text[:20_000]
+    for expected in ("mpjpe2d", "fd_event_classifier_", "real+synthetic", "data:image/png;base64,"):
+        assert expected in text
+    assert "http://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", text) and "<script src" not in text
+    output = (smoke_home / "first_run.txt").read_text()
+    assert str(report) in output
+
+
+def test_every_artefact_is_whole_and_says_where_it_came_from(smoke_home):
+    seen = 0
+    for record_file in (smoke_home / "artefacts").glob("*/*/run.json"):
+        record = json.loads(record_file.read_text())
+        manifest = read_manifest(
+            ManifestRef(key=record_file.parent.name, path=record_file.parent, digest=record["digest"]), full=True
+        )
+        assert len(manifest) > 0
+        seen += 1
+    assert seen >= 15
+    assert not list((smoke_home / "tmp").iterdir()) and not list((smoke_home / "work").iterdir())
+
+
+def test_labels_travel_from_condition_to_synthetic_frame(smoke_home):
+    (synthetic,) = artefacts(smoke_home, "sample")
+    (conditions,) = artefacts(smoke_home, "condition_samples")
+    assert synthetic.column("condition_id") == conditions.column("sample_id")
+    np.testing.assert_array_equal(synthetic.labels.joints2d, conditions.labels.joints2d)
+    assert synthetic.array("frames").shape == (len(synthetic), 64, 64, 3)
+    assert len(set(synthetic.column("seed"))) == len(synthetic)
+
+
+def test_training_and_test_subjects_are_disjoint(smoke_home):
+    (frames,) = artefacts(smoke_home, "encode")
+    subjects = {split: set() for split in ("train", "test")}
+    for split, subject in zip(frames.column("split"), frames.column("subject"), strict=True):
+        subjects[split].add(subject)
+    assert subjects["train"] and subjects["test"] and not subjects["train"] & subjects["test"]
+
+
+BARE_FLOW = """
+import sys, time
+from pathlib import Path
+sys.argv = ["bare", "--home", sys.argv[1]]
+from flows.settings import HOME, flow
+from flows import local_server
+from prefect import task
+
+@task
+def one():
+    return 1
+
+@flow
+def bare():
+    return one()
+
+local_server.start(HOME)
+local_server.wait()
+assert bare() == 1
+"""
+
+
+def seconds(command, **options):
+    started = time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True, **options)
+    return time.perf_counter() - started
+
+
+def test_second_run_recomputes_nothing_and_is_nearly_as_quick_as_a_bare_flow(smoke_home):
+    before = digests(smoke_home)
+    again = [sys.executable, str(REPOSITORY / "flows/full_experiment.py"), "--preset", "smoke"]
+    bare = [sys.executable, "-c", BARE_FLOW, str(smoke_home)]
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PREFECT_")}
+    differences = []
+    for _ in range(3):  # interleaved, because the machine's speed drifts
+        cached = seconds([*again, "--home", str(smoke_home)], cwd=smoke_home, env=environment)
+        differences.append(cached - seconds(bare, cwd=smoke_home, env=environment))
+    assert digests(smoke_home) == before
+    assert statistics.median(differences) < 5, differences
+
+
+@pytest.mark.parametrize(
+    ("override", "changed"),
+    [
+        ("downstream.options.num_steps=21", {"train_downstream: pose2d", "score_model", "report"}),
+        ("num_synthetic=9", {"condition_samples", "sample", "synthetic", "labels of synthetic", "report"}),
+        ("encoding.options.normalisation=max", {"encode", "condition", "finetune", "sample", "train", "score", "report"}),
+        ("name=renamed", {"report"}),
+    ],
+)
+def test_changing_an_option_reruns_exactly_what_depends_on_it(smoke_home, override, changed):
+    base = run_script("full_experiment", "--preset", "smoke", "--dry-run", home=smoke_home).plan
+    assert base and {state for state, _ in base.values()} == {"cached"}
+    plan = run_script("full_experiment", "--preset", "smoke", "--set", override, "--dry-run", home=smoke_home).plan
+    assert plan.keys() == base.keys() or override.startswith("name")
+    for label, (state, key) in plan.items():
+        expected = any(part in label for part in changed)
+        assert (state == "to run") == expected, (label, state)
+        if label in base:
+            assert (key != base[label][1]) == expected
+
+
+def test_each_flow_is_a_script_of_its_own_and_shares_the_store(smoke_home):
+    before = digests(smoke_home)
+    for name in ("prepare_dataset", "train_generator", "synthesize", "evaluate"):
+        finished = run_script(name, "--preset", "smoke", home=smoke_home)
+        assert finished.status == 0, finished.errors
+        assert re.search(r"(\d+) stages, \1 of them cached", finished.output)
+    assert digests(smoke_home) == before
+
+
+def test_killed_runs_end_in_the_same_digests(smoke_home, tmp_path):
+    """`kill -9` at random moments, then a rerun: nothing half-written, every digest as in the undisturbed run."""
+    random = np.random.default_rng(20261121)
+    for _ in range(4):
+        process = script("full_experiment", "--preset", "smoke", home=tmp_path, start_new_session=True)
+        try:
+            process.wait(timeout=float(random.uniform(8, 35)))
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+        for manifest in (tmp_path / "artefacts").glob(f"*/*/{MANIFEST_FILE}"):
+            read_manifest(ManifestRef(key=manifest.parent.name, path=manifest.parent), full=True)
+    finished = run_script("full_experiment", "--preset", "smoke", home=tmp_path)
+    assert finished.status == 0, finished.errors
+    assert digests(tmp_path, DETERMINISTIC) == {
+        name: digest
+        for name, digest in digests(smoke_home, DETERMINISTIC).items()
+        if name in digests(tmp_path, DETERMINISTIC)
+    }
+    assert len(digests(tmp_path, DETERMINISTIC)) >= 14
+    assert not list((tmp_path / "tmp").iterdir())
+
+
+def test_private_server_dies_with_a_killed_script(tmp_path):
+    process = script("full_experiment", "--preset", "smoke", home=tmp_path)
+    deadline = time.monotonic() + 60
+    children = []
+    while not children and time.monotonic() < deadline:
+        time.sleep(0.2)
+        children = [int(pid) for pid in open(f"/proc/{process.pid}/task/{process.pid}/children").read().split()]
+    assert children, "the private Prefect server did not start"
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 20
+    while any(os.path.exists(f"/proc/{pid}") for pid in children) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in children)
+
+
+def test_scores_are_tables(smoke_home):
+    tables = list((smoke_home / "reports").glob("*/scores.parquet"))
+    assert len(tables) == 1
+    scores = pq.read_table(tables[0]).to_pylist()
+    assert {row["setting"] for row in scores} >= {"real", "synthetic", "real+synthetic"}
+    assert all(np.isfinite(row["value"]) for row in scores)
