@@ -14,7 +14,7 @@ from ctlev_core import event_files, plugins
 from ctlev_core.plugins import Plugin
 from data_contracts import tables
 from data_contracts.config import DatasetChoice
-from data_contracts.events import DataError, check_events
+from data_contracts.events import DataError, Events, check_events
 from data_contracts.labels import Labels, Recording, check_labels
 from data_contracts.manifest import concat_labels, label_columns
 from tasks.stage import Output, stage
@@ -87,7 +87,7 @@ def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ing
             events = check_events(plugin.module.read_events(recording, plugin.options), where)
             if len(events) == 0:
                 raise DataError(f"{where}: the recording holds no events")
-            event_files.write_events_parquet(finished, events)
+            _write_whole(finished, events)
         os.link(finished, out.folder / name)
         row |= event_files.summarise(events)
         row |= {
@@ -106,6 +106,13 @@ def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ing
         for part in recording.parts
     ]
     return _Ingested(row, parts, labels)
+
+
+def _write_whole(path: Path, events: Events) -> None:
+    """Write so that the file is either absent or complete, whenever the process is killed."""
+    temporary = path.with_suffix(".part")
+    plugins.load("formats", "parquet").write(temporary, events)
+    temporary.replace(path)
 
 
 def _label_table(recordings: list[Recording], tracks: list[Labels]) -> pa.Table:
