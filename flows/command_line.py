@@ -76,12 +76,12 @@ def print_plan(rows: list[PlannedStage]) -> None:
     print(f"{sum(row.cached for row in rows)} of {len(rows)} stages are cached")
 
 
-def main(flow: Any, describe: Callable[[Any], str], *, default_preset: str = "demo") -> int:
+def main(flow: Any, describe: Callable[[Any, Experiment], str], *, default_preset: str = "demo") -> int:
     """Run a flow as a script.
 
     Args:
         flow: a Prefect flow of one parameter, an `Experiment`.
-        describe: from the flow's result to the lines printed at the end.
+        describe: from the flow's result and the experiment to the lines printed at the end.
         default_preset: used without `--preset`.
 
     Returns:
@@ -108,7 +108,7 @@ def main(flow: Any, describe: Callable[[Any], str], *, default_preset: str = "de
         print("interrupted; finished stages and checkpoints are kept", file=sys.stderr)
         return 130
     cached = sum(row.cached for row in rows)
-    print(describe(result))
+    print(describe(result, experiment))
     print(f"{len(rows)} stages, {cached} of them cached, in {time.perf_counter() - started:.1f} s")
     return 0
 

@@ -21,6 +21,7 @@ class Evaluation(Frozen):
 
     scores: list[ManifestRef]
     models: list[ManifestRef]
+    model_names: list[str]
 
 
 @flow(name="evaluate")
@@ -37,11 +38,13 @@ def evaluate(
     }
     scores: list[ManifestRef] = []
     models: list[ManifestRef] = []
+    model_names: list[str] = []
     for setting in experiment.settings:
         for seed in experiment.downstream_seeds:
             label = f"{experiment.downstream.name} on {setting}, seed {seed}"
             model = train_downstream(training_sets[setting], downstream=experiment.downstream, seed=seed, label=label)
             models.append(model)
+            model_names.append(f"{setting}, seed {seed}")
             tested = [(dataset.frames, "test", setting)]
             if setting == "real":
                 # Do the synthetic frames show what their labels say? The real row's error is the floor.
@@ -76,8 +79,8 @@ def evaluate(
                     label=row,
                 )
             )
-    return Evaluation(scores=scores, models=models)
+    return Evaluation(scores=scores, models=models, model_names=model_names)
 
 
 if __name__ == "__main__":
-    sys.exit(main(evaluate, lambda evaluation: "\n".join(f"scores: {ref.path}" for ref in evaluation.scores)))
+    sys.exit(main(evaluate, lambda evaluation, _: "\n".join(f"scores: {ref.path}" for ref in evaluation.scores)))

@@ -35,14 +35,13 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
         synthetic,
         evaluation.scores,
         evaluation.models,
-        experiment=experiment,
+        title=experiment.name,
+        notice=experiment.data_notice,
+        settings=experiment.settings,
+        model_names=evaluation.model_names,
         label=experiment.name,
     )
 
 
-def _describe(made: ManifestRef) -> str:
-    return publish_report(made, HOME)
-
-
 if __name__ == "__main__":
-    sys.exit(main(full_experiment, _describe))
+    sys.exit(main(full_experiment, lambda made, experiment: publish_report(made, HOME, experiment.name)))

@@ -51,7 +51,7 @@ if __name__ == "__main__":
     sys.exit(
         main(
             prepare_dataset,
-            lambda dataset: (
+            lambda dataset, _: (
                 f"recordings: {dataset.recordings.rows} in {dataset.recordings.path}\n"
                 f"frames:     {dataset.frames.rows} in {dataset.frames.path}"
             ),

@@ -31,4 +31,4 @@ def synthesize(
 
 
 if __name__ == "__main__":
-    sys.exit(main(synthesize, lambda synthetic: f"synthetic frames: {synthetic.rows} in {synthetic.path}"))
+    sys.exit(main(synthesize, lambda synthetic, _: f"synthetic frames: {synthetic.rows} in {synthetic.path}"))

@@ -27,4 +27,4 @@ def train_generator(experiment: Experiment, dataset: PreparedDataset | None = No
 
 
 if __name__ == "__main__":
-    sys.exit(main(train_generator, lambda checkpoint: f"checkpoint: {checkpoint.path / 'checkpoint'}"))
+    sys.exit(main(train_generator, lambda checkpoint, _: f"checkpoint: {checkpoint.path / 'checkpoint'}"))

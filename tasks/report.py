@@ -1,0 +1,214 @@
+"""One self-contained HTML page of the experiment, and the same tables as Parquet."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ctlev_core.html_report import Curves, ImageGrid, Section, Table, render_report
+from ctlev_core.verdict import lower_is_better, verdict
+from data_contracts import tables
+from data_contracts.manifest import RUN_FILE, Manifest, ManifestRef
+from tasks.stage import Output, stage
+
+GRID_COLUMNS = 10
+
+
+@stage(version=1, schema=tables.REPORT)
+def report(
+    out: Output,
+    recordings: Manifest,
+    frames: Manifest,
+    conditions: Manifest,
+    checkpoint: Manifest,
+    synthetic: Manifest,
+    scores: list[Manifest],
+    models: list[Manifest],
+    *,
+    title: str,
+    notice: str,
+    settings: Sequence[str],
+    model_names: Sequence[str],
+) -> pa.Table:
+    """Write `report.html`, `scores.parquet` and `recordings.parquet`."""
+    all_scores = pa.concat_tables([manifest.table for manifest in scores])
+    rows = all_scores.to_pylist()
+    sections: list[Section] = [
+        *_score_tables(rows, settings),
+        _grid("Asked for, and sampled", conditions, synthetic),
+        _real_grid(frames),
+        _curves("Fine-tuning of the generator", [checkpoint], ["generator"]),
+        _curves("Downstream training", models, model_names),
+        _recordings_table(recordings, frames),
+        _cost_table([recordings, frames, conditions, checkpoint, synthetic, *models, *scores]),
+    ]
+    page = render_report(title=title, lead=notice, verdict=verdict(rows, settings), sections=sections)
+    (out.folder / "report.html").write_text(page, encoding="utf-8")
+    pq.write_table(all_scores, out.folder / "scores.parquet")
+    pq.write_table(recordings.table, out.folder / "recordings.parquet")
+    return pa.table({"table": ["scores", "recordings"], "file": ["scores.parquet", "recordings.parquet"]})
+
+
+def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
+    """Put the newest report of an experiment where a person looks for it, and say where that is."""
+    folder = home / "reports"
+    (folder / name).mkdir(parents=True, exist_ok=True)
+    for source in ("scores.parquet", "recordings.parquet"):
+        shutil.copyfile(ref.path / source, folder / name / source)
+    temporary = folder / f".{name}.html"
+    shutil.copyfile(ref.path / "report.html", temporary)
+    temporary.replace(folder / f"{name}.html")
+    return f"report: {folder / f'{name}.html'}"
+
+
+def _score_tables(rows: list[dict[str, Any]], settings: Sequence[str]) -> list[Section]:
+    trained = [row for row in rows if row["setting"] in settings and row["group"] == "all"]
+    faithful = [row for row in rows if row["setting"] == "labels of synthetic" and row["group"] == "all"]
+    distances = [row for row in rows if row["task"] == "distance"]
+    seeds = len({row["seed"] for row in trained})
+    sections: list[Section] = [
+        _pivot(
+            "Does synthetic data help? Held-out real test data",
+            trained,
+            "trained on",
+            f"Equal optimiser steps for every row; mean over {seeds} seed{'s' if seeds > 1 else ''}. In brackets the 95 % "
+            "interval over test recordings (cluster bootstrap), which does not cover the spread over seeds.",
+        )
+    ]
+    floor = [{**row, "setting": "held-out real (floor)"} for row in trained if row["setting"] == "real"]
+    if faithful:
+        sections.append(
+            _pivot(
+                "Do the synthetic frames show their labels?",
+                floor + faithful,
+                "frames",
+                "The model trained on real frames, scored on synthetic frames against the labels they were sampled from, "
+                "beside its score on held-out real frames.",
+            )
+        )
+    if distances:
+        sections.append(
+            _pivot(
+                "How far from real frames?",
+                distances,
+                "frames",
+                "Frechet distance to the real training frames in the features of a classifier trained on real events "
+                "(not FID). It depends on the number of frames, so read it against the row of held-out real frames; alone "
+                "it does not tell whether labels are right.",
+            )
+        )
+    groups = [row for row in rows if row["setting"] in settings and row["group"] != "all"]
+    if groups:
+        sections.append(_group_table(groups, settings))
+    return sections
+
+
+def _pivot(title: str, rows: list[dict[str, Any]], first: str, caption: str) -> Table:
+    """Settings down, metrics across."""
+    metrics = list(dict.fromkeys(row["metric"] for row in rows))
+    body = []
+    for setting in dict.fromkeys(row["setting"] for row in rows):
+        of_setting = [row for row in rows if row["setting"] == setting]
+        cells = [_cell([row for row in of_setting if row["metric"] == metric]) for metric in metrics]
+        body.append([setting, *cells, of_setting[0]["num_train"], of_setting[0]["num_samples"]])
+    arrows = [f"{metric} {'↓' if lower_is_better(metric) else '↑'}" for metric in metrics]
+    return Table(title, [first, *arrows, "frames trained on", "frames scored"], body, caption=caption)
+
+
+def _cell(rows: list[dict[str, Any]]) -> str:
+    if not rows:
+        return ""
+    value = float(np.mean([row["value"] for row in rows]))
+    if any(row["low"] is None or row["high"] is None for row in rows):
+        return f"{value:.3f}"
+    low, high = (float(np.mean([row[end] for row in rows])) for end in ("low", "high"))
+    return f"{value:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def _group_table(rows: list[dict[str, Any]], settings: Sequence[str]) -> Table:
+    metric = rows[0]["metric"]
+    rows = [row for row in rows if row["metric"] == metric]
+    body = []
+    for group in dict.fromkeys(row["group"] for row in rows):
+        of_group = [row for row in rows if row["group"] == group]
+        cells = [_cell([row for row in of_group if row["setting"] == setting]) for setting in settings]
+        body.append([group, *cells, of_group[0]["num_samples"]])
+    return Table(f"{metric}, class by class", ["class", *settings, "frames scored"], body)
+
+
+def _grid(title: str, conditions: Manifest, synthetic: Manifest) -> ImageGrid:
+    chosen = np.linspace(0, len(synthetic) - 1, min(GRID_COLUMNS, len(synthetic))).astype(int)
+    rows: list[tuple[str, list[np.ndarray]]] = []
+    if "images.npy" in conditions.files:
+        rows.append(("condition", [conditions.array("images")[row] for row in chosen]))
+    rows.append(("synthetic", [synthetic.array("frames")[row] for row in chosen]))
+    captions = [synthetic.column("class_name")[row] for row in chosen]
+    return ImageGrid(title, rows, column_labels=captions, caption="One column a sample, none chosen by eye.")
+
+
+def _real_grid(frames: Manifest) -> ImageGrid:
+    rows: list[tuple[str, list[np.ndarray]]] = []
+    for split in ("train", "test"):
+        members = frames.rows_where(split=split)
+        chosen = members[np.linspace(0, len(members) - 1, min(GRID_COLUMNS, len(members))).astype(int)]
+        rows.append((f"real, {split}", [frames.array("frames")[row] for row in chosen]))
+    return ImageGrid("Real frames", rows, caption="The data the generator was tuned on, and the data tested on.")
+
+
+def _curves(title: str, manifests: list[Manifest], names: Sequence[str]) -> Curves:
+    series: dict[str, tuple[list[float], list[float]]] = {}
+    for manifest, name in zip(manifests, names, strict=True):
+        for curve in dict.fromkeys(manifest.column("curve")):
+            rows = [row for row in manifest.table.to_pylist() if row["curve"] == curve]
+            series[f"{name}, {curve}"] = ([row["step"] for row in rows], [row["loss"] for row in rows])
+    return Curves(title, series, x_label="optimiser step", y_label="loss")
+
+
+def _recordings_table(recordings: Manifest, frames: Manifest) -> Table:
+    """Recordings added up by split and class, with their events."""
+    table = recordings.table.to_pylist()
+    frame_rows = list(zip(frames.column("recording_id"), strict=True))
+    frames_of: dict[str, int] = {}
+    for (name,) in frame_rows:
+        frames_of[name] = frames_of.get(name, 0) + 1
+    body = []
+    for key in dict.fromkeys((row["splits"], row["class_name"]) for row in table):
+        members = [row for row in table if (row["splits"], row["class_name"]) == key]
+        body.append(
+            [
+                *key,
+                len(members),
+                len({row["subject"] for row in members}),
+                sum(row["num_events"] for row in members),
+                sum(row["num_positive"] for row in members),
+                sum(row["num_negative"] for row in members),
+                round(sum(row["duration_us"] for row in members) / 1e6, 4),
+                sum(frames_of.get(row["recording_id"], 0) for row in members),
+            ]
+        )
+    columns = ["split", "class", "recordings", "subjects", "events", "ON", "OFF", "seconds", "frames"]
+    return Table("Recordings", columns, body, caption="Splits are fixed at ingest. `condition`: labels without events.")
+
+
+def _cost_table(manifests: list[Manifest]) -> Table:
+    """What each stage took when it was computed, which may have been in an earlier run."""
+    totals: dict[str, list[float]] = {}
+    for manifest in {manifest.ref.key: manifest for manifest in manifests}.values():
+        record = json.loads((manifest.ref.path / RUN_FILE).read_text())
+        entry = totals.setdefault(record["stage"], [0, 0.0, 0.0, 0.0])
+        entry[0] += 1
+        entry[1] += record["wall_seconds"]
+        entry[2] += record["cpu_seconds"]
+        entry[3] = max(entry[3], record["process_peak_memory_mib"])
+    body = [
+        [name, count, round(wall, 1), round(cpu, 1), round(peak)] for name, (count, wall, cpu, peak) in totals.items()
+    ]
+    columns = ["stage", "runs", "wall seconds", "CPU seconds", "peak memory of the process, MiB"]
+    return Table("What it cost", columns, body, caption="As computed, which may have been in an earlier run.")

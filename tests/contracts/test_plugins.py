@@ -1,0 +1,81 @@
+"""Every file in every plug-in folder keeps the contract of its kind, without being listed anywhere."""
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+from ctlev_core import plugins
+from ctlev_core.plugins import PluginError
+from data_contracts.config import DatasetChoice, Frozen, MetricChoice
+
+PROTOCOLS = {
+    "datasets": plugins.Dataset,
+    "formats": plugins.Format,
+    "encodings": plugins.Encoding,
+    "conditions": plugins.Condition,
+    "generators": plugins.Generator,
+    "downstream": plugins.Downstream,
+    "metrics": plugins.Metric,
+}
+ALL = [(kind, name) for kind in plugins.KINDS for name in plugins.names(kind)]
+
+
+@pytest.mark.parametrize(("kind", "name"), ALL)
+def test_module_keeps_its_protocol(kind, name):
+    module = plugins.load(kind, name)
+    protocol = PROTOCOLS[kind]
+    assert isinstance(module.VERSION, int) and module.VERSION >= 1
+    assert module.__doc__
+    for attribute in protocol.__annotations__:
+        assert hasattr(module, attribute), f"{kind}/{name} lacks {attribute}"
+    for function_name, expected in inspect.getmembers(protocol, inspect.isfunction):
+        if function_name.startswith("_"):
+            continue
+        function = getattr(module, function_name)
+        assert function.__doc__, f"{kind}/{name}.{function_name} has no docstring"
+        wanted = list(inspect.signature(expected).parameters)[1:]
+        assert list(inspect.signature(function).parameters)[: len(wanted)] == wanted, f"{kind}/{name}.{function_name}"
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, name in ALL if kind != "formats"])
+def test_options_are_frozen_documented_and_have_defaults(kind, name):
+    module = plugins.load(kind, name)
+    models = [module.Options, *([module.SampleOptions] if kind == "generators" else [])]
+    for model in models:
+        assert issubclass(model, Frozen)
+        for field, info in model.model_fields.items():
+            assert info.description, f"{kind}/{name}: option {field} has no description"
+    required = {"root": "."} if kind == "datasets" and "root" in module.Options.model_fields else {}
+    assert module.Options(**required) == module.Options(**required)
+
+
+def test_planning_imports_are_light():
+    """The plan of an experiment loads every plug-in; it must not wait for torch."""
+    code = """
+        import sys
+        from ctlev_core import plugins
+        for kind in plugins.KINDS:
+            for name in plugins.names(kind):
+                plugins.load(kind, name)
+        print(sorted({"torch", "numba", "cv2", "diffusers", "transformers", "scipy", "prefect"} & set(sys.modules)))
+    """
+    import textwrap
+
+    result = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_unknown_names_list_the_known_ones():
+    with pytest.raises(PluginError, match="unknown plug-in 'fid' in metrics; known: .*mpjpe2d"):
+        plugins.load_options(MetricChoice(name="fid"))
+    with pytest.raises(PluginError, match="unknown plug-in kind 'metric'; known kinds: datasets, formats"):
+        plugins.names("metric")
+
+
+def test_every_wrong_option_is_named_at_once():
+    choice = DatasetChoice(name="folder", options={"root": ".", "test_fraction": 2, "colour": 1})
+    with pytest.raises(PluginError) as error:
+        plugins.load_options(choice)
+    assert "'test_fraction'" in str(error.value) and "unknown option 'colour'; known: root" in str(error.value)
