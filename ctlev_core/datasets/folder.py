@@ -42,11 +42,13 @@ class Options(Frozen):
 
     root: Path = Field(json_schema_extra=RUN_SETTING, description="the folder that holds the class folders")
     split: Literal["time", "recording"] = Field(
-        "time",
+        default="time",
         description="`time`: the last part of every recording is for testing; `recording`: whole recordings are, and "
         "every class needs two",
     )
-    test_fraction: float = Field(0.3, gt=0, lt=1, description="of the events of a recording, or of the recordings")
+    test_fraction: float = Field(
+        default=0.3, gt=0, lt=1, description="of the events of a recording, or of the recordings"
+    )
 
 
 def list_recordings(options: Options) -> list[Recording]:

@@ -24,21 +24,23 @@ VERSION = 1
 class Options(Frozen):
     """Options of the event histogram."""
 
-    polarity: bool = Field(True, description="count positive and negative events apart; DHP19 discards polarity")
+    polarity: bool = Field(
+        default=True, description="count positive and negative events apart; DHP19 discards polarity"
+    )
     image_size: tuple[PositiveInt, PositiveInt] | None = Field(
-        None, description="(width, height) px of the image; the sensor's own where not given"
+        default=None, description="(width, height) px of the image; the sensor's own where not given"
     )
     fit: Literal["pad", "crop", "stretch"] = Field(
-        "pad",
+        default="pad",
         description="how the sensor meets another image size: whole sensor with black bars, image filled and the rest "
         "of the sensor dropped, or both axes scaled on their own; pad and crop keep the aspect and the centre",
     )
     normalisation: Literal["three_sigma", "max", "count"] = Field(
-        "three_sigma",
+        default="three_sigma",
         description="what count becomes 255: three standard deviations of the window's counts (DHP19), the window's "
         "largest count, or full_scale_count",
     )
-    full_scale_count: int = Field(8, ge=1, description="the count that becomes 255 with normalisation `count`")
+    full_scale_count: int = Field(default=8, ge=1, description="the count that becomes 255 with normalisation `count`")
 
 
 def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
