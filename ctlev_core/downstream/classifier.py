@@ -1,0 +1,182 @@
+"""Object classification from one event image: a ResNet.
+
+The paper trains a pre-trained ResNet-34 with a randomly initialised MLP head (N-ImageNet, its Table 1). The default
+here is a ResNet-10 of a quarter of the width from random weights, which two CPU cores train in a minute;
+`architecture="resnet34"`, a `head_width` and a `pretrained` folder give the paper's model.
+The class list is the sorted list of the classes in the training labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from data_contracts.config import RUN_SETTING, Frozen, cache_material
+from data_contracts.events import DataError
+from data_contracts.labels import History, Labels
+
+if TYPE_CHECKING:
+    import torch
+
+VERSION = 1
+NAME = "classifier"
+
+
+class Options(Frozen):
+    """Network and training budget."""
+
+    architecture: Literal["resnet10-quarter", "resnet10-half", "resnet18", "resnet34"] = Field(
+        "resnet10-quarter", description="the paper's is resnet34"
+    )
+    head_width: int = Field(0, ge=0, description="hidden units of the head, 0 = linear; the paper gives no width")
+    pretrained: str = Field(
+        "", description="folder of a published ResNet (transformers layout, same architecture) to start from"
+    )
+    num_steps: int = Field(600, ge=1, description="optimiser steps; the paper does not state them")
+    batch_size: int = Field(32, ge=1, description="images a step")
+    learning_rate: float = Field(2e-3, gt=0, description="peak of AdamW's learning rate")
+    warmup_steps: int = Field(40, ge=0, description="steps to the peak")
+    weight_decay: float = Field(1e-2, ge=0, description="of AdamW")
+    flip: bool = Field(False, description="mirror half of the training images")
+    log_every: int = Field(10, ge=1, description="steps a row of the loss history", json_schema_extra=RUN_SETTING)
+    checkpoint_every: int = Field(200, ge=1, description="steps between checkpoints", json_schema_extra=RUN_SETTING)
+    device: str = Field("auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING)
+
+
+def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, out: Path, work: Path) -> History:
+    """Train on frames with class names and write `model.safetensors` and `config.json` to `out`.
+
+    Args:
+        frames: [N, H, W, 3] uint8.
+        labels: N rows with class names, at least two different ones.
+        options: see `Options`.
+        seed: of the initial weights, the order of the samples and the augmentation.
+        out: model folder.
+        work: folder of the resumable state.
+    Returns:
+        The training loss per logged step.
+    Raises:
+        DataError: numbers of rows disagree, a class name is empty, or there is one class only.
+    """
+    import torch
+
+    from ctlev_core import supervised
+
+    classes, targets = _check_training_set(frames, labels)
+    device = supervised.resolve_device(options.device)
+    model = supervised.build_seeded(lambda: _build_from_options(len(classes), options), seed).to(device)
+
+    def compute_loss(rows: np.ndarray, generator: np.random.Generator) -> torch.Tensor:
+        batch = frames[rows]
+        if options.flip:
+            mirror = generator.random(len(rows)) < 0.5
+            batch = np.where(mirror[:, None, None, None], batch[:, :, ::-1], batch)
+        logits = model(_to_input(torch.from_numpy(batch).to(device)))
+        return torch.nn.functional.cross_entropy(logits, torch.from_numpy(targets[rows]).to(device))
+
+    history = supervised.train_model(
+        model,
+        compute_loss,
+        len(frames),
+        supervised.Schedule(
+            options.num_steps,
+            options.batch_size,
+            options.learning_rate,
+            options.warmup_steps,
+            options.weight_decay,
+            options.log_every,
+            options.checkpoint_every,
+        ),
+        seed=seed,
+        work=work,
+        run_digest=supervised.digest(NAME, VERSION, cache_material(options), seed, frames, targets),
+        description="train classifier",
+    )
+    config = {
+        "model": NAME,
+        "version": VERSION,
+        "classes": list(classes),
+        "shape": _shape(options),
+        "options": cache_material(options),
+    }
+    supervised.write_model(out, model, config)
+    return history
+
+
+def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Class probabilities of each frame.
+
+    Args:
+        model: folder written by `train`.
+        frames: [N, H, W, 3] uint8.
+    Returns:
+        `probability` [N, K] float32 and `classes` [K] str, the name of each column.
+    """
+    network, config = _read_model(model)
+    probability = _run(network, lambda images: network(images).softmax(dim=-1), frames)
+    classes = np.array(config["classes"])
+    return {"probability": probability.reshape(len(frames), len(classes)), "classes": classes}
+
+
+def features(model: Path, frames: np.ndarray) -> np.ndarray:
+    """Pooled features [N, D] float32 in front of the head: what the Frechet distance compares."""
+    network, config = _read_model(model)
+    return _run(network, network.features, frames).reshape(len(frames), config["shape"]["hidden_sizes"][-1])
+
+
+def _check_training_set(frames: np.ndarray, labels: Labels) -> tuple[tuple[str, ...], np.ndarray]:
+    from ctlev_core.supervised import check_frames
+
+    where = "train classifier"
+    check_frames(frames, where)
+    if len(labels) != len(frames):
+        raise DataError(f"{where}: {len(frames)} frames but {len(labels)} labels")
+    if "" in labels.class_names:
+        raise DataError(f"{where}: row {labels.class_names.index('')} has no class name")
+    classes = tuple(sorted(set(labels.class_names)))
+    if len(classes) < 2:
+        raise DataError(f"{where}: needs at least two classes, got {', '.join(classes) or 'no rows'}")
+    columns = {name: column for column, name in enumerate(classes)}
+    return classes, np.array([columns[name] for name in labels.class_names], dtype=np.int64)
+
+
+def _shape(options: Options) -> dict[str, Any]:
+    from ctlev_core.networks.resnet import ARCHITECTURES
+
+    return ARCHITECTURES[options.architecture]
+
+
+def _build_from_options(num_classes: int, options: Options) -> Any:
+    from ctlev_core.networks.resnet import ResNetClassifier, load_backbone
+
+    network = ResNetClassifier(_shape(options), num_classes, options.head_width)
+    if options.pretrained:
+        load_backbone(network, Path(options.pretrained))
+    return network
+
+
+def _read_model(folder: Path) -> tuple[Any, dict[str, Any]]:
+    from ctlev_core import supervised
+    from ctlev_core.networks.resnet import ResNetClassifier
+
+    config = supervised.read_config(folder, NAME)
+    network = ResNetClassifier(config["shape"], len(config["classes"]), config["options"]["head_width"])
+    supervised.read_weights(folder, network)
+    return network.to(supervised.resolve_device("auto")), config
+
+
+def _run(network: Any, function: Any, frames: np.ndarray) -> np.ndarray:
+    from ctlev_core import supervised
+
+    supervised.check_frames(frames, "predict classifier")
+    batches = supervised.predict_in_batches(network, lambda images: function(_to_input(images)).cpu().numpy(), frames)
+    return np.concatenate(batches) if batches else np.zeros(0, np.float32)
+
+
+def _to_input(images: torch.Tensor) -> torch.Tensor:
+    """[N, H, W, 3] uint8 -> [N, 3, H, W] float32 in [0, 1]."""
+    return images.permute(0, 3, 1, 2).float() / 255

@@ -1,0 +1,278 @@
+"""2D human pose from one event image: DHP19's heatmap network.
+
+Source: Calabrese et al., DHP19, CVPR Workshops 2019 (network, targets, mean square loss, argmax decoding). The
+defaults are DHP19's. Batch normalisation, the cross-entropy loss and sub-pixel decoding are ours and train far faster
+from scratch; AdamW takes the place of RMSprop, and targets sit at the joint rather than at its pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ctlev_core.skeletons import JOINT_SETS
+from data_contracts.config import RUN_SETTING, Frozen, cache_material
+from data_contracts.events import DataError
+from data_contracts.labels import History, Labels, check_labels
+
+if TYPE_CHECKING:
+    import torch
+
+VERSION = 1
+NAME = "pose2d"
+
+
+class Options(Frozen):
+    """Network, loss, decoding and training budget."""
+
+    width: float = Field(1.0, gt=0, description="factor on the channel counts; 1 = DHP19, 218,592 parameters")
+    batch_norm: bool = Field(False, description="normalise after each convolution; DHP19 does not")
+    output_stride: Literal[1, 2] = Field(1, description="2 = heatmaps of half the size, about 40 % faster; DHP19: 1")
+    loss: Literal["mse", "cross_entropy"] = Field(
+        "mse",
+        description="mse against a Gaussian of height 1 (DHP19), or cross-entropy of a softmax over all pixels "
+        "against a Gaussian of sum 1",
+    )
+    sigma_px: float = Field(4.0, gt=0, description="standard deviation of the target, image px; DHP19: 4 at 344 x 260")
+    decoding: Literal["argmax", "soft_argmax", "mean"] = Field(
+        "argmax",
+        description="centre of the highest pixel (DHP19), centroid of the heatmap around it, or centroid of all of it",
+    )
+    num_steps: int = Field(20_000, ge=1, description="optimiser steps; the paper does not state them")
+    batch_size: int = Field(32, ge=1, description="images a step")
+    learning_rate: float = Field(1e-3, gt=0, description="peak of AdamW's learning rate")
+    warmup_steps: int = Field(40, ge=0, description="steps to the peak")
+    weight_decay: float = Field(1e-2, ge=0, description="of AdamW")
+    flip: bool = Field(False, description="mirror half of the training images, with left and right joints exchanged")
+    shift_px: int = Field(0, ge=0, description="move training images by up to so many px in x and y; black moves in")
+    log_every: int = Field(10, ge=1, description="steps a row of the loss history", json_schema_extra=RUN_SETTING)
+    checkpoint_every: int = Field(200, ge=1, description="steps between checkpoints", json_schema_extra=RUN_SETTING)
+    device: str = Field("auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING)
+
+
+def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, out: Path, work: Path) -> History:
+    """Train on labelled frames and write `model.safetensors` and `config.json` to `out`.
+
+    Args:
+        frames: [N, H, W, 3] uint8; the network sees the largest of the three channels.
+        labels: N rows with `joints2d` in image px; joints that are not visible or outside the image carry no loss.
+        options: see `Options`.
+        seed: of the initial weights, the order of the samples and the augmentation.
+        out: model folder.
+        work: folder of the resumable state.
+    Returns:
+        The training loss per logged step.
+    Raises:
+        DataError: shapes disagree, or no joint of any row is visible inside the image.
+    """
+    from ctlev_core import supervised
+
+    joints2d, visible = _check_training_set(frames, labels, options)
+    grey = _grey(frames)
+    device = supervised.resolve_device(options.device)
+    model = supervised.build_seeded(lambda: _build(joints2d.shape[1], options), seed).to(device)
+    mirror = JOINT_SETS[labels.joint_set].mirror if options.flip else None
+
+    def compute_loss(rows: np.ndarray, generator: np.random.Generator) -> torch.Tensor:
+        import torch
+
+        images, points = _shift(grey[rows], joints2d[rows], options.shift_px, generator)
+        seen = visible[rows]
+        if mirror is not None:
+            images, points, seen = _flip_half(images, points, seen, mirror, generator)
+        inside = seen & _inside(points, grey.shape[1:])
+        heatmaps = model(_to_input(torch.from_numpy(images).to(device)))
+        points_tensor = torch.from_numpy(np.where(inside[..., None], points, 0).astype(np.float32)).to(device)
+        return _heatmap_loss(heatmaps, points_tensor, torch.from_numpy(inside).to(device), options)
+
+    history = supervised.train_model(
+        model,
+        compute_loss,
+        len(grey),
+        supervised.Schedule(
+            options.num_steps,
+            options.batch_size,
+            options.learning_rate,
+            options.warmup_steps,
+            options.weight_decay,
+            options.log_every,
+            options.checkpoint_every,
+        ),
+        seed=seed,
+        work=work,
+        run_digest=supervised.digest(NAME, VERSION, cache_material(options), seed, grey, joints2d, visible),
+        description="train pose2d",
+    )
+    supervised.write_model(
+        out,
+        model,
+        {
+            "model": NAME,
+            "version": VERSION,
+            "joint_set": labels.joint_set,
+            "num_joints": joints2d.shape[1],
+            "options": cache_material(options),
+        },
+    )
+    return history
+
+
+def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Joints of each frame.
+
+    Args:
+        model: folder written by `train`.
+        frames: [N, H, W, 3] uint8, of the scale the model was trained on.
+    Returns:
+        `joints2d` [N, J, 2] float32, px, pixel centres at integer + 0.5, and `confidence` [N, J] float32, the highest
+        value of the heatmap (of its softmax with the cross-entropy loss).
+    """
+    from ctlev_core import supervised
+
+    supervised.check_frames(frames, "predict pose2d")
+    config = supervised.read_config(model, NAME)
+    options = Options(**config["options"])
+    network = _build(config["num_joints"], options)
+    supervised.read_weights(model, network)
+    network.to(supervised.resolve_device("auto"))
+    batches = supervised.predict_in_batches(
+        network, lambda images: _decode(network(_to_input(images)), options), _grey(frames)
+    )
+    joints2d = [points.cpu().numpy() for points, _ in batches] or [np.zeros((0, config["num_joints"], 2), np.float32)]
+    confidence = [values.cpu().numpy() for _, values in batches] or [np.zeros((0, config["num_joints"]), np.float32)]
+    return {"joints2d": np.concatenate(joints2d), "confidence": np.concatenate(confidence)}
+
+
+def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) -> tuple[np.ndarray, np.ndarray]:
+    from ctlev_core.supervised import check_frames
+
+    where = "train pose2d"
+    check_frames(frames, where)
+    check_labels(labels, where)
+    if labels.joints2d is None or labels.visible is None:
+        raise DataError(f"{where}: the labels have no joints2d")
+    if len(labels) != len(frames):
+        raise DataError(f"{where}: {len(frames)} frames but {len(labels)} labels")
+    if options.flip and labels.joint_set not in JOINT_SETS:
+        raise DataError(f"{where}: flip needs a joint set of {', '.join(JOINT_SETS)}, got {labels.joint_set!r}")
+    usable = labels.visible & _inside(labels.joints2d, frames.shape[1:3])
+    if not usable.any():
+        raise DataError(f"{where}: no joint of any of the {len(labels)} rows is visible inside the image")
+    return labels.joints2d, labels.visible
+
+
+def _build(num_joints: int, options: Options) -> Any:
+    from ctlev_core.networks.dhp19 import DHP19Network
+
+    return DHP19Network(num_joints, options.width, options.batch_norm, options.output_stride)
+
+
+def _grey(frames: np.ndarray) -> np.ndarray:
+    """[N, H, W, 3] -> [N, H, W]: the largest channel is the brightness of grey and of red/blue event images alike."""
+    return frames.max(axis=-1)
+
+
+def _to_input(images: torch.Tensor) -> torch.Tensor:
+    """[N, H, W] uint8 -> [N, 1, H, W] float32 in [0, 1]."""
+    return images[:, None].float() / 255
+
+
+def _inside(points: np.ndarray, image_shape: tuple[int, ...]) -> np.ndarray:
+    """Which points [..., 2] lie in the image of shape (H, W); NaN does not."""
+    height, width = image_shape
+    return (points >= 0).all(axis=-1) & (points[..., 0] < width) & (points[..., 1] < height)
+
+
+def _shift(
+    images: np.ndarray, points: np.ndarray, shift_px: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shift each image [B, H, W] and its points [B, J, 2] by its own whole number of px."""
+    if not shift_px:
+        return images, points
+    height, width = images.shape[1:]
+    shifts = generator.integers(-shift_px, shift_px + 1, size=(len(images), 2))
+    padded = np.pad(images, ((0, 0), (shift_px, shift_px), (shift_px, shift_px)))
+    shifted = np.stack(
+        [
+            image[shift_px - dy : shift_px - dy + height, shift_px - dx : shift_px - dx + width]
+            for image, (dx, dy) in zip(padded, shifts, strict=True)
+        ]
+    )
+    return shifted, points + shifts[:, None].astype(points.dtype)
+
+
+def _flip_half(
+    images: np.ndarray,
+    points: np.ndarray,
+    visible: np.ndarray,
+    mirror: tuple[int, ...],
+    generator: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mirror each image with probability one half; the left elbow of a mirrored person is their right one."""
+    flip = generator.random(len(images)) < 0.5
+    mirrored = points[:, mirror] * np.array([-1, 1], points.dtype) + np.array([images.shape[2], 0], points.dtype)
+    return (
+        np.where(flip[:, None, None], images[:, :, ::-1], images),
+        np.where(flip[:, None, None], mirrored, points),
+        np.where(flip[:, None], visible[:, mirror], visible),
+    )
+
+
+def _pixel_centres(heatmaps: torch.Tensor, stride: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Coordinates x [W] and y [H] of the heatmap's pixel centres, image px."""
+    import torch
+
+    height, width = heatmaps.shape[-2:]
+    x = (torch.arange(width, device=heatmaps.device, dtype=torch.float32) + 0.5) * stride
+    y = (torch.arange(height, device=heatmaps.device, dtype=torch.float32) + 0.5) * stride
+    return x, y
+
+
+def _heatmap_loss(heatmaps: torch.Tensor, points: torch.Tensor, inside: torch.Tensor, options: Options) -> torch.Tensor:
+    """Mean over the joints inside the image; zero with a graph where there is none."""
+    import torch
+
+    x, y = _pixel_centres(heatmaps, options.output_stride)
+    # The Gaussian is separable: two rows of exponentials a joint rather than one image.
+    column = torch.exp(-((x - points[..., :1]) ** 2) / (2 * options.sigma_px**2))
+    row = torch.exp(-((y - points[..., 1:]) ** 2) / (2 * options.sigma_px**2))
+    if options.loss == "mse":
+        per_joint = (heatmaps - row[..., :, None] * column[..., None, :]).square().mean(dim=(-2, -1))
+    else:
+        column = column / column.sum(dim=-1, keepdim=True)
+        row = row / row.sum(dim=-1, keepdim=True)
+        # Cross-entropy against a distribution: log of the normaliser minus the expected logit.
+        expected = torch.einsum("njhw,njh,njw->nj", heatmaps, row, column)
+        per_joint = heatmaps.flatten(2).logsumexp(dim=-1) - expected
+    return (per_joint * inside).sum() / inside.sum().clamp(min=1)
+
+
+def _decode(heatmaps: torch.Tensor, options: Options) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points [N, J, 2] in image px and confidence [N, J] of heatmaps [N, J, H, W]."""
+    import torch
+
+    flat = heatmaps.flatten(2)
+    values = flat.softmax(dim=-1) if options.loss == "cross_entropy" else flat.clamp(min=0)
+    confidence, index = values.max(dim=-1)
+    width = heatmaps.shape[-1]
+    x, y = _pixel_centres(heatmaps, options.output_stride)
+    peak_x, peak_y = x[index % width], y[index // width]
+    peak = torch.stack([peak_x, peak_y], dim=-1)
+    if options.decoding == "argmax":
+        return peak, confidence
+    weights = values.view_as(heatmaps)
+    if options.decoding == "soft_argmax":
+        radius_px = options.output_stride * math.ceil(2 * options.sigma_px / options.output_stride)
+        near_x = (x - peak_x[..., None]).abs() <= radius_px
+        near_y = (y - peak_y[..., None]).abs() <= radius_px
+        weights = weights * near_y[..., :, None] * near_x[..., None, :]
+    columns, rows = weights.sum(dim=-2), weights.sum(dim=-1)
+    total = columns.sum(dim=-1)
+    centroid = torch.stack([(columns * x).sum(dim=-1), (rows * y).sum(dim=-1)], dim=-1)
+    # A heatmap without any positive value has no centroid; its first pixel is as good as any.
+    return torch.where(total[..., None] > 0, centroid / total.clamp(min=1e-30)[..., None], peak), confidence

@@ -1,0 +1,139 @@
+"""How sure is a score? Bootstrap intervals over groups of samples, and the spread over seeds.
+
+Frames of one recording resemble one another, so whole recordings are drawn, never single frames of them: a bootstrap
+over frames would give intervals that are far too narrow.
+Source: Davison & Hinkley, Bootstrap Methods and their Application, 1997, section 3.8 (clusters).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+_CHUNK_NUMBERS = 4_000_000
+
+
+def bootstrap_interval(
+    values: np.ndarray,
+    groups: Sequence[str] | np.ndarray | None = None,
+    *,
+    level: float = 0.95,
+    num_resamples: int = 2000,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """Percentile interval of the mean of `values` under resampling of whole groups.
+
+    For the difference of two models on the same samples, pass the differences: the bootstrap is then paired.
+
+    Args:
+        values: [N] scores of samples; NaN = not scored.
+        groups: [N] recording or sequence of each sample; None = every sample is its own group.
+        level: probability the interval should cover.
+        num_resamples: bootstrap replicates.
+        seed: of the resampling.
+    Returns:
+        (low, high). Both NaN with fewer than two scored groups: nothing is known about the spread then.
+    Raises:
+        ValueError: shapes differ, no value is scored, or the level is outside (0, 1).
+    """
+    values = np.asarray(values, dtype=np.float64)
+    names = np.arange(len(values)) if groups is None else np.asarray(groups)
+    if values.ndim != 1 or names.shape != values.shape:
+        raise ValueError(f"values and groups must both be [N], got {values.shape} and {names.shape}")
+    if not 0 < level < 1:
+        raise ValueError(f"level must be between 0 and 1, got {level}")
+    scored = ~np.isnan(values)
+    if not scored.any():
+        raise ValueError(f"none of the {len(values)} values is scored")
+    _, index = np.unique(names[scored], return_inverse=True)
+    sums, counts = np.bincount(index, weights=values[scored]), np.bincount(index)
+    if len(sums) < 2:
+        return float("nan"), float("nan")
+    means = np.concatenate([(d @ sums) / (d @ counts) for d in _draws(len(sums), num_resamples, seed)])
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+def cluster_bootstrap(
+    compute: Callable[[np.ndarray], Mapping[str, float]],
+    groups: Sequence[str] | np.ndarray,
+    *,
+    level: float = 0.95,
+    num_resamples: int = 500,
+    seed: int = 0,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Percentile intervals of any scores under resampling of whole groups; one call of `compute` a replicate.
+
+    Args:
+        compute: named scores of the given rows, in which rows of a group drawn twice come twice.
+        groups: [N] recording or sequence of each row.
+        level: probability each interval should cover.
+        num_resamples: bootstrap replicates.
+        seed: of the resampling.
+    Returns:
+        The lower and the upper ends by name; both empty with fewer than two groups. A replicate on which `compute`
+        raises ValueError (no visible joint, say) is left out.
+    """
+    names, index = np.unique(np.asarray(groups), return_inverse=True)
+    if len(names) < 2:
+        return {}, {}
+    members = [np.flatnonzero(index == group) for group in range(len(names))]
+    replicates: list[Mapping[str, float]] = []
+    for draws in _draws(len(names), num_resamples, seed):
+        for counts in draws:
+            rows = np.concatenate([np.tile(members[group], counts[group]) for group in np.flatnonzero(counts)])
+            with suppress(ValueError):
+                replicates.append(compute(rows))
+    if not replicates:
+        return {}, {}
+    low, high = {}, {}
+    for name in replicates[0]:
+        values = [replicate[name] for replicate in replicates]
+        low[name], high[name] = (float(q) for q in np.quantile(values, [(1 - level) / 2, (1 + level) / 2]))
+    return low, high
+
+
+def _draws(group_count: int, num_resamples: int, seed: int) -> Iterator[np.ndarray]:
+    """How often each group is drawn in each replicate, [replicates, group_count], in pieces that fit into memory."""
+    generator = np.random.default_rng(seed)
+    chunk = max(1, _CHUNK_NUMBERS // group_count)
+    for start in range(0, num_resamples, chunk):
+        size = min(chunk, num_resamples - start)
+        yield generator.multinomial(group_count, np.full(group_count, 1 / group_count), size=size)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A score over repetitions with different seeds.
+
+    Attributes:
+        mean: over the seeds.
+        deviation: sample standard deviation (n - 1) over the seeds; NaN with one seed.
+        count: number of seeds.
+    """
+
+    mean: float
+    deviation: float
+    count: int
+
+    def text(self, digits: int = 2) -> str:
+        """For a table cell: `6.31 ± 0.02`, or the mean alone with one seed."""
+        if self.count < 2:
+            return f"{self.mean:.{digits}f}"
+        return f"{self.mean:.{digits}f} ± {self.deviation:.{digits}f}"
+
+
+def compute_spread(values: Sequence[float] | np.ndarray) -> Spread:
+    """Mean and sample standard deviation of one score over seeds.
+
+    Raises:
+        ValueError: there is no value, or one is not finite.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
+        raise ValueError(f"needs at least one finite value a seed, got {array.tolist()}")
+    deviation = float(array.std(ddof=1)) if len(array) > 1 else float("nan")
+    return Spread(float(array.mean()), deviation, len(array))

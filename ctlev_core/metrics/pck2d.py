@@ -1,0 +1,78 @@
+"""Fraction of correct keypoints in the image: joints at most a threshold away from their label.
+
+The threshold is in px, or a fraction of a length of the labelled person. A joint exactly at the threshold is correct.
+Source: Yang & Ramanan, Articulated Human Detection with Flexible Mixtures of Parts, TPAMI 2013 (bounding box); Sapp &
+Taskar, MODEC, CVPR 2013 (torso: left shoulder to right hip).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ctlev_core.joint_errors import compute_joint_errors_px, row_means
+from ctlev_core.skeletons import JOINT_SETS
+from data_contracts.config import Frozen
+from data_contracts.labels import Labels
+
+VERSION = 1
+INPUT = "joints2d"
+
+
+class Options(Frozen):
+    """What counts as correct."""
+
+    threshold: float = Field(0.2, gt=0, description="px, or a fraction of the normaliser's length")
+    normaliser: Literal["px", "torso", "bbox"] = Field(
+        "torso",
+        description="px; torso = left shoulder to right hip; bbox = longer side of the box around the visible joints",
+    )
+
+
+def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> dict[str, float]:
+    """One fraction in [0, 1], named after normaliser and threshold, for example `pck_px4` or `pck_torso0.2`.
+
+    Args:
+        predicted: `joints2d` [N, J, 2], px.
+        target: labels with joints in the same image and order.
+        options: threshold and normaliser. Rows whose normaliser is unknown or zero are left out.
+    Raises:
+        ValueError: shapes differ, no joint is visible, or no row has a normaliser.
+    """
+    correct = _correct(predicted, target, options)
+    if np.isnan(correct).all():
+        raise ValueError(f"no row with a visible joint has a {options.normaliser} length to measure the threshold with")
+    return {f"pck_{options.normaliser}{options.threshold:g}": float(np.nanmean(correct))}
+
+
+def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
+    """Fraction [N] of correct joints of each row, NaN where the row is left out: what intervals are made of."""
+    return row_means(_correct(predicted, target, options))
+
+
+def _correct(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
+    """[N, J]: 1 correct, 0 wrong, NaN not scored."""
+    errors_px = compute_joint_errors_px(predicted, target)
+    limit_px = options.threshold * _normaliser_px(target, options)[:, None]
+    return np.where(np.isnan(errors_px) | ~(limit_px > 0), np.nan, errors_px <= limit_px)
+
+
+def _normaliser_px(target: Labels, options: Options) -> np.ndarray:
+    """Length [N] in px that a threshold of 1 stands for; NaN where unknown."""
+    if target.joints2d is None or target.visible is None:
+        raise ValueError("the target labels have no joints2d")
+    if options.normaliser == "px":
+        return np.ones(len(target))
+    points = np.where(target.visible[..., None], target.joints2d.astype(np.float64), np.nan)
+    if options.normaliser == "bbox":
+        size = np.full(len(target), np.nan)
+        seen = target.visible.any(axis=1)
+        size[seen] = (np.nanmax(points[seen], axis=1) - np.nanmin(points[seen], axis=1)).max(axis=-1)
+        return size
+    if target.joint_set not in JOINT_SETS:
+        raise ValueError(f"the torso needs a joint set of {', '.join(JOINT_SETS)}, got {target.joint_set!r}")
+    joints = JOINT_SETS[target.joint_set].joints
+    return np.linalg.norm(points[:, joints.index("left_shoulder")] - points[:, joints.index("right_hip")], axis=-1)

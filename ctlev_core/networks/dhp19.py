@@ -1,0 +1,95 @@
+"""The convolutional pose network of DHP19, with a width, batch normalisation and a half-size output as options.
+
+Source: Calabrese et al., DHP19, CVPR Workshops 2019. The layers are those of the published Keras file DHP_CNN.model:
+seventeen 3 x 3 convolutions without bias, ReLU after every one of them, the last included.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+# Name, channels at width 1, dilation. `pool` halves the image, `up` doubles it by a transposed convolution.
+LAYERS: tuple[tuple[str, int, int], ...] = (
+    ("conv1", 16, 1),
+    ("pool1", 0, 0),
+    ("conv2a", 32, 1), ("conv2b", 32, 1), ("conv2d", 32, 1),
+    ("pool2", 0, 0),
+    ("conv3a", 64, 2), ("conv3b", 64, 2), ("conv3c", 64, 2), ("conv3d", 64, 2),
+    ("conv3_up", 32, 1),
+    ("conv4a", 32, 2), ("conv4b", 32, 2), ("conv4c", 32, 2), ("conv4d", 32, 2),
+    ("conv4_up", 16, 1),
+    ("conv5a", 16, 1), ("conv5d", 16, 1),
+)  # fmt: skip
+DOWNSAMPLING = 4
+"""Height and width inside the network are padded to a multiple of this."""
+
+
+class SameTransposedConvolution(nn.ConvTranspose2d):
+    """3 x 3, stride 2, as Keras computes it with padding "same": no padding, then the last row and column dropped.
+
+    PyTorch's `padding=1, output_padding=1` also doubles the size but shifts the result by one pixel.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__(channels_in, channels_out, 3, stride=2, bias=False)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """[N, C, H, W] -> [N, channels_out, 2H, 2W]."""
+        return super().forward(x)[..., :-1, :-1]
+
+
+class DHP19Network(nn.Module):
+    """One heatmap a joint from one grey image.
+
+    Args:
+        num_joints: heatmaps to predict; 13 in DHP19.
+        width: factor on all channel counts; 1 is DHP19 (218,592 parameters with 13 joints).
+        batch_norm: normalise after every convolution but the last. The heatmaps are then unbounded (no last ReLU).
+        output_stride: 1 as DHP19; 2 leaves out the last upsampling and predicts heatmaps of half the size.
+    """
+
+    def __init__(
+        self, num_joints: int = 13, width: float = 1.0, batch_norm: bool = False, output_stride: int = 1
+    ) -> None:
+        super().__init__()
+        self.output_stride = output_stride
+        layers: OrderedDict[str, nn.Module] = OrderedDict()
+        channels = 1
+        for name, base, dilation in LAYERS:
+            if name.startswith("pool"):
+                layers[name] = nn.MaxPool2d(2)
+                continue
+            if name == "conv4_up" and output_stride == 2:
+                continue
+            channels_out = max(1, round(base * width))
+            if name.endswith("up"):
+                layers[name] = SameTransposedConvolution(channels, channels_out)
+            else:
+                layers[name] = nn.Conv2d(channels, channels_out, 3, padding=dilation, dilation=dilation, bias=False)
+            if batch_norm:
+                layers[f"{name}_norm"] = nn.BatchNorm2d(channels_out)
+            layers[f"{name}_relu"] = nn.ReLU(inplace=True)
+            channels = channels_out
+        layers["pred_cube"] = nn.Conv2d(channels, num_joints, 3, padding=1, bias=False)
+        if not batch_norm:
+            layers["pred_cube_relu"] = nn.ReLU()
+        self.layers = nn.Sequential(layers)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        # He initialisation: PyTorch's own default would shrink the signal by sqrt(6) in each of the 17 layers.
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                fan_in = module.in_channels * 9 / (module.stride[0] ** 2 if module.transposed else 1)
+                nn.init.normal_(module.weight, std=(2 / fan_in) ** 0.5)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """Heatmaps [N, J, ceil(H / output_stride), ceil(W / output_stride)] of images [N, 1, H, W] in [0, 1]."""
+        height, width = images.shape[-2:]
+        padded = functional.pad(images, (0, -width % DOWNSAMPLING, 0, -height % DOWNSAMPLING))
+        heatmaps = self.layers(padded)
+        return heatmaps[..., : -(-height // self.output_stride), : -(-width // self.output_stride)]
