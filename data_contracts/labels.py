@@ -91,9 +91,8 @@ def check_labels(labels: Labels, where: str) -> Labels:
     if labels.joints2d.ndim != 3 or labels.joints2d.shape[0] != count or labels.joints2d.shape[2] != 2:
         raise DataError(f"{where}: joints2d must be [{count}, J, 2], got {labels.joints2d.shape}")
     if labels.visible.shape != labels.joints2d.shape[:2] or labels.visible.dtype != bool:
-        raise DataError(
-            f"{where}: visible must be {labels.joints2d.shape[:2]} bool, got {labels.visible.shape} {labels.visible.dtype}"
-        )
+        got = f"{labels.visible.shape} {labels.visible.dtype}"
+        raise DataError(f"{where}: visible must be {labels.joints2d.shape[:2]} bool, got {got}")
     wrong = labels.visible & ~np.isfinite(labels.joints2d).all(axis=-1)
     if wrong.any():
         row, joint = np.argwhere(wrong)[0]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from ctlev_core import plugins
 from ctlev_core.plugins import PluginError, validate_options
@@ -23,33 +23,42 @@ from tasks.stage import PlannedStage, planning
 PRESETS = Path(__file__).resolve().parent / "presets"
 
 
-def preset_names() -> list[str]:
-    """Names of the bundled presets."""
-    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+def preset_names(folder: Path = PRESETS) -> list[str]:
+    """Names of the bundled presets of a folder."""
+    return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
 def load_experiment(preset: str, overrides: list[str]) -> Experiment:
-    """Read a preset, apply `key=value` overrides and validate everything, plug-in options included.
-
-    Args:
-        preset: name of a bundled preset, or path of a YAML file.
-        overrides: dotted names, for example `encoding.options.polarity=false`; values are YAML.
+    """The experiment a preset describes, with every plug-in's options validated.
 
     Raises:
         PluginError: unknown preset, option or plug-in, or a wrong value.
     """
-    path = Path(preset) if preset.endswith((".yaml", ".yml")) else PRESETS / f"{preset}.yaml"
+    experiment = load_preset(Experiment, PRESETS, preset, overrides)
+    for choice in experiment.choices:
+        plugins.load_options(choice)
+    return experiment
+
+
+def load_preset(model: type[BaseModel], folder: Path, preset: str, overrides: list[str]) -> Any:
+    """Read a preset, apply `key=value` overrides and validate it.
+
+    Args:
+        model: the options the preset holds.
+        folder: of the bundled presets of this kind.
+        preset: name of a bundled preset, or path of a YAML file.
+        overrides: dotted names, for example `encoding.options.polarity=false`; values are YAML.
+    """
+    path = Path(preset) if preset.endswith((".yaml", ".yml")) else folder / f"{preset}.yaml"
     if not path.is_file():
-        raise PluginError(f"unknown preset {preset!r}; known: {', '.join(preset_names())}, or the path of a .yaml file")
+        known = ", ".join(preset_names(folder))
+        raise PluginError(f"unknown preset {preset!r}; known: {known}, or the path of a .yaml file")
     values = yaml.safe_load(path.read_text())
     if not isinstance(values, dict):
         raise PluginError(f"{path}: a preset is a mapping of options, got {type(values).__name__}")
     for override in overrides:
         _apply(values, override)
-    experiment = validate_options(Experiment, values, f"preset {preset!r}")
-    for choice in experiment.choices:
-        plugins.load_options(choice)
-    return experiment
+    return validate_options(model, values, f"preset {preset!r}")
 
 
 def _apply(values: dict[str, Any], override: str) -> None:
@@ -76,12 +85,19 @@ def print_plan(rows: list[PlannedStage]) -> None:
     print(f"{sum(row.cached for row in rows)} of {len(rows)} stages are cached")
 
 
-def main(flow: Any, describe: Callable[[Any, Experiment], str], *, default_preset: str = "demo") -> int:
+def main(
+    flow: Any,
+    describe: Callable[[Any, Any], str],
+    *,
+    load: Callable[[str, list[str]], Any] = load_experiment,
+    default_preset: str = "demo",
+) -> int:
     """Run a flow as a script.
 
     Args:
-        flow: a Prefect flow of one parameter, an `Experiment`.
-        describe: from the flow's result and the experiment to the lines printed at the end.
+        flow: a Prefect flow of one parameter, its options.
+        describe: from the flow's result and its options to the lines printed at the end.
+        load: from a preset's name and overrides to the options.
         default_preset: used without `--preset`.
 
     Returns:
@@ -90,17 +106,18 @@ def main(flow: Any, describe: Callable[[Any, Experiment], str], *, default_prese
     arguments = _parse(flow, default_preset)
     started = time.perf_counter()
     try:
-        experiment = load_experiment(arguments.preset, arguments.set)
+        _check_home(Path(os.environ["CTLEV_HOME"]))
+        options = load(arguments.preset, arguments.set)
         if not arguments.dry_run:
             local_server.start(Path(os.environ["CTLEV_HOME"]))
         with planning() as rows:
-            flow.fn(experiment)
+            flow.fn(options)
         if arguments.dry_run:
             print_plan(rows)
             return 0
         _use_cores(rows)
         local_server.wait()
-        result = flow(experiment)
+        result = flow(options)
     except (DataError, PluginError, ValidationError, FileNotFoundError, PermissionError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -108,9 +125,14 @@ def main(flow: Any, describe: Callable[[Any, Experiment], str], *, default_prese
         print("interrupted; finished stages and checkpoints are kept", file=sys.stderr)
         return 130
     cached = sum(row.cached for row in rows)
-    print(describe(result, experiment))
+    print(describe(result, options))
     print(f"{len(rows)} stages, {cached} of them cached, in {time.perf_counter() - started:.1f} s")
     return 0
+
+
+def _check_home(home: Path) -> None:
+    if not os.access(home, os.W_OK | os.X_OK):
+        raise PermissionError(f"{home}: the home folder cannot be written; choose another with --home or CTLEV_HOME")
 
 
 def _use_cores(rows: list[PlannedStage]) -> None:
@@ -126,7 +148,7 @@ def _parse(flow: Any, default_preset: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=(flow.__doc__ or "").strip().splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    parser.add_argument("--preset", default=default_preset, help=f"one of {', '.join(preset_names())}, or a .yaml file")
+    parser.add_argument("--preset", default=default_preset, help="name of a bundled preset, or path of a .yaml file")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change an option; repeatable")
     parser.add_argument("--dry-run", action="store_true", help="print the plan and run nothing")
     parser.add_argument("--home", help="folder of all state [CTLEV_HOME or .ctlev]")

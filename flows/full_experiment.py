@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import sys
 
-from tasks.report import publish_report, report
-
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from flows.command_line import main
@@ -17,6 +15,7 @@ from flows.prepare_dataset import prepare_dataset
 from flows.settings import HOME, flow
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
+from tasks.report import publish_report, report
 from tasks.stage import call_flow
 
 

@@ -1,13 +1,14 @@
 """Prefect without a server of the user's own: one private server for the life of one script.
 
-Prefect would start such a server itself, but only when the first flow is called, with a 20 s limit that a busy machine
-exceeds, and it outlives a killed script. Here it starts before anything heavy is imported, so that its start-up overlaps
-ours, and it dies with the script, whatever ends the script.
+Prefect would start such a server itself, but only when the first flow is called, with a 20 s limit that a busy
+machine exceeds, and it outlives a killed script. Here it starts before anything heavy is imported, so that its start-up
+overlaps ours, and it dies with the script, whatever ends the script.
 """
 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
 import os
 import signal
@@ -32,6 +33,8 @@ _server: subprocess.Popen[bytes] | None = None
 
 def configure(home: Path, *, verbose: bool) -> None:
     """Point Prefect at `home` and keep it quiet. Must run before Prefect is imported; what the user set stays."""
+    with contextlib.suppress(OSError):  # `main` says clearly that the home cannot be written
+        (home / "prefect").mkdir(parents=True, exist_ok=True)
     settings = {"PREFECT_HOME": str(home / "prefect"), "PREFECT_LOGGING_LEVEL": "INFO" if verbose else "CRITICAL"}
     for name, value in {**_QUIET, **settings}.items():
         os.environ.setdefault(name, value)

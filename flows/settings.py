@@ -32,7 +32,7 @@ def _configure() -> Path:
     for name, value in _OFFLINE.items():
         os.environ.setdefault(name, value)
     local_server.configure(home, verbose=known.verbose)
-    # `python flows/full_experiment.py` puts this folder on the path, where evaluate.py would hide packages of that name.
+    # `python flows/full_experiment.py` puts this folder on the path, where evaluate.py would hide a package.
     folder = str(Path(__file__).resolve().parent)
     sys.path[:] = [entry for entry in sys.path if not entry or str(Path(entry).resolve()) != folder]
     return home

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from ctlev_core.intervals import cluster_bootstrap
 
 from ctlev_core import plugins
+from ctlev_core.intervals import cluster_bootstrap
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.events import DataError

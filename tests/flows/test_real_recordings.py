@@ -30,7 +30,9 @@ def finished_home(tmp_path_factory, request):
     if not root.is_dir():
         pytest.skip("the real recordings are not beside this checkout")
     home = tmp_path_factory.mktemp("folder")
-    finished = run_script("full_experiment", "--preset", "folder", "--set", f"dataset.options.root={root}", *SMALL, home=home)
+    finished = run_script(
+        "full_experiment", "--preset", "folder", "--set", f"dataset.options.root={root}", *SMALL, home=home
+    )
     assert finished.status == 0, finished.errors
     return home
 

@@ -117,7 +117,10 @@ def test_second_run_recomputes_nothing_and_is_nearly_as_quick_as_a_bare_flow(smo
     [
         ("downstream.options.num_steps=21", {"train_downstream: pose2d", "score_model", "report"}),
         ("num_synthetic=9", {"condition_samples", "sample", "synthetic", "labels of synthetic", "report"}),
-        ("encoding.options.normalisation=max", {"encode", "condition", "finetune", "sample", "train", "score", "report"}),
+        (
+            "encoding.options.normalisation=max",
+            {"encode", "condition", "finetune", "sample", "train", "score", "report"},
+        ),
         ("name=renamed", {"report"}),
     ],
 )

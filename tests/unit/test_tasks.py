@@ -29,7 +29,15 @@ def test_balanced_choice_of_more_rows_starts_with_the_same_rows():
 
 
 def row(setting, value, low=None, high=None, metric="mpjpe2d_px", seed=0):
-    return {"setting": setting, "group": "all", "metric": metric, "value": value, "low": low, "high": high, "seed": seed}
+    return {
+        "setting": setting,
+        "group": "all",
+        "metric": metric,
+        "value": value,
+        "low": low,
+        "high": high,
+        "seed": seed,
+    }
 
 
 SETTINGS = ("real", "synthetic", "real+synthetic")
