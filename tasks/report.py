@@ -78,8 +78,8 @@ def _score_tables(rows: list[dict[str, Any]], settings: Sequence[str]) -> list[S
             "Does synthetic data help? Held-out real test data",
             trained,
             "trained on",
-            f"Equal optimiser steps for every row; mean over {seeds} seed{'s' if seeds > 1 else ''}. In brackets the 95 % "
-            "interval over test recordings (cluster bootstrap), which does not cover the spread over seeds.",
+            f"Equal optimiser steps for every row; mean over {seeds} seed{'s' if seeds > 1 else ''}. In brackets the "
+            "95 % interval over test recordings (cluster bootstrap), which does not cover the spread over seeds.",
         )
     ]
     floor = [{**row, "setting": "held-out real (floor)"} for row in trained if row["setting"] == "real"]
@@ -89,8 +89,8 @@ def _score_tables(rows: list[dict[str, Any]], settings: Sequence[str]) -> list[S
                 "Do the synthetic frames show their labels?",
                 floor + faithful,
                 "frames",
-                "The model trained on real frames, scored on synthetic frames against the labels they were sampled from, "
-                "beside its score on held-out real frames.",
+                "The model trained on real frames, scored on synthetic frames against the labels they were sampled "
+                "from, beside its score on held-out real frames.",
             )
         )
     if distances:
@@ -100,8 +100,8 @@ def _score_tables(rows: list[dict[str, Any]], settings: Sequence[str]) -> list[S
                 distances,
                 "frames",
                 "Frechet distance to the real training frames in the features of a classifier trained on real events "
-                "(not FID). It depends on the number of frames, so read it against the row of held-out real frames; alone "
-                "it does not tell whether labels are right.",
+                "(not FID). It depends on the number of frames, so read it against the row of held-out real frames; "
+                "alone it does not tell whether labels are right.",
             )
         )
     groups = [row for row in rows if row["setting"] in settings and row["group"] != "all"]

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from data_contracts.events import Events
 
 for _name, _value in {"HF_HUB_OFFLINE": "1", "DO_NOT_TRACK": "1", "TRANSFORMERS_VERBOSITY": "error"}.items():
     os.environ.setdefault(_name, _value)
-
-from data_contracts.events import Events
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 REAL_DATA = REPOSITORY.parent / "shared" / "real"

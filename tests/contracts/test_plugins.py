@@ -68,7 +68,7 @@ def test_planning_imports_are_light():
 
 
 def test_unknown_names_list_the_known_ones():
-    with pytest.raises(PluginError, match="unknown plug-in 'fid' in metrics; known: .*mpjpe2d"):
+    with pytest.raises(PluginError, match=r"unknown plug-in 'fid' in metrics; known: .*mpjpe2d"):
         plugins.load_options(MetricChoice(name="fid"))
     with pytest.raises(PluginError, match="unknown plug-in kind 'metric'; known kinds: datasets, formats"):
         plugins.names("metric")

@@ -8,6 +8,7 @@ import statistics
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -174,7 +175,7 @@ def test_private_server_dies_with_a_killed_script(tmp_path):
     children = []
     while not children and time.monotonic() < deadline:
         time.sleep(0.2)
-        children = [int(pid) for pid in open(f"/proc/{process.pid}/task/{process.pid}/children").read().split()]
+        children = [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
     assert children, "the private Prefect server did not start"
     process.kill()
     process.communicate()
