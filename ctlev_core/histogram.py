@@ -15,36 +15,43 @@ def count_events(
     p: np.ndarray,
     windows: np.ndarray,
     column_of: np.ndarray,
-    row_of: np.ndarray,
+    row_start_of: np.ndarray,
+    negative_start: int,
+    scratch: np.ndarray,
     histogram: np.ndarray,
 ) -> int:
-    """Add the events of each window to its counts, which stop at 65,535.
+    """Count the events of each window; counts stop at 65,535.
 
-    One pass, straight into the result: an event costs two look-ups in tables that stay in cache and one increment.
+    An event costs two look-ups in tables that stay in cache and one increment, without a branch on its polarity (a coin
+    toss that a processor cannot predict). Counting in one small buffer and copying it was measured 1.4 times as fast as
+    counting in the large result, whose pages are new.
 
     Args:
         x: [E] uint16, sensor px.
         y: [E] uint16, sensor px.
         p: [E] uint8; anything but 0 is positive.
         windows: [N, 2] int64, ranges within 0 .. E.
-        column_of: [sensor width] int64, image column of each sensor column; -1 = outside the image.
-        row_of: [sensor height] int64, image row of each sensor row; -1 = outside the image.
-        histogram: [N, C, H, W] uint16, changed in place; C is 2 (positive, negative) or 1 (both).
+        column_of: [sensor width] int64, image column of each sensor column; negative = outside the image.
+        row_start_of: [sensor height] int64, cell where the image row of each sensor row starts; negative = outside.
+        negative_start: cell where the channel of negative events starts; 0 where polarity is discarded.
+        scratch: [cells] uint16, overwritten.
+        histogram: [N, cells] uint16, filled; the cells are those of [C, H, W].
     Returns:
         Index of the first event outside the sensor, where counting stopped; -1 if there is none.
     """
-    num_channels = histogram.shape[1]
     for window in range(len(windows)):
+        scratch[:] = 0
         for event in range(windows[window, 0], windows[window, 1]):
-            if x[event] >= len(column_of) or y[event] >= len(row_of):
+            if x[event] >= len(column_of) or y[event] >= len(row_start_of):
                 return event
-            column, row = column_of[x[event]], row_of[y[event]]
-            if column < 0 or row < 0:
+            column, row_start = column_of[x[event]], row_start_of[y[event]]
+            if column < 0 or row_start < 0:
                 continue
-            channel = 1 if num_channels == 2 and p[event] == 0 else 0
-            count = histogram[window, channel, row, column]
-            if count < MAX_COUNT:
-                histogram[window, channel, row, column] = count + 1
+            # Unsigned, so that no code for negative indices is made.
+            cell = np.uint64(row_start + column + negative_start * (p[event] == 0))
+            count = scratch[cell]
+            scratch[cell] = count + (count < MAX_COUNT)
+        histogram[window] = scratch
     return -1
 
 

@@ -113,9 +113,7 @@ def _open_words(path: Path, header: Header) -> np.ndarray:
             f"{path}: cut inside a word: {num_bytes} bytes after the header, "
             f"expected a multiple of {dtype.itemsize} for {header.encoding}"
         )
-    words = np.asarray(np.memmap(path, dtype, mode="c", offset=header.size))
-    # A header may end on any byte; numba would compile its loops once more for words that are not aligned.
-    return np.require(words, requirements="A")
+    return np.asarray(np.memmap(path, dtype, mode="c", offset=header.size))
 
 
 def _sensor_size(header: Header, x: np.ndarray, y: np.ndarray, where: str) -> SensorSize:

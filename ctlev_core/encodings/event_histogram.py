@@ -68,17 +68,22 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         row = int(np.argmax(wrong))
         raise ValueError(f"window {row} must be a range within {len(events)} events, got {windows[row].tolist()}")
     width, height = _image_size(events.sensor_size, options)
-    counts = np.zeros((len(windows), 2 if options.polarity else 1, height, width), np.uint16)
+    num_channels = 2 if options.polarity else 1
     (scale_x, offset_x), (scale_y, offset_y) = _scale_and_offset(events.sensor_size, options)
     column_of = _bins(events.sensor_size[0], width, scale_x, offset_x)
-    row_of = _bins(events.sensor_size[1], height, scale_y, offset_y)
-    outside = kernels.count_events(events.x, events.y, events.p, windows, column_of, row_of, counts)
+    row_start_of = _bins(events.sensor_size[1], height, scale_y, offset_y) * width
+    negative_start = (num_channels - 1) * height * width
+    scratch = np.empty(num_channels * height * width, np.uint16)
+    counts = np.empty((len(windows), scratch.size), np.uint16)
+    outside = kernels.count_events(
+        events.x, events.y, events.p, windows, column_of, row_start_of, negative_start, scratch, counts
+    )
     if outside >= 0:
         raise DataError(
             f"event {outside} at x = {events.x[outside]}, y = {events.y[outside]} px lies outside the sensor of "
             f"{events.sensor_size[0]} x {events.sensor_size[1]} px"
         )
-    return counts
+    return counts.reshape(len(windows), num_channels, height, width)
 
 
 def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:

@@ -50,12 +50,14 @@ FITS = st.sampled_from(["pad", "crop", "stretch"])
 SIZES = st.tuples(st.integers(1, 12), st.integers(1, 12))
 
 
+@settings(deadline=None)
 @given(ROWS)
 def test_the_sum_is_the_number_of_events(rows):
     events = make_events(rows, (7, 5))
     assert encode(events, whole(events), Options()).sum() == len(rows)
 
 
+@settings(deadline=None)
 @given(ROWS, SIZES, st.sampled_from(["pad", "stretch"]))
 def test_pad_and_stretch_lose_no_event(rows, image_size, fit):
     events = make_events(rows, (7, 5))
@@ -64,6 +66,7 @@ def test_pad_and_stretch_lose_no_event(rows, image_size, fit):
     assert counts.sum() == len(rows)
 
 
+@settings(deadline=None)
 @given(ROWS, SIZES, FITS)
 def test_swapping_the_polarity_exchanges_the_channels(rows, image_size, fit):
     options = Options(image_size=image_size, fit=fit)
@@ -73,6 +76,7 @@ def test_swapping_the_polarity_exchanges_the_channels(rows, image_size, fit):
     assert (render_image(counts, options) == render_image(exchanged, options)[..., ::-1]).all()
 
 
+@settings(deadline=None)
 @given(ROWS, SIZES, FITS)
 def test_events_fall_where_their_points_map_to(rows, image_size, fit):
     options = Options(polarity=False, image_size=image_size, fit=fit)
@@ -234,7 +238,7 @@ def test_count_normalisation_clips():
     assert image[0, 0, :, 0].tolist() == [0, 31, 223, 255, 255, 255]
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(arrays(np.uint16, (2, 2, 3, 4), elements=st.integers(0, 300)), st.sampled_from(["three_sigma", "max", "count"]))
 def test_brightness_grows_with_the_count_and_zero_stays_black(counts, normalisation):
     images = render_image(counts, Options(normalisation=normalisation))

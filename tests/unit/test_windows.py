@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.windows import cut
@@ -77,6 +77,7 @@ def test_max_windows_spreads_evenly(limit, expected):
 TIMES = st.lists(st.integers(0, 200), max_size=60).map(sorted)
 
 
+@settings(deadline=None)
 @given(TIMES, st.integers(1, 20))
 def test_count_windows_tile_the_recording(times, num_events):
     result = ranges(times, num_events=num_events)
@@ -84,6 +85,7 @@ def test_count_windows_tile_the_recording(times, num_events):
     assert len(times) - num_events * len(result) < num_events
 
 
+@settings(deadline=None)
 @given(TIMES, st.integers(1, 50), st.integers(1, 5))
 def test_duration_windows_equal_a_slow_search(times, duration_us, min_events):
     expected = []
@@ -95,6 +97,7 @@ def test_duration_windows_equal_a_slow_search(times, duration_us, min_events):
     assert ranges(times, method="duration", duration_us=duration_us, min_events=min_events) == expected
 
 
+@settings(deadline=None)
 @given(TIMES, st.sampled_from(["count", "duration", "whole"]), st.integers(1, 12), st.integers(1, 10))
 def test_max_windows_keeps_a_subset_in_order(times, method, size, limit):
     options = {"method": method, "num_events": size, "duration_us": size}
