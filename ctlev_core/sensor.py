@@ -24,20 +24,28 @@ from data_contracts.events import DataError, Events, SensorSize, check_events
 class SensorOptions(Frozen):
     """One kind of sensor. The defaults are an ideal one; `PRESETS["noisy"]` is a real one."""
 
-    threshold: float = Field(0.2, gt=0, description="Mean log-intensity step of an event, both polarities.")
-    threshold_sigma: float = Field(0.0, ge=0, description="Standard deviation of the thresholds over pixels.")
-    threshold_minimum: float = Field(0.05, gt=0, description="No pixel is more sensitive than this.")
-    log_floor: float = Field(0.02, gt=0, description="Below this intensity the response is linear; white is 1.")
-    cutoff_dark_hz: float | None = Field(None, gt=0, description="Photoreceptor bandwidth in the dark; None = none.")
-    cutoff_bright_hz: float = Field(180.0, gt=0, description="Photoreceptor bandwidth at white.")
-    refractory_us: int = Field(0, ge=0, description="Time after an event in which a pixel stays silent.")
-    leak_rate_hz: float = Field(0.0, ge=0, description="ON events a second of a pixel that sees nothing happen.")
-    shot_rate_hz: float = Field(0.0, ge=0, description="Noise events a second of a dark pixel, either polarity.")
-    shot_rate_bright: float = Field(0.25, ge=0, le=1, description="Share of the shot noise left at white.")
-    rate_spread: float = Field(0.0, ge=0, description="Log-normal spread of leak and shot rates over pixels.")
-    hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Pixels that fire on their own.")
-    hot_rate_hz: tuple[float, float] = Field((20.0, 150.0), description="Their rates, uniform in this range.")
-    starts_settled: bool = Field(True, description="False: the first frame is the reference level of every pixel.")
+    threshold: float = Field(default=0.2, gt=0, description="Mean log-intensity step of an event, both polarities.")
+    threshold_sigma: float = Field(default=0.0, ge=0, description="Standard deviation of the thresholds over pixels.")
+    threshold_minimum: float = Field(default=0.05, gt=0, description="No pixel is more sensitive than this.")
+    log_floor: float = Field(default=0.02, gt=0, description="Below this intensity the response is linear; white is 1.")
+    cutoff_dark_hz: float | None = Field(
+        default=None, gt=0, description="Photoreceptor bandwidth in the dark; None = none."
+    )
+    cutoff_bright_hz: float = Field(default=180.0, gt=0, description="Photoreceptor bandwidth at white.")
+    refractory_us: int = Field(default=0, ge=0, description="Time after an event in which a pixel stays silent.")
+    leak_rate_hz: float = Field(
+        default=0.0, ge=0, description="ON events a second of a pixel that sees nothing happen."
+    )
+    shot_rate_hz: float = Field(
+        default=0.0, ge=0, description="Noise events a second of a dark pixel, either polarity."
+    )
+    shot_rate_bright: float = Field(default=0.25, ge=0, le=1, description="Share of the shot noise left at white.")
+    rate_spread: float = Field(default=0.0, ge=0, description="Log-normal spread of leak and shot rates over pixels.")
+    hot_pixel_fraction: float = Field(default=0.0, ge=0, le=1, description="Pixels that fire on their own.")
+    hot_rate_hz: tuple[float, float] = Field(default=(20.0, 150.0), description="Their rates, uniform in this range.")
+    starts_settled: bool = Field(
+        default=True, description="False: the first frame is the reference level of every pixel."
+    )
 
 
 PRESETS = {
@@ -243,7 +251,7 @@ def _crossing(difference, change, on, off):
 
 @numba.njit(cache=True, nogil=True)
 def _log_response(light, log_floor):
-    """log above the floor, its tangent below: finite at zero, without a kink."""
+    """Log above the floor, its tangent below: finite at zero, without a kink."""
     if light > log_floor:
         return math.log(light)
     return math.log(log_floor) + (light - log_floor) / log_floor

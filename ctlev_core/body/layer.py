@@ -186,12 +186,11 @@ def skin(vertices, normals, weight_indices, weight_values, transforms, posed, po
         for row in range(3):
             a = b = c = d = vertices.dtype.type(0.0)
             for k in range(weight_indices.shape[1]):
-                weight = weight_values[i, k]
-                bone = transforms[weight_indices[i, k], row]
-                a += weight * bone[0]
-                b += weight * bone[1]
-                c += weight * bone[2]
-                d += weight * bone[3]
+                weight, bone = weight_values[i, k], weight_indices[i, k]
+                a += weight * transforms[bone, row, 0]
+                b += weight * transforms[bone, row, 1]
+                c += weight * transforms[bone, row, 2]
+                d += weight * transforms[bone, row, 3]
             posed[i, row] = a * x + b * y + c * z + d
             posed_normals[i, row] = a * nx + b * ny + c * nz
 

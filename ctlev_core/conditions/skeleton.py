@@ -20,7 +20,7 @@ VERSION = 1
 class Options(Frozen):
     """Options of the skeleton condition."""
 
-    prompt: str = Field("A moving human", description="The same prompt for every image, as in the paper.")
+    prompt: str = Field(default="A moving human", description="The same prompt for every image, as in the paper.")
 
 
 def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds: Sequence[int]) -> Conditions:

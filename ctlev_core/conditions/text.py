@@ -21,10 +21,12 @@ PLACEHOLDER = "{class_name}"
 class Options(Frozen):
     """Options of the text condition."""
 
-    template: str = Field("A photo of {class_name}", description="The prompt; {class_name} stands for the name.")
+    template: str = Field(
+        default="A photo of {class_name}", description="The prompt; {class_name} stands for the name."
+    )
     synonyms: dict[str, list[str]] = Field(
         default_factory=dict,
-        description="Names to draw from for a class, for example its WordNet lemmas; other classes keep their own name.",
+        description="Names to draw from, by class, for example WordNet lemmas; other classes keep their own name.",
     )
 
     @field_validator("template")

@@ -38,19 +38,31 @@ SUBJECT_STREAM, SENSOR_STREAM, SCENE_STREAM, NOISE_STREAM = 10, 11, 12, 13
 class Options(Frozen):
     """Options of the studio. The defaults are a small set that is made in about a minute on one core."""
 
-    seed: int = Field(0, ge=0, description="Everything in the studio follows from it.")
-    sensor_size: tuple[int, int] = Field((64, 64), description="(width, height) px.")
-    num_train_recordings: int = Field(600, ge=0, description="Recordings of subjects 0 to 3, SEEN motions.")
-    num_test_recordings: int = Field(300, ge=0, description="Recordings of subjects 4 and 5, all motions in turn.")
-    num_condition_recordings: int = Field(1200, ge=0, description="Label-only poses of random people, UNSEEN motions.")
-    recording_duration_us: int = Field(250_000, ge=10_000, description="Length of a recording.")
-    render_rate_hz: float = Field(250.0, gt=0, le=10_000, description="Pictures a second the sensor model sees.")
-    label_rate_hz: float = Field(200.0, gt=0, le=10_000, description="Labels a second; DHP19's motion capture has 100.")
-    num_train_subjects: int = Field(4, ge=1, description="Subjects 0 .. n - 1.")
-    num_test_subjects: int = Field(2, ge=1, description="The subjects after those.")
-    num_sensors: int = Field(2, ge=1, description="Individual sensors, each with its own mismatch and hot pixels.")
-    sensor_preset: Literal["noisy", "ideal"] = Field("noisy", description="A key of `ctlev_core.sensor.PRESETS`.")
-    textured: bool = Field(True, description="False: grey people before a plain wall, as in naive simulations.")
+    seed: int = Field(default=0, ge=0, description="Everything in the studio follows from it.")
+    sensor_size: tuple[int, int] = Field(default=(64, 64), description="(width, height) px.")
+    num_train_recordings: int = Field(default=600, ge=0, description="Recordings of subjects 0 to 3, SEEN motions.")
+    num_test_recordings: int = Field(
+        default=300, ge=0, description="Recordings of subjects 4 and 5, all motions in turn."
+    )
+    num_condition_recordings: int = Field(
+        default=1200, ge=0, description="Label-only poses of random people, UNSEEN motions."
+    )
+    recording_duration_us: int = Field(default=250_000, ge=10_000, description="Length of a recording.")
+    render_rate_hz: float = Field(
+        default=250.0, gt=0, le=10_000, description="Pictures a second the sensor model sees."
+    )
+    label_rate_hz: float = Field(
+        default=200.0, gt=0, le=10_000, description="Labels a second; DHP19's motion capture has 100."
+    )
+    num_train_subjects: int = Field(default=4, ge=1, description="Subjects 0 .. n - 1.")
+    num_test_subjects: int = Field(default=2, ge=1, description="The subjects after those.")
+    num_sensors: int = Field(
+        default=2, ge=1, description="Individual sensors, each with its own mismatch and hot pixels."
+    )
+    sensor_preset: Literal["noisy", "ideal"] = Field(
+        default="noisy", description="A key of `ctlev_core.sensor.PRESETS`."
+    )
+    textured: bool = Field(default=True, description="False: grey people before a plain wall, as in naive simulations.")
 
 
 def list_recordings(options: Options) -> list[Recording]:

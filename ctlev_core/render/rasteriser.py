@@ -80,24 +80,13 @@ def render_attributes(
 @numba.njit(cache=True, nogil=True)
 def rasterise(vertices, faces, attributes, K, near, cull_back, image, depth_inverse):
     """The kernel behind `render_attributes`, without checks: draws over `image` and `depth_inverse`."""
-    screen = np.empty((vertices.shape[0], 3))
-    for i in range(vertices.shape[0]):
-        _project(vertices[i, 0], vertices[i, 1], vertices[i, 2], K, near, screen[i])
-    clipped_points = np.empty((4, 3))
-    clipped_screen = np.empty((4, 3))
-    clipped_attributes = np.empty((4, attributes.shape[1]), dtype=attributes.dtype)
-    for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        in_front = (screen[a, 2] > 0.0) + (screen[b, 2] > 0.0) + (screen[c, 2] > 0.0)
-        if in_front == 3:
-            _fill(screen, attributes, a, b, c, cull_back, image, depth_inverse)
-        elif in_front > 0:
-            corners = _clip_near(vertices, attributes, faces[f], near, clipped_points, clipped_attributes)
-            for i in range(corners):
-                # A corner cut off exactly on the plane must count as in front of it.
-                _project(clipped_points[i, 0], clipped_points[i, 1], clipped_points[i, 2], K, 0.0, clipped_screen[i])
-            for i in range(1, corners - 1):
-                _fill(clipped_screen, clipped_attributes, 0, i, i + 1, cull_back, image, depth_inverse)
+    screen = _project(vertices, K, near)
+    _fill(screen, faces, attributes, cull_back, image, depth_inverse)
+    crossing = _count_crossing(screen, faces)
+    if crossing > 0:
+        points, values, pieces = _clip_near(vertices, faces, attributes, screen, near, crossing)
+        # A corner cut off exactly on the plane must count as in front of it: hence half.
+        _fill(_project(points, K, 0.5 * near), pieces, values, cull_back, image, depth_inverse)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -127,73 +116,108 @@ def vertex_normals(vertices, faces):
     return normals
 
 
-@numba.njit(cache=True, nogil=True)
-def _project(x, y, z, K, near, out):
-    """Screen position and 1 / z; 1 / z is -1 nearer than `near`, behind the camera, or at NaN."""
-    if z > near:
-        inverse = 1.0 / z
-        out[0] = K[0, 0] * x * inverse + K[0, 2]
-        out[1] = K[1, 1] * y * inverse + K[1, 2]
-        out[2] = inverse
-    else:
-        out[2] = -1.0
+# The helpers take whole arrays rather than one triangle each: numba counts references at every call, with atomic
+# operations, and that would cost more than the triangle (measured: 0.55 ms against 0.08 ms for 13,600 faces at 128 px).
 
 
 @numba.njit(cache=True, nogil=True)
-def _clip_near(vertices, attributes, face, near, points, values):
-    """Sutherland-Hodgman against z = near; writes the 3 or 4 corners left and returns how many."""
-    corners = 0
-    for i in range(3):
-        current, following = face[i], face[(i + 1) % 3]
-        z, z_following = vertices[current, 2], vertices[following, 2]
-        if not (np.isfinite(z) and np.isfinite(z_following)):
-            return 0
+def _project(points, K, near):
+    """Screen position and 1 / z [V, 3] of each point; 1 / z is -1 up to `near`, behind the camera, and at NaN."""
+    focal_x, focal_y, centre_x, centre_y = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    screen = np.empty((points.shape[0], 3))
+    for i in range(points.shape[0]):
+        z = points[i, 2]
         if z > near:
-            for k in range(3):
-                points[corners, k] = vertices[current, k]
-            for k in range(attributes.shape[1]):
-                values[corners, k] = attributes[current, k]
-            corners += 1
-        if (z > near) != (z_following > near):
-            cut = (near - z) / (z_following - z)
-            for k in range(3):
-                points[corners, k] = vertices[current, k] + cut * (vertices[following, k] - vertices[current, k])
-            points[corners, 2] = near
-            for k in range(attributes.shape[1]):
-                values[corners, k] = attributes[current, k] + cut * (attributes[following, k] - attributes[current, k])
-            corners += 1
-    return corners
+            inverse = 1.0 / z
+            screen[i, 0] = focal_x * points[i, 0] * inverse + centre_x
+            screen[i, 1] = focal_y * points[i, 1] * inverse + centre_y
+            screen[i, 2] = inverse
+        else:
+            screen[i, 2] = -1.0
+    return screen
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(screen, attributes, a, b, c, cull_back, image, depth_inverse):
-    ax, ay, bx, by, cx, cy = screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1]
-    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    # y points down, so a face that is counter-clockwise from outside has a negative area here. NaN fails both tests.
-    if not (area < 0.0 or (area > 0.0 and not cull_back)) or abs(area) == np.inf:
-        return
+def _count_crossing(screen, faces):
+    """How many triangles have corners on both sides of the near plane."""
+    crossing = 0
+    for f in range(faces.shape[0]):
+        a, b, c = screen[faces[f, 0], 2] > 0.0, screen[faces[f, 1], 2] > 0.0, screen[faces[f, 2], 2] > 0.0
+        crossing += a != b or b != c
+    return crossing
+
+
+@numba.njit(cache=True, nogil=True)
+def _clip_near(vertices, faces, attributes, screen, near, crossing):
+    """The parts beyond z = near of the triangles that cross it, as a mesh (Sutherland-Hodgman: 3 or 4 corners each)."""
+    points = np.empty((4 * crossing, 3), vertices.dtype)
+    values = np.empty((4 * crossing, attributes.shape[1]), attributes.dtype)
+    pieces = np.empty((2 * crossing, 3), faces.dtype)
+    corners = triangles = 0
+    for f in range(faces.shape[0]):
+        inside = (screen[faces[f, 0], 2] > 0.0) + (screen[faces[f, 1], 2] > 0.0) + (screen[faces[f, 2], 2] > 0.0)
+        depths = vertices[faces[f, 0], 2] + vertices[faces[f, 1], 2] + vertices[faces[f, 2], 2]
+        if inside == 0 or inside == 3 or not np.isfinite(depths):
+            continue
+        first = corners
+        for i in range(3):
+            current, following = faces[f, i], faces[f, (i + 1) % 3]
+            z, z_following = vertices[current, 2], vertices[following, 2]
+            if z > near:
+                _interpolate(vertices, current, following, 0.0, points, corners)
+                _interpolate(attributes, current, following, 0.0, values, corners)
+                corners += 1
+            if (z > near) != (z_following > near):
+                cut = (near - z) / (z_following - z)
+                _interpolate(vertices, current, following, cut, points, corners)
+                _interpolate(attributes, current, following, cut, values, corners)
+                corners += 1
+        for i in range(first + 1, corners - 1):
+            pieces[triangles, 0], pieces[triangles, 1], pieces[triangles, 2] = first, i, i + 1
+            triangles += 1
+    return points[:corners], values[:corners], pieces[:triangles]
+
+
+@numba.njit(cache=True, nogil=True)
+def _interpolate(rows, start, end, fraction, out, out_row):
+    for k in range(rows.shape[1]):
+        out[out_row, k] = rows[start, k] + fraction * (rows[end, k] - rows[start, k])
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(screen, faces, attributes, cull_back, image, depth_inverse):
+    """Draw all triangles whose corners are in front of the camera."""
     height, width = depth_inverse.shape
-    # Clamped on both sides before the cast: far outside the image a position need not fit an integer.
-    left = int(min(max(np.ceil(min(ax, bx, cx) - 0.5), 0.0), float(width)))
-    right = int(max(min(np.floor(max(ax, bx, cx) - 0.5), width - 1.0), -1.0))
-    top = int(min(max(np.ceil(min(ay, by, cy) - 0.5), 0.0), float(height)))
-    bottom = int(max(min(np.floor(max(ay, by, cy) - 0.5), height - 1.0), -1.0))
-    za, zb, zc = screen[a, 2], screen[b, 2], screen[c, 2]
-    sign = 1.0 if area > 0.0 else -1.0
-    for row in range(top, bottom + 1):
-        y = row + 0.5
-        for column in range(left, right + 1):
-            x = column + 0.5
-            wa = sign * ((bx - x) * (cy - y) - (by - y) * (cx - x))
-            wb = sign * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
-            wc = sign * ((ax - x) * (by - y) - (ay - y) * (bx - x))
-            if wa < 0.0 or wb < 0.0 or wc < 0.0:
-                continue
-            total = wa + wb + wc
-            inverse = (wa * za + wb * zb + wc * zc) / total
-            if inverse > depth_inverse[row, column]:
-                depth_inverse[row, column] = inverse
-                scale = 1.0 / (inverse * total)
-                wa, wb, wc = wa * za * scale, wb * zb * scale, wc * zc * scale
-                for k in range(attributes.shape[1]):
-                    image[row, column, k] = wa * attributes[a, k] + wb * attributes[b, k] + wc * attributes[c, k]
+    for f in range(faces.shape[0]):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        za, zb, zc = screen[a, 2], screen[b, 2], screen[c, 2]
+        if not (za > 0.0 and zb > 0.0 and zc > 0.0):
+            continue
+        ax, ay, bx, by, cx, cy = screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1]
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        # y points down, so a face that is counter-clockwise from outside has a negative area. NaN and inf end here.
+        if not (-np.inf < area < 0.0 or (0.0 < area < np.inf and not cull_back)):
+            continue
+        # Clamped before the cast: far outside the image a position need not fit an integer.
+        left = int(np.ceil(min(max(min(ax, bx, cx), 0.0), float(width)) - 0.5))
+        right = int(np.floor(max(min(max(ax, bx, cx), float(width)), 0.0) - 0.5))
+        top = int(np.ceil(min(max(min(ay, by, cy), 0.0), float(height)) - 0.5))
+        bottom = int(np.floor(max(min(max(ay, by, cy), float(height)), 0.0) - 0.5))
+        sign = 1.0 if area > 0.0 else -1.0
+        for row in range(max(top, 0), min(bottom, height - 1) + 1):
+            y = row + 0.5
+            for column in range(max(left, 0), min(right, width - 1) + 1):
+                x = column + 0.5
+                wa = sign * ((bx - x) * (cy - y) - (by - y) * (cx - x))
+                wb = sign * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
+                wc = sign * ((ax - x) * (by - y) - (ay - y) * (bx - x))
+                if wa < 0.0 or wb < 0.0 or wc < 0.0:
+                    continue
+                total = wa + wb + wc
+                inverse = (wa * za + wb * zb + wc * zc) / total
+                if inverse > depth_inverse[row, column]:
+                    depth_inverse[row, column] = inverse
+                    scale = 1.0 / (inverse * total)
+                    wa, wb, wc = wa * za * scale, wb * zb * scale, wc * zc * scale
+                    for k in range(attributes.shape[1]):
+                        image[row, column, k] = wa * attributes[a, k] + wb * attributes[b, k] + wc * attributes[c, k]
