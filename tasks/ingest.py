@@ -14,7 +14,7 @@ from ctlev_core import event_files, plugins
 from ctlev_core.plugins import Plugin
 from data_contracts import tables
 from data_contracts.config import DatasetChoice
-from data_contracts.events import DataError, Events, check_events
+from data_contracts.events import DataError, check_events
 from data_contracts.labels import Labels, Recording, check_labels
 from data_contracts.manifest import concat_labels, label_columns
 from tasks.stage import Output, stage
@@ -54,8 +54,6 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     """Read every recording once, check it, and keep events and labels in the project's own form."""
     plugin = plugins.load_options(dataset)
     recordings = _list_recordings(plugin)
-    (out.folder / "events").mkdir()
-    (out.work / "events").mkdir(exist_ok=True)
     # Readers and the simulator release the interpreter lock; map() keeps the order of the recordings.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = pool.map(lambda recording: _ingest_recording(plugin, recording, out), recordings)
@@ -79,16 +77,18 @@ def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ing
         **dict.fromkeys(("t_first_us", "t_last_us", "duration_us"), 0),
     }
     if recording.has_events:
-        name = f"events/{recording.recording_id.replace('/', '__')}.parquet"
-        finished = out.work / name
+        name = f"events/{recording.recording_id}.parquet"
+        finished, attached = out.work / name, out.folder / name
+        for path in (finished, attached):
+            path.parent.mkdir(parents=True, exist_ok=True)
         if finished.exists():  # by an earlier run that was interrupted
             events = event_files.read_events_file(finished)
         else:
             events = check_events(plugin.module.read_events(recording, plugin.options), where)
             if len(events) == 0:
                 raise DataError(f"{where}: the recording holds no events")
-            _write_whole(finished, events)
-        os.link(finished, out.folder / name)
+            event_files.write_events_parquet(finished, events)
+        os.link(finished, attached)
         row |= event_files.summarise(events)
         row |= {
             "events_file": name,
@@ -106,13 +106,6 @@ def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ing
         for part in recording.parts
     ]
     return _Ingested(row, parts, labels)
-
-
-def _write_whole(path: Path, events: Events) -> None:
-    """Write so that the file is either absent or complete, whenever the process is killed."""
-    temporary = path.with_suffix(".part")
-    plugins.load("formats", "parquet").write(temporary, events)
-    temporary.replace(path)
 
 
 def _label_table(recordings: list[Recording], tracks: list[Labels]) -> pa.Table:

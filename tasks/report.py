@@ -69,8 +69,9 @@ def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
 
 
 def _score_tables(rows: list[dict[str, Any]], settings: Sequence[str]) -> list[Section]:
-    trained = [row for row in rows if row["setting"] in settings and row["group"] == "all"]
-    faithful = [row for row in rows if row["setting"] == "labels of synthetic" and row["group"] == "all"]
+    scored = [row for row in rows if row["task"] != "distance"]
+    trained = [row for row in scored if row["setting"] in settings and row["group"] == "all"]
+    faithful = [row for row in scored if row["setting"] == "labels of synthetic" and row["group"] == "all"]
     distances = [row for row in rows if row["task"] == "distance"]
     seeds = len({row["seed"] for row in trained})
     sections: list[Section] = [
@@ -104,7 +105,7 @@ def _score_tables(rows: list[dict[str, Any]], settings: Sequence[str]) -> list[S
                 "alone it does not tell whether labels are right.",
             )
         )
-    groups = [row for row in rows if row["setting"] in settings and row["group"] != "all"]
+    groups = [row for row in scored if row["setting"] in settings and row["group"] != "all"]
     if groups:
         sections.append(_group_table(groups, settings))
     return sections
