@@ -25,7 +25,7 @@ def image_grid_png(rows: Sequence[Sequence[np.ndarray]], min_cell_px: int = 128,
     """All images of a grid as one PNG, enlarged without smoothing, on a transparent ground.
 
     Args:
-        rows: images [H, W], [H, W, 1] or [H, W, 3] uint8, row by row; a short row leaves its last cells empty. Images
+        rows: images [H, W] or [H, W, 3] uint8, row by row; a short row leaves its last cells empty. Images
             smaller than the largest one are enlarged to it and centred.
         min_cell_px: cells are enlarged by the smallest whole factor that makes their longer side at least this.
         gap_px: transparent px between two cells.
@@ -59,11 +59,10 @@ def image_grid_png(rows: Sequence[Sequence[np.ndarray]], min_cell_px: int = 128,
 
 def _to_rgb(image: np.ndarray) -> np.ndarray:
     image = np.asarray(image)
-    if image.ndim == 2:
-        image = image[..., None]
-    if image.ndim != 3 or image.shape[2] not in (1, 3) or image.dtype != np.uint8 or 0 in image.shape:
+    is_grey, is_rgb = image.ndim == 2, image.ndim == 3 and image.shape[-1] == 3
+    if not (is_grey or is_rgb) or image.dtype != np.uint8 or image.size == 0:
         raise ValueError(f"an image must be [H, W] or [H, W, 3] uint8, got {image.shape} {image.dtype}")
-    return np.broadcast_to(image, (*image.shape[:2], 3))
+    return np.repeat(image[..., None], 3, axis=-1) if is_grey else image
 
 
 def _paste_enlarged(image: np.ndarray, cell: np.ndarray) -> None:

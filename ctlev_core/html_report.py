@@ -21,7 +21,7 @@ from ctlev_core.report_style import SCRIPT, STYLE
 Cell = str | float | int | bool | None
 NO_VALUE = "–"
 # A number, then perhaps its uncertainty: "6.31", "-1,234", "5.0e-3", "6.31 ± 0.02", "6.313 [6.120, 6.500]", "93 %".
-_NUMBER = re.compile(r"^([-+−]?[\d,]*\.?\d+(?:e[-+]?\d+)?)(\s*%?)(\s*(?:±|\[|\().*)?$", re.IGNORECASE)
+_NUMBER = re.compile(r"^([-+−]?[\d,]*\.?\d+(?:e[-+]?\d+)?)((?:\s*%)?)(\s*(?:±|\[|\().*)?$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)

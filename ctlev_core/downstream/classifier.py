@@ -30,21 +30,29 @@ class Options(Frozen):
     """Network and training budget."""
 
     architecture: Literal["resnet10-quarter", "resnet10-half", "resnet18", "resnet34"] = Field(
-        "resnet10-quarter", description="the paper's is resnet34"
+        default="resnet10-quarter", description="the paper's is resnet34"
     )
-    head_width: int = Field(0, ge=0, description="hidden units of the head, 0 = linear; the paper gives no width")
+    head_width: int = Field(
+        default=0, ge=0, description="hidden units of the head, 0 = linear; the paper gives no width"
+    )
     pretrained: str = Field(
-        "", description="folder of a published ResNet (transformers layout, same architecture) to start from"
+        default="", description="folder of a published ResNet (transformers layout, same architecture) to start from"
     )
-    num_steps: int = Field(600, ge=1, description="optimiser steps; the paper does not state them")
-    batch_size: int = Field(32, ge=1, description="images a step")
-    learning_rate: float = Field(2e-3, gt=0, description="peak of AdamW's learning rate")
-    warmup_steps: int = Field(40, ge=0, description="steps to the peak")
-    weight_decay: float = Field(1e-2, ge=0, description="of AdamW")
-    flip: bool = Field(False, description="mirror half of the training images")
-    log_every: int = Field(10, ge=1, description="steps a row of the loss history", json_schema_extra=RUN_SETTING)
-    checkpoint_every: int = Field(200, ge=1, description="steps between checkpoints", json_schema_extra=RUN_SETTING)
-    device: str = Field("auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING)
+    num_steps: int = Field(default=600, ge=1, description="optimiser steps; the paper does not state them")
+    batch_size: int = Field(default=32, ge=1, description="images a step")
+    learning_rate: float = Field(default=2e-3, gt=0, description="peak of AdamW's learning rate")
+    warmup_steps: int = Field(default=40, ge=0, description="steps to the peak")
+    weight_decay: float = Field(default=1e-2, ge=0, description="of AdamW")
+    flip: bool = Field(default=False, description="mirror half of the training images")
+    log_every: int = Field(
+        default=10, ge=1, description="steps a row of the loss history", json_schema_extra=RUN_SETTING
+    )
+    checkpoint_every: int = Field(
+        default=200, ge=1, description="steps between checkpoints", json_schema_extra=RUN_SETTING
+    )
+    device: str = Field(
+        default="auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING
+    )
 
 
 def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, out: Path, work: Path) -> History:

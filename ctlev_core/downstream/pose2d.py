@@ -30,29 +30,43 @@ NAME = "pose2d"
 class Options(Frozen):
     """Network, loss, decoding and training budget."""
 
-    width: float = Field(1.0, gt=0, description="factor on the channel counts; 1 = DHP19, 218,592 parameters")
-    batch_norm: bool = Field(False, description="normalise after each convolution; DHP19 does not")
-    output_stride: Literal[1, 2] = Field(1, description="2 = heatmaps of half the size, about 40 % faster; DHP19: 1")
+    width: float = Field(default=1.0, gt=0, description="factor on the channel counts; 1 = DHP19, 218,592 parameters")
+    batch_norm: bool = Field(default=False, description="normalise after each convolution; DHP19 does not")
+    output_stride: Literal[1, 2] = Field(
+        default=1, description="2 = heatmaps of half the size, about 40 % faster; DHP19: 1"
+    )
     loss: Literal["mse", "cross_entropy"] = Field(
-        "mse",
+        default="mse",
         description="mse against a Gaussian of height 1 (DHP19), or cross-entropy of a softmax over all pixels "
         "against a Gaussian of sum 1",
     )
-    sigma_px: float = Field(4.0, gt=0, description="standard deviation of the target, image px; DHP19: 4 at 344 x 260")
+    sigma_px: float = Field(
+        default=4.0, gt=0, description="standard deviation of the target, image px; DHP19: 4 at 344 x 260"
+    )
     decoding: Literal["argmax", "soft_argmax", "mean"] = Field(
-        "argmax",
+        default="argmax",
         description="centre of the highest pixel (DHP19), centroid of the heatmap around it, or centroid of all of it",
     )
-    num_steps: int = Field(20_000, ge=1, description="optimiser steps; the paper does not state them")
-    batch_size: int = Field(32, ge=1, description="images a step")
-    learning_rate: float = Field(1e-3, gt=0, description="peak of AdamW's learning rate")
-    warmup_steps: int = Field(40, ge=0, description="steps to the peak")
-    weight_decay: float = Field(1e-2, ge=0, description="of AdamW")
-    flip: bool = Field(False, description="mirror half of the training images, with left and right joints exchanged")
-    shift_px: int = Field(0, ge=0, description="move training images by up to so many px in x and y; black moves in")
-    log_every: int = Field(10, ge=1, description="steps a row of the loss history", json_schema_extra=RUN_SETTING)
-    checkpoint_every: int = Field(200, ge=1, description="steps between checkpoints", json_schema_extra=RUN_SETTING)
-    device: str = Field("auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING)
+    num_steps: int = Field(default=20_000, ge=1, description="optimiser steps; the paper does not state them")
+    batch_size: int = Field(default=32, ge=1, description="images a step")
+    learning_rate: float = Field(default=1e-3, gt=0, description="peak of AdamW's learning rate")
+    warmup_steps: int = Field(default=40, ge=0, description="steps to the peak")
+    weight_decay: float = Field(default=1e-2, ge=0, description="of AdamW")
+    flip: bool = Field(
+        default=False, description="mirror half of the training images, with left and right joints exchanged"
+    )
+    shift_px: int = Field(
+        default=0, ge=0, description="move training images by up to so many px in x and y; black moves in"
+    )
+    log_every: int = Field(
+        default=10, ge=1, description="steps a row of the loss history", json_schema_extra=RUN_SETTING
+    )
+    checkpoint_every: int = Field(
+        default=200, ge=1, description="steps between checkpoints", json_schema_extra=RUN_SETTING
+    )
+    device: str = Field(
+        default="auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING
+    )
 
 
 def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, out: Path, work: Path) -> History:

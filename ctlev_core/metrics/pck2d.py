@@ -25,9 +25,9 @@ INPUT = "joints2d"
 class Options(Frozen):
     """What counts as correct."""
 
-    threshold: float = Field(0.2, gt=0, description="px, or a fraction of the normaliser's length")
+    threshold: float = Field(default=0.2, gt=0, description="px, or a fraction of the normaliser's length")
     normaliser: Literal["px", "torso", "bbox"] = Field(
-        "torso",
+        default="torso",
         description="px; torso = left shoulder to right hip; bbox = longer side of the box around the visible joints",
     )
 

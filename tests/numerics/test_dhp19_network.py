@@ -1,0 +1,95 @@
+"""Our pose network is the published one: same weights, same heatmaps as a slow NumPy forward pass."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ctlev_core.networks.dhp19 import LAYERS, DHP19Network
+
+REAL_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "real"
+PUBLISHED_WEIGHTS = REAL_DATA / "dhp19_cnn" / "DHP_CNN.h5"
+
+
+def read_kernels() -> dict[str, np.ndarray]:
+    """Keras kernels by layer name: [3, 3, in, out], and [3, 3, out, in] for the transposed convolutions."""
+    h5py = pytest.importorskip("h5py", reason="needs the test extra")
+    if not PUBLISHED_WEIGHTS.is_file():
+        pytest.skip("the published DHP19 weights are not part of the repository")
+    with h5py.File(PUBLISHED_WEIGHTS) as file:
+        weights = file["model_weights"]
+        return {name: weights[name][name]["kernel:0"][:].astype(np.float64) for name in weights if len(weights[name])}
+
+
+def convolve_same(image: np.ndarray, kernel: np.ndarray, dilation: int) -> np.ndarray:
+    """[H, W, in] -> [H, W, out], zeros outside."""
+    height, width, _ = image.shape
+    padded = np.pad(image, ((dilation, dilation), (dilation, dilation), (0, 0)))
+    total = np.zeros((height, width, kernel.shape[3]))
+    for a in range(3):
+        for b in range(3):
+            total += padded[a * dilation : a * dilation + height, b * dilation : b * dilation + width] @ kernel[a, b]
+    return total
+
+
+def transposed_same(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """[H, W, in] -> [2H, 2W, out]: each pixel adds its kernel to the output, as Keras pads "same" with stride 2."""
+    height, width, _ = image.shape
+    total = np.zeros((2 * height + 1, 2 * width + 1, kernel.shape[2]))
+    for y in range(height):
+        for x in range(width):
+            total[2 * y : 2 * y + 3, 2 * x : 2 * x + 3] += kernel @ image[y, x]
+    return total[:-1, :-1]
+
+
+def forward(image: np.ndarray, kernels: dict[str, np.ndarray]) -> np.ndarray:
+    """The network layer by layer, [H, W] -> [H, W, 13]."""
+    x = image[..., None]
+    for name, _, dilation in (*LAYERS, ("pred_cube", 13, 1)):
+        if name.startswith("pool"):
+            x = x.reshape(x.shape[0] // 2, 2, x.shape[1] // 2, 2, -1).max(axis=(1, 3))
+        elif name.endswith("up"):
+            x = np.maximum(transposed_same(x, kernels[name]), 0)
+        else:
+            x = np.maximum(convolve_same(x, kernels[name], dilation), 0)
+    return x
+
+
+def test_published_weights_give_the_heatmaps_of_a_slow_forward_pass():
+    kernels = read_kernels()
+    network = DHP19Network()
+    state = {}
+    for name, kernel in kernels.items():
+        # Both orders end in (rows, columns) first; PyTorch keeps (out, in) for one and (in, out) for the other.
+        state[f"layers.{name}.weight"] = torch.from_numpy(kernel.transpose(3, 2, 0, 1).copy()).float()
+    network.load_state_dict(state)
+    image = np.zeros((36, 28))
+    image[6:30, 10:16] = np.random.default_rng(0).random((24, 6))
+    expected = forward(image, kernels)
+    with torch.inference_mode():
+        heatmaps = network(torch.from_numpy(image)[None, None].float())[0].permute(1, 2, 0).numpy()
+    scale = expected.max()
+    assert scale > 0 and (expected.max(axis=(0, 1)) > 0).sum() >= 10, "the test image excites too few joints"
+    # float32 with up to 576 products a sum, seventeen layers deep.
+    np.testing.assert_allclose(heatmaps / scale, expected / scale, atol=1e-5)
+
+
+def test_number_of_parameters_is_the_published_one():
+    assert sum(parameter.numel() for parameter in DHP19Network().parameters()) == 218_592
+
+
+@pytest.mark.parametrize("size", [(64, 64), (61, 47), (3, 5)])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_heatmaps_cover_the_image(size, stride):
+    network = DHP19Network(5, width=0.25, output_stride=stride)
+    heatmaps = network(torch.zeros(2, 1, *size))
+    assert heatmaps.shape == (2, 5, -(-size[0] // stride), -(-size[1] // stride))
+
+
+def test_signal_keeps_its_size_through_the_network():
+    """He initialisation: without it seventeen layers shrink the signal to nothing and training does not start."""
+    torch.manual_seed(0)
+    x = torch.rand(4, 1, 64, 64)
+    heatmaps = DHP19Network()(x)
+    assert 0.05 < heatmaps.std() / x.std() < 20

@@ -1,0 +1,196 @@
+import base64
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctlev_core.figures import curves_svg, image_grid_png, series_style
+from ctlev_core.html_report import Curves, ImageGrid, Table, Text, format_column, render_report
+
+HOSTILE = "<script>alert(\"1\")</script> & 'x' http://example.org"
+VOID = {"meta", "img", "br"}
+
+
+class Reader(HTMLParser):
+    """Collects what a browser would see, and that every element is closed in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.ids: list[str] = []
+        self.texts: dict[str, list[str]] = {}
+
+    def handle_starttag(self, tag, attrs):
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        self.ids += [value or "" for name, value in attrs if name == "id"]
+        if tag not in VOID:
+            self.open.append(tag)
+            self.texts.setdefault(tag, []).append("")
+
+    def handle_startendtag(self, tag, attrs):
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        for tag in self.open:
+            self.texts[tag][-1] += data
+
+
+def read(page: str) -> Reader:
+    reader = Reader()
+    reader.feed(page)
+    reader.close()
+    assert reader.open == []
+    return reader
+
+
+def full_report(text: str = "plain") -> str:
+    images = [np.full((8, 8, 3), value, np.uint8) for value in (0, 255)]
+    return render_report(
+        title=text,
+        lead=text,
+        verdict=text,
+        sections=[
+            Table(text, [text, "score"], [[text, 1.25], ["b", None]], caption=text, footnotes=[text]),
+            ImageGrid(text, [(text, images), ("short", images[:1])], column_labels=[text, "b"], caption=text),
+            Curves(text, {text: ([1, 2], [3.0, 4.0])}, text, text, caption=text),
+            Curves("second", {"a": ([1, 10], [0.1, 100.0])}, "x", "y", log_x=True, log_y=True),
+            Text(text, f"{text}\n\nsecond paragraph"),
+        ],
+        footer=text,
+    )
+
+
+def test_hostile_texts_stay_texts():
+    plain, hostile = read(full_report()), read(full_report(HOSTILE))
+    assert len(plain.texts["script"]) == len(hostile.texts["script"]) == 1
+    tags = [(tag, name) for tag, name, _ in hostile.attributes]
+    assert tags == [(tag, name) for tag, name, _ in plain.attributes]
+    assert hostile.texts["h1"] == [HOSTILE] and HOSTILE in hostile.texts["td"] and HOSTILE in hostile.texts["svg"][0]
+    assert hostile.texts["title"] == [HOSTILE]
+
+
+def test_page_needs_nothing_from_outside():
+    page = full_report()
+    for _, name, value in read(page).attributes:
+        if name in {"src", "href", "xlink:href", "action", "data", "poster", "srcset"}:
+            assert value.startswith(("data:image/png;base64,", "#")), value
+    assert "@import" not in page and not re.search(r"url\((?!#)", page)
+    assert "default-src 'none'" in page
+
+
+def test_equal_input_gives_equal_text_and_ids_are_unique():
+    page = full_report()
+    assert page == full_report()
+    ids = read(page).ids
+    links = re.findall(r'href="(#section-\d+)"', page)
+    assert len(links) == 5 and all(link[1:] in ids for link in links)
+    assert len([name for name in ids if name.startswith("section")]) == 5
+    assert len(ids) == len(set(ids))
+
+
+def test_backticks_become_code_after_escaping():
+    reader = read(render_report(title="t", lead="Data: `<b>`.", verdict="v", sections=[]))
+    assert reader.texts["code"] == ["<b>"]
+
+
+def test_table_aligns_numbers_and_marks_uncertainty_and_bold():
+    rows = [["real", "6.870 [6.5, 7.2]", 1400], ["both", "6.31 ± 0.02", None]]
+    page = render_report(title="t", lead="", verdict="", sections=[Table("T", ["on", "px", "n"], rows, bold={(1, 1)})])
+    assert '<td class="number" data-sort="6.870">6.870<span class="uncertainty"> [6.5, 7.2]</span></td>' in page
+    assert '<td class="number bold" data-sort="6.31">6.31<span class="uncertainty"> ± 0.02</span></td>' in page
+    assert '<td class="number" data-sort="1400">1,400</td>' in page
+    assert '<td class="number">–</td>' in page and "<td>real</td>" in page
+
+
+@pytest.mark.parametrize(
+    ("cells", "texts"),
+    [
+        ([1234567, 5], ["1,234,567", "5"]),
+        ([1.5, 2.25, 3.0], ["1.50", "2.25", "3.00"]),
+        ([0.123456, float("nan"), None], ["0.1235", "–", "–"]),
+        ([float("inf"), -float("inf"), 0.0], ["∞", "−∞", "0"]),
+        ([1e-9, 2.5e12, 0.5], ["1.000e-09", "2.500e+12", "0.5"]),
+        ([True, False], ["yes", "no"]),
+        ([np.float32(0.5), np.int64(3), "text", ""], ["0.5", "3", "text", "–"]),
+    ],
+)
+def test_columns_are_formatted_alike(cells, texts):
+    assert format_column(cells) == texts
+
+
+@given(st.lists(st.floats(1e-3, 1e6), min_size=1, max_size=5))
+def test_formatting_keeps_three_significant_digits(values):
+    for value, text in zip(values, format_column(values), strict=True):
+        assert float(text.replace(",", "")) == pytest.approx(value, rel=5.1e-4 if value < 1e3 else 1e-3)
+
+
+def test_grid_enlarges_without_smoothing_and_leaves_missing_cells_clear():
+    checkers = np.array([[0, 255], [255, 0]], np.uint8)
+    colour = np.zeros((4, 4, 3), np.uint8)
+    colour[..., 0] = 200
+    picture = cv2.imdecode(np.frombuffer(image_grid_png([[checkers, colour], [colour]], 8, 2), np.uint8), -1)
+    assert picture.shape == (18, 18, 4)
+    assert np.array_equal(picture[:8, :8, 0], np.kron(checkers, np.ones((4, 4), np.uint8)))
+    # OpenCV decodes to blue, green, red, alpha.
+    assert (picture[:8, 10:] == [0, 0, 200, 255]).all() and (picture[10:, :8] == [0, 0, 200, 255]).all()
+    assert (picture[10:, 10:, 3] == 0).all() and (picture[8:10, :, 3] == 0).all()
+
+
+def test_grid_fits_images_of_other_proportions():
+    wide = np.full((2, 4), 9, np.uint8)
+    tall = np.full((8, 8), 7, np.uint8)
+    picture = cv2.imdecode(np.frombuffer(image_grid_png([[wide, tall]], 8, 0), np.uint8), -1)[..., 0]
+    assert (picture[2:6, :8] == 9).all() and (picture[:2, :8] == 0).all() and (picture[:, 8:] == 7).all()
+
+
+def test_grid_in_the_page_is_one_png():
+    page = full_report()
+    pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert len(pictures) == 1
+    assert base64.b64decode(pictures[0])[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_curves_take_the_colours_of_the_page():
+    svg = curves_svg({"a": ([1, 2, 3], [1.0, float("nan"), 2.0])}, "step, $x$", "loss < 1")
+    assert "currentColor" in svg and "#000000" not in svg and series_style(0)[0] in svg
+    assert "step, $x$" in svg and "loss &lt; 1" in svg
+    assert svg.startswith("<svg viewBox=") and "<style" not in svg and "metadata" not in svg
+
+
+def test_curves_leave_out_what_a_logarithm_cannot_show():
+    both = curves_svg({"a": ([1, 2, 3], [1.0, 5.0, 2.0])}, "x", "y", log_y=True)
+    assert curves_svg({"a": ([1, 1.5, 2, 2.5, 3], [1.0, 0.0, 5.0, -1.0, 2.0])}, "x", "y", log_y=True) == both
+    assert "mathdefault" not in both
+
+
+def test_many_series_differ_in_colour_or_line():
+    assert len({series_style(index) for index in range(24)}) == 24
+
+
+def test_empty_sections_say_so():
+    page = render_report(
+        title="t", lead="", verdict="", sections=[Table("T", ["a"], []), ImageGrid("G", []), Curves("C", {}, "x", "y")]
+    )
+    assert [word in page for word in ("No rows.", "No images.", "No points.")] == [True] * 3
+
+
+def test_wrong_sections_are_named():
+    def render(section):
+        render_report(title="t", lead="", verdict="", sections=[section])
+
+    with pytest.raises(ValueError, match="table 'T': row 1 has 1 cells for 2 columns"):
+        render(Table("T", ["a", "b"], [[1, 2], [3]]))
+    with pytest.raises(ValueError, match=r"uint8, got \(4, 4\) float64"):
+        render(ImageGrid("G", [("r", [np.zeros((4, 4))])]))
+    with pytest.raises(ValueError, match="1 column labels for 2 columns"):
+        render(ImageGrid("G", [("r", [np.zeros((4, 4), np.uint8)] * 2)], column_labels=["a"]))
+    with pytest.raises(ValueError, match="series 'a': x and y must have the same length"):
+        render(Curves("C", {"a": ([1, 2], [1.0])}, "x", "y"))

@@ -1,0 +1,211 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.metrics import accuracy_score, precision_score, recall_score
+
+from ctlev_core.intervals import bootstrap_interval, cluster_bootstrap, compute_spread
+from ctlev_core.metrics import classification, frechet, mpjpe2d, pck2d
+from data_contracts.labels import Labels
+
+
+def pose_labels(joints2d, visible=None, joint_set="dhp19"):
+    joints2d = np.asarray(joints2d, np.float32)
+    visible = np.ones(joints2d.shape[:2], bool) if visible is None else np.asarray(visible, bool)
+    return Labels(("",) * len(joints2d), np.zeros(len(joints2d), np.int64), joints2d, visible, joint_set)
+
+
+def class_labels(names):
+    return Labels(tuple(names), np.zeros(len(names), np.int64))
+
+
+def certain(names, classes):
+    """A prediction that gives each named class probability one."""
+    return {"probability": (np.array(names)[:, None] == np.array(classes)).astype(float), "classes": np.array(classes)}
+
+
+def standing_person():
+    """Thirteen joints in which the torso, left shoulder to right hip, is 3-4-5 long: 50 px."""
+    joints = np.zeros((1, 13, 2))
+    joints[0, 2], joints[0, 5] = (60, 20), (30, 60)
+    joints[0, 12] = (10, 100)
+    return joints
+
+
+def test_mpjpe_is_the_mean_over_visible_joints_not_over_rows():
+    target = pose_labels([[[0, 0], [10, 0]], [[5, 5], [np.nan, np.nan]]], [[True, True], [True, False]])
+    predicted = {"joints2d": np.array([[[3, 4], [10, 0]], [[5, 6], [0, 0]]])}
+    assert mpjpe2d.compute(predicted, target, mpjpe2d.Options()) == {"mpjpe2d_px": pytest.approx((5 + 0 + 1) / 3)}
+    np.testing.assert_allclose(mpjpe2d.compute_rows(predicted, target, mpjpe2d.Options()), [2.5, 1.0])
+
+
+def test_rows_without_a_visible_joint_have_no_score():
+    target = pose_labels(np.zeros((2, 3, 2)), [[False] * 3, [True] * 3])
+    rows = mpjpe2d.compute_rows({"joints2d": np.ones((2, 3, 2))}, target, mpjpe2d.Options())
+    assert np.isnan(rows[0]) and rows[1] == pytest.approx(2**0.5)
+
+
+@pytest.mark.parametrize("metric", [mpjpe2d, pck2d])
+def test_pose_metrics_refuse_what_they_cannot_score(metric):
+    nothing = pose_labels(np.zeros((2, 13, 2)), np.zeros((2, 13), bool))
+    with pytest.raises(ValueError, match="no joint is visible in any of the 2 target rows"):
+        metric.compute({"joints2d": np.zeros((2, 13, 2))}, nothing, metric.Options())
+    with pytest.raises(ValueError, match=r"must be \(2, 13, 2\), got \(2, 12, 2\)"):
+        metric.compute({"joints2d": np.zeros((2, 12, 2))}, pose_labels(np.zeros((2, 13, 2))), metric.Options())
+    broken = np.zeros((2, 13, 2))
+    broken[1, 3, 0] = np.nan
+    with pytest.raises(ValueError, match="predicted joint 3 of row 1"):
+        metric.compute({"joints2d": broken}, pose_labels(np.zeros((2, 13, 2))), metric.Options())
+    with pytest.raises(ValueError, match="no joints2d"):
+        metric.compute({"joints2d": broken}, class_labels(["a", "b"]), metric.Options())
+
+
+@pytest.mark.parametrize(
+    ("normaliser", "threshold", "limit_px", "key"),
+    [("px", 4, 4.0, "pck_px4"), ("torso", 0.2, 10.0, "pck_torso0.2"), ("bbox", 0.1, 10.0, "pck_bbox0.1")],
+)
+def test_pck_threshold_is_inclusive(normaliser, threshold, limit_px, key):
+    joints = standing_person()
+    options = pck2d.Options(threshold=threshold, normaliser=normaliser)
+    predicted = joints.copy()
+    predicted[0, 0, 0] += limit_px
+    predicted[0, 1, 1] += limit_px * 1.001
+    predicted[0, 3] += 1000
+    assert pck2d.compute({"joints2d": predicted}, pose_labels(joints), options) == {key: pytest.approx(11 / 13)}
+
+
+def test_pck_leaves_out_rows_without_a_torso():
+    joints = np.concatenate([standing_person(), standing_person()])
+    visible = np.ones((2, 13), bool)
+    visible[0, 2] = False
+    predicted = joints.copy()
+    predicted[0] += 1000
+    options = pck2d.Options()
+    assert pck2d.compute({"joints2d": predicted}, pose_labels(joints, visible), options) == {"pck_torso0.2": 1.0}
+    visible[1, 5] = False
+    with pytest.raises(ValueError, match="torso length"):
+        pck2d.compute({"joints2d": predicted}, pose_labels(joints, visible), options)
+    with pytest.raises(ValueError, match="needs a joint set of dhp19"):
+        pck2d.compute({"joints2d": predicted}, pose_labels(joints, joint_set="other"), options)
+
+
+def test_pose_metrics_do_not_change_their_inputs():
+    joints = standing_person()
+    target, predicted = pose_labels(joints), joints.copy()
+    for metric in (mpjpe2d, pck2d):
+        metric.compute({"joints2d": predicted}, target, metric.Options())
+    assert np.array_equal(predicted, joints) and target.joints2d is not None
+    assert np.array_equal(target.joints2d, joints.astype(np.float32))
+
+
+def test_classification_by_hand():
+    scores = classification.compute(
+        certain(["a", "a", "b", "b"], ["a", "b", "c"]), class_labels(["a", "b", "b", "c"]), classification.Options()
+    )
+    # Precision a 1/2, b 1/2, c never predicted 0; recall a 1, b 1/2, c 0.
+    assert scores == {
+        "accuracy": 0.5,
+        "macro_precision": pytest.approx(1 / 3),
+        "macro_recall": pytest.approx(0.5),
+        "chance_accuracy": 0.5,
+    }
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from("abcd"), st.sampled_from("abcde")), min_size=1, max_size=30))
+def test_classification_agrees_with_scikit_learn(pairs):
+    names, truth = zip(*pairs, strict=True)
+    scores = classification.compute(certain(names, list("abcd")), class_labels(truth), classification.Options())
+    assert scores["accuracy"] == pytest.approx(accuracy_score(truth, names))
+    macro = {"average": "macro", "zero_division": 0}
+    assert scores["macro_precision"] == pytest.approx(precision_score(truth, names, **macro))
+    assert scores["macro_recall"] == pytest.approx(recall_score(truth, names, **macro))
+
+
+def test_classification_names_bad_input():
+    options = classification.Options()
+    predicted = certain(["a", "b"], ["a", "b"])
+    with pytest.raises(ValueError, match=r"must be \[1, 2\], got \(2, 2\)"):
+        classification.compute(predicted, class_labels(["a"]), options)
+    with pytest.raises(ValueError, match="target row 1 has no class name"):
+        classification.compute(predicted, class_labels(["a", ""]), options)
+    predicted["probability"][1, 0] = np.nan
+    with pytest.raises(ValueError, match="row 1 is not finite"):
+        classification.compute(predicted, class_labels(["a", "b"]), options)
+    with pytest.raises(ValueError, match="no row"):
+        classification.compute(
+            {"probability": np.zeros((0, 2)), "classes": np.array(["a", "b"])}, class_labels([]), options
+        )
+
+
+def test_frechet_metric_names_its_score():
+    a = np.array([[0.0], [2.0]])
+    assert frechet.compute(a, a + 3, frechet.Options()) == {"fd": pytest.approx(9.0)}
+
+
+def test_interval_of_independent_samples_is_that_of_the_normal_approximation():
+    values = np.random.default_rng(0).normal(5, 2, size=2000)
+    low, high = bootstrap_interval(values)
+    half = 1.96 * values.std(ddof=1) / np.sqrt(len(values))
+    # 2,000 replicates place a 2.5 % quantile to about 5 % of the half width.
+    assert low == pytest.approx(values.mean() - half, abs=0.12 * half)
+    assert high == pytest.approx(values.mean() + half, abs=0.12 * half)
+
+
+def test_interval_of_copies_does_not_shrink_with_the_number_of_copies():
+    """Twenty frames of one recording that are all alike are worth one."""
+    values = np.random.default_rng(1).normal(size=30)
+    alone = bootstrap_interval(values, seed=3)
+    copied = bootstrap_interval(np.repeat(values, 20), np.repeat(np.arange(30).astype(str), 20), seed=3)
+    naive = bootstrap_interval(np.repeat(values, 20), seed=3)
+    assert copied[1] - copied[0] == pytest.approx(alone[1] - alone[0], rel=0.1)
+    assert naive[1] - naive[0] < 0.4 * (copied[1] - copied[0])
+
+
+def test_intervals_cover_the_truth_as_often_as_they_say():
+    hits = 0
+    for trial in range(200):
+        generator = np.random.default_rng(trial)
+        groups = np.repeat(np.arange(40), 5)
+        values = generator.normal(size=40)[groups] + generator.normal(size=200)
+        low, high = bootstrap_interval(values, groups, num_resamples=400, seed=trial)
+        hits += low <= 0 <= high
+    # 95 % of 200 is 190; the percentile bootstrap of 40 groups is a little narrow, and 3 deviations are 9.
+    assert 178 <= hits <= 199
+
+
+def test_both_bootstraps_agree_on_a_mean():
+    generator = np.random.default_rng(2)
+    values, groups = generator.normal(size=100), generator.integers(0, 9, size=100)
+    low, high = cluster_bootstrap(lambda rows: {"mean": float(values[rows].mean())}, groups, num_resamples=300, seed=4)
+    expected = bootstrap_interval(values, groups, num_resamples=300, seed=4)
+    assert (low["mean"], high["mean"]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_intervals_ignore_rows_without_a_score_and_refuse_to_guess():
+    values = np.array([1.0, np.nan, 3.0, np.nan])
+    assert bootstrap_interval(values, seed=1) == bootstrap_interval(values[[0, 2]], seed=1)
+    assert all(np.isnan(bootstrap_interval(values[:2])))
+    assert cluster_bootstrap(lambda rows: {"mean": 0.0}, ["only", "only"]) == ({}, {})
+    with pytest.raises(ValueError, match="none of the 2 values"):
+        bootstrap_interval(np.full(2, np.nan))
+    with pytest.raises(ValueError, match=r"must both be \[N\]"):
+        bootstrap_interval(values, ["a"])
+
+
+def test_replicates_that_cannot_be_scored_are_left_out():
+    def compute(rows):
+        if 0 not in rows:
+            raise ValueError("no joint is visible")
+        return {"score": 1.0}
+
+    assert cluster_bootstrap(compute, ["a", "b", "c"]) == ({"score": 1.0}, {"score": 1.0})
+
+
+def test_spread_over_seeds():
+    spread = compute_spread([6.0, 6.2, 6.4])
+    assert (spread.mean, spread.deviation, spread.count) == (pytest.approx(6.2), pytest.approx(0.2), 3)
+    assert spread.text() == "6.20 ± 0.20"
+    assert compute_spread([6.123]).text(1) == "6.1"
+    with pytest.raises(ValueError, match="finite value"):
+        compute_spread([1.0, float("nan")])
