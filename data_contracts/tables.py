@@ -3,6 +3,9 @@
 A stage writes exactly one of these as its manifest; `check_table` holds on every write and every read.
 """
 
+# pyarrow.compute makes its functions when it is imported, where a type checker cannot see them.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -29,8 +29,10 @@ def evaluate(
     experiment: Experiment, dataset: PreparedDataset | None = None, synthetic: ManifestRef | None = None
 ) -> Evaluation:
     """Train and score every setting and seed; dataset and synthetic frames are made first unless they are given."""
-    dataset = dataset or call_flow(prepare_dataset, experiment)
-    synthetic = synthetic or call_flow(synthesize, experiment, dataset)
+    if dataset is None:
+        dataset = call_flow(prepare_dataset, experiment)
+    if synthetic is None:
+        synthetic = call_flow(synthesize, experiment, dataset)
     training_sets = {
         "real": [dataset.frames],
         "synthetic": [synthetic],

@@ -19,8 +19,10 @@ def synthesize(
     experiment: Experiment, dataset: PreparedDataset | None = None, checkpoint: ManifestRef | None = None
 ) -> ManifestRef:
     """Sample the experiment's synthetic frames; dataset and checkpoint are made first unless they are given."""
-    dataset = dataset or call_flow(prepare_dataset, experiment)
-    checkpoint = checkpoint or call_flow(train_generator, experiment, dataset)
+    if dataset is None:
+        dataset = call_flow(prepare_dataset, experiment)
+    if checkpoint is None:
+        checkpoint = call_flow(train_generator, experiment, dataset)
     return sample(
         checkpoint,
         dataset.sample_conditions,

@@ -16,7 +16,8 @@ from tasks.stage import call_flow
 @flow(name="train-generator")
 def train_generator(experiment: Experiment, dataset: PreparedDataset | None = None) -> ManifestRef:
     """Fine-tune the experiment's generator; the dataset is prepared first unless it is given."""
-    dataset = dataset or call_flow(prepare_dataset, experiment)
+    if dataset is None:
+        dataset = call_flow(prepare_dataset, experiment)
     return finetune(
         dataset.frames,
         dataset.frame_conditions,

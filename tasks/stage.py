@@ -30,7 +30,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -44,6 +44,11 @@ from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
 from tasks.store import RawFileDigests, Store
 
+if TYPE_CHECKING:
+    from prefect import Flow
+
+P = ParamSpec("P")
+R = TypeVar("R")
 RawFiles = Callable[[dict[str, Any]], Sequence[tuple[str, Path]]]
 """From the stage's arguments to (name, path) of the raw files it will read; the names enter the key too."""
 
@@ -77,9 +82,9 @@ def planning() -> Iterator[list[PlannedStage]]:
         _plan.reset(token)
 
 
-def call_flow(flow: Any, *arguments: Any) -> Any:
+def call_flow(flow: Flow[P, R], *arguments: P.args, **settings: P.kwargs) -> R:
     """Call a Prefect flow, or only its wiring while planning."""
-    return flow.fn(*arguments) if _plan.get() is not None else flow(*arguments)
+    return (flow.fn if _plan.get() is not None else flow)(*arguments, **settings)
 
 
 class Output:
