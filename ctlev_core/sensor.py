@@ -51,12 +51,12 @@ class SensorOptions(Frozen):
 PRESETS = {
     "ideal": SensorOptions(starts_settled=False),
     "noisy": SensorOptions(
-        threshold=0.3,
-        threshold_sigma=0.04,
+        threshold=0.25,
+        threshold_sigma=0.035,
         cutoff_dark_hz=20.0,
         refractory_us=500,
         leak_rate_hz=0.25,
-        shot_rate_hz=0.7,
+        shot_rate_hz=0.6,
         rate_spread=0.5,
         hot_pixel_fraction=0.0034,
     ),

@@ -29,7 +29,7 @@ ORIENTATION_CHANNELS = ("pitch", "yaw", "roll", "jump")
 """Left alone by the amplitude: they carry the body, and half a cartwheel is no cartwheel."""
 
 GROUND_STEP_S = 0.01
-GROUND_SOFTNESS_M = 0.02
+GROUND_SOFTNESS_M = 0.012
 """How far above the lowest joint another still carries weight: contact moves smoothly from foot to foot."""
 SWAY_PERIOD_S = 2.5
 
