@@ -191,21 +191,19 @@ def render_body_frames(
     transforms, _ = joint_transforms(body, rotations, subject.betas, transl)
     in_camera = camera.R @ transforms
     in_camera[..., 3] += camera.translation
+    rest, K = shape_vertices(body, subject.betas), camera.scaled(SUPERSAMPLING).K
+    backdrop = background.repeat(SUPERSAMPLING, axis=0).repeat(SUPERSAMPLING, axis=1).astype(np.float32)
+    vertices, normals, colours = np.empty_like(rest), np.empty_like(rest), np.empty_like(subject.albedo)
+    image, depth_inverse = np.empty_like(backdrop), np.empty(backdrop.shape[:2], dtype=np.float32)
     out = np.empty((len(transforms), *shape), dtype=np.float32)
-    _render_frames(
-        shape_vertices(body, subject.betas),
-        body.normals,
-        body.weight_indices,
-        body.weight_values,
-        in_camera.astype(np.float32),
-        body.faces,
-        subject.albedo,
-        camera.scaled(SUPERSAMPLING).K,
-        light.direction,
-        light.ambient,
-        np.ascontiguousarray(background, dtype=np.float32),
-        out,
-    )
+    # The loop stays in Python: numba's cache does not notice when a kernel called from another module changes.
+    for frame, moves in enumerate(in_camera.astype(np.float32)):
+        skin(rest, body.normals, body.weight_indices, body.weight_values, moves, vertices, normals)
+        _shade(normals, subject.albedo, light.direction, light.ambient, colours)
+        image[:] = backdrop
+        depth_inverse[:] = 0.0
+        rasterise(vertices, body.faces, colours, K, NEAR_M, True, image, depth_inverse)
+        _average_blocks(image, out[frame])
     return out
 
 
@@ -234,27 +232,6 @@ def render_person(
     if image_size != camera.image_size:
         raise DataError(f"the camera makes images of {camera.image_size} px, asked for {image_size}")
     return render_body_frames(subject, rotations[None], transl[None], camera, background, sample_light(rng))[0]
-
-
-@numba.njit(cache=True, nogil=True)
-def _render_frames(
-    rest, normals, weight_indices, weight_values, transforms, faces, albedo, K, lamp, ambient, background, out
-):
-    frames, height, width, channels = out.shape
-    vertices, turned = np.empty_like(rest), np.empty_like(rest)
-    colours = np.empty_like(albedo)
-    image = np.empty((SUPERSAMPLING * height, SUPERSAMPLING * width, channels), dtype=np.float32)
-    depth_inverse = np.empty(image.shape[:2], dtype=np.float32)
-    for t in range(frames):
-        skin(rest, normals, weight_indices, weight_values, transforms[t], vertices, turned)
-        _shade(turned, albedo, lamp, ambient, colours)
-        for row in range(image.shape[0]):
-            for column in range(image.shape[1]):
-                for k in range(channels):
-                    image[row, column, k] = background[row // SUPERSAMPLING, column // SUPERSAMPLING, k]
-        depth_inverse[:] = 0.0
-        rasterise(vertices, faces, colours, K, NEAR_M, True, image, depth_inverse)
-        _average_blocks(image, out[t])
 
 
 @numba.njit(cache=True, nogil=True)
