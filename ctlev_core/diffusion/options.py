@@ -1,0 +1,89 @@
+"""Options of training and sampling that both diffusion generators share. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from data_contracts.config import RUN_SETTING, Frozen
+
+
+class TrainingOptions(Frozen):
+    """How long and how fast to train. The paper gives epochs and batch sizes, but no learning rate."""
+
+    num_steps: int = Field(
+        default=1200, gt=0, description="optimiser steps; the paper trains 80 (text) and 600 epochs (skeleton)"
+    )
+    batch_size: int = Field(default=8, gt=0, description="images in memory at a time; paper: 4 (text), 2 (skeleton)")
+    gradient_accumulation: int = Field(
+        default=1, gt=0, description="batches an optimiser step; paper: 32 and 64, on 4 GPUs"
+    )
+    learning_rate: float = Field(
+        default=1e-3, gt=0, description="peak, for the small prior; 1e-5 is usual for Stable Diffusion"
+    )
+    warmup_steps: int = Field(default=30, ge=0, description="linear rise of the learning rate")
+    final_learning_rate: float = Field(
+        default=0.05, ge=0, le=1, description="share of the peak that a linear decay ends at"
+    )
+    weight_decay: float = Field(default=1e-3, ge=0, description="decoupled (AdamW)")
+    max_gradient_norm: float = Field(default=1.0, gt=0, description="gradients are scaled down to this norm")
+    ema_decay: float = Field(
+        default=0.995, ge=0, lt=1, description="of the averaged weights that are kept; 0 = no averaging"
+    )
+    snr_gamma: float | None = Field(
+        default=5.0, gt=0, description="min-SNR loss weights (Hang et al., ICCV 2023); null = plain"
+    )
+    log_every: int = Field(default=20, gt=0, description="steps between two points of the loss curve")
+    validation_every: int = Field(default=400, gt=0, description="steps between two points of the validation curve")
+    precision: Literal["float32", "bfloat16"] = Field(
+        default="float32", description="of the forward pass; weights, averages and losses stay float32"
+    )
+    checkpoint_every_s: float = Field(
+        default=60.0, gt=0, json_schema_extra=RUN_SETTING, description="seconds between two saves of the training state"
+    )
+
+
+class FineTuningOptions(TrainingOptions):
+    """Fine-tuning of a prior on labelled event images."""
+
+    prior: Path | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="diffusers folder of the prior; the bundled small prior when null",
+    )
+    random_init: bool = Field(
+        default=False, description="ablation: forget the prior's U-Net and ControlNet weights first"
+    )
+    prompt_dropout: float = Field(
+        default=0.0, ge=0, le=1, description="share of empty prompts, needed only for guidance_scale > 1"
+    )
+    num_validation: int = Field(
+        default=64, ge=0, description="frames held back for the validation loss, a tenth at most"
+    )
+    device: str = Field(default="auto", json_schema_extra=RUN_SETTING, description="auto, cpu, cuda, cuda:1 ...")
+
+
+class SamplingOptions(Frozen):
+    """How frames are drawn from a checkpoint."""
+
+    scheduler: Literal["unipc", "dpm++", "ddim", "ddpm"] = Field(
+        default="unipc", description="solver; the paper's is ddpm with 1000 steps, unipc (Karras) matches it in 20"
+    )
+    num_inference_steps: int = Field(
+        default=20, gt=0, le=1000, description="evaluations of the network an image; paper: 1000"
+    )
+    guidance_scale: float = Field(default=1.0, ge=1, description="classifier-free guidance; 1 = none, twice as fast")
+    monochrome: bool = Field(default=False, description="average the channels: for encodings that discard polarity")
+    dark_level: int = Field(
+        default=20,
+        ge=0,
+        le=255,
+        description="channel values below become 0: a decoder never gives the exact black of no event",
+    )
+    precision: Literal["float32", "bfloat16"] = Field(
+        default="float32", description="of the networks; the state of the solver stays float32"
+    )
+    batch_size: int = Field(default=32, gt=0, json_schema_extra=RUN_SETTING, description="images in memory at a time")
+    device: str = Field(default="auto", json_schema_extra=RUN_SETTING, description="auto, cpu, cuda, cuda:1 ...")

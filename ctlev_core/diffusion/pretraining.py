@@ -1,0 +1,256 @@
+"""Pre-train the small prior on procedural images, and write it as a diffusers folder."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import logging
+import math
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from ctlev_core.diffusion import procedural_images
+from ctlev_core.diffusion.options import TrainingOptions
+from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
+from ctlev_core.diffusion.prior import Prior, conditions_to_tensor, images_to_tensor, save_prior
+from ctlev_core.diffusion.small_prior import IMAGE_SIZE, WIDTHS, build_prior
+from ctlev_core.diffusion.training import (
+    Batch,
+    Denoiser,
+    NoiseSchedule,
+    Trainer,
+    run_training,
+    sample_rows,
+    validation_losses,
+)
+from data_contracts.config import RUN_SETTING, Frozen, cache_material
+from data_contracts.labels import History
+
+FIT_IMAGES = 384
+VALIDATION_IMAGES = 128
+VALIDATION_OFFSET = 2**31
+VALIDATION_STREAM, STYLE_STREAM = 1, 2  # entropy that keeps the random streams apart
+
+logger = logging.getLogger(__name__)
+
+
+class PretrainingOptions(Frozen):
+    """How the small prior is made."""
+
+    training: TrainingOptions = Field(
+        default=TrainingOptions(
+            num_steps=40_000,
+            ema_decay=0.999,
+            # Above the usual 5: the quiet channels of the patch code are decided at higher signal-to-noise ratios.
+            snr_gamma=10.0,
+            warmup_steps=200,
+            final_learning_rate=0.0,
+            validation_every=500,
+            log_every=100,
+            checkpoint_every_s=120,
+        ),
+        description="the loop",
+    )
+    max_seconds: float | None = Field(default=3600.0, gt=0, description="wall-clock budget; null = all steps")
+    block_scenes: int = Field(default=768, gt=0, description="scenes drawn at a time by the worker process")
+    block_passes: int = Field(
+        default=2, gt=0, description="how often each scene is shown, every time in a random style"
+    )
+    text_dropout: float = Field(default=0.1, ge=0, le=1, description="share of empty prompts, for guidance")
+    condition_dropout: float = Field(default=0.1, ge=0, le=1, description="share of people without their skeleton")
+    image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
+    widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
+    seed: int = Field(default=0, ge=0, description="of weights, pictures, order and noise")
+    workers: int = Field(
+        default=1, ge=0, json_schema_extra=RUN_SETTING, description="processes that draw; 0 = in the same one"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One training picture: `skeleton` is None where it goes through the U-Net alone."""
+
+    image: np.ndarray
+    caption: str
+    skeleton: np.ndarray | None
+
+
+class ImageStream:
+    """Micro-batches of the procedural stream; the blocks ahead are drawn in worker processes meanwhile."""
+
+    def __init__(self, prior: Prior, options: PretrainingOptions) -> None:
+        self._prior, self._options = prior, options
+        self._batches_per_block = options.block_scenes * options.block_passes // options.training.batch_size
+        # Spawned, not forked: forking a process that runs torch threads can hang.
+        self._pool = ProcessPoolExecutor(options.workers, get_context("spawn")) if options.workers else None
+        self._ahead: dict[int, Future] = {}
+        self._block: tuple[int, list[procedural_images.Scene]] = (-1, [])
+
+    def close(self) -> None:
+        """Stop drawing."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def fetch(self, number: int) -> Batch:
+        """Batch `number`: people with a skeleton first, then everything that goes through the U-Net alone."""
+        options = self._options
+        block, position = divmod(number, self._batches_per_block)
+        scenes = self._scenes(block)
+        size = options.training.batch_size
+        rows = sample_rows(options.seed + 1000 * (block + 1), position, size, len(scenes))
+        rng = np.random.default_rng([options.seed, STYLE_STREAM, number])
+        batch = []
+        for row in rows:
+            image, caption = procedural_images.apply_style(scenes[row], rng)
+            steered = scenes[row].has_skeleton and rng.random() >= options.condition_dropout
+            caption = "" if rng.random() < options.text_dropout else caption
+            batch.append(Row(image, caption, scenes[row].skeleton if steered else None))
+        return make_batch(self._prior, batch)
+
+    def _scenes(self, block: int) -> list[procedural_images.Scene]:
+        if self._block[0] != block:
+            seed, count, size = self._options.seed, self._options.block_scenes, self._options.image_size
+            if self._pool is None:
+                self._block = (block, procedural_images.draw_block(seed, block, count, size))
+            else:
+                for ahead in range(block, block + 1 + self._options.workers):
+                    if ahead not in self._ahead:
+                        self._ahead[ahead] = self._pool.submit(procedural_images.draw_block, seed, ahead, count, size)
+                self._block = (block, self._ahead.pop(block).result())
+        return self._block[1]
+
+
+def make_batch(prior: Prior, rows: list[Row]) -> Batch:
+    """Latents, prompt embeddings (with their gradient) and conditions, rows with a skeleton first."""
+    rows = sorted(rows, key=lambda row: row.skeleton is None)
+    images = images_to_tensor(np.stack([row.image for row in rows]))
+    latents = prior.vae.encode(images)[0].mode() * prior.scaling_factor
+    tokens = prior.tokenizer(
+        [row.caption for row in rows],
+        padding="max_length",
+        max_length=prior.tokenizer.model_max_length,
+        truncation=True,
+        return_tensors="pt",
+    )
+    embeddings = prior.text_encoder(tokens.input_ids)[0]
+    skeletons = [row.skeleton for row in rows if row.skeleton is not None]
+    conditions = conditions_to_tensor(np.stack(skeletons)) if skeletons else None
+    return Batch(latents, embeddings, conditions)
+
+
+def draw_validation_rows(options: PretrainingOptions) -> list[Row]:
+    """Held-back people, each with a skeleton, from a stream of their own."""
+    people = []
+    for index in range(VALIDATION_IMAGES):
+        rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + index])
+        scene = procedural_images.draw_person(rng, options.image_size)
+        image, caption = procedural_images.apply_style(scene, rng)
+        people.append(Row(image, caption, scene.skeleton))
+    return people
+
+
+def new_prior(options: PretrainingOptions) -> Prior:
+    """The untrained prior: fitted patch code, trained tokenizer, random networks."""
+    scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
+    rng = np.random.default_rng([options.seed, STYLE_STREAM])
+    images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
+    vae: PatchAutoencoder = fit_patch_autoencoder(images_to_tensor(images))
+    corpus = procedural_images.caption_corpus()
+    return build_prior(corpus, vae, seed=options.seed, widths=options.widths, image_size=options.image_size)
+
+
+def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:
+    """The untrained prior and the trainer of everything in it but the patch code."""
+    prior = new_prior(options)
+    parameters = []
+    for model in (prior.unet, prior.controlnet, prior.text_encoder):
+        if model is not None:
+            parameters += list(model.train().requires_grad_(True).parameters())
+    identity = hashlib.sha256(json.dumps(cache_material(options), sort_keys=True).encode()).hexdigest()
+    return prior, Trainer(parameters, options.training, identity)
+
+
+def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
+    """Pre-train U-Net, ControlNet and text encoder together; write the averaged weights, in half precision, to `out`.
+
+    Args:
+        options: size, length and mixture.
+        out: becomes a diffusers folder.
+        work: resumable state; a killed run goes on from there.
+    Returns:
+        Loss curves; the validation losses are of people with their own and with somebody else's skeleton.
+    """
+    prior, trainer = prepare(options)
+    denoiser = Denoiser(prior.unet, prior.controlnet)
+    schedule = NoiseSchedule(prior.scheduler_config)
+    held_back = draw_validation_rows(options)
+    stream = ImageStream(prior, options)
+
+    def validate() -> tuple[float, float]:
+        with torch.no_grad():  # the text encoder is trained as well, so the embeddings are of the moment
+            batch = make_batch(prior, held_back)
+        losses = validation_losses(denoiser, schedule, batch, seed=options.seed, batch_size=32)
+        speed = trainer.step * options.training.batch_size / max(trainer.seconds, 1e-9)
+        loss = trainer.history.loss[-1] if trainer.history.loss else math.nan
+        logger.info(
+            "step %d, %.0f s, %.1f img/s, loss %.4f, validation: own skeleton %.4f, another's %.4f",
+            trainer.step, trainer.seconds, speed, loss, *losses,
+        )  # fmt: skip
+        return losses
+
+    try:
+        history = run_training(
+            trainer,
+            denoiser,
+            schedule,
+            stream.fetch,
+            seed=options.seed,
+            work=work,
+            validate=validate,
+            max_seconds=options.max_seconds or math.inf,
+            description="pre-training",
+        )
+    finally:
+        stream.close()
+    save_prior(prior, out, torch.float16)
+    return history
+
+
+def export(options: PretrainingOptions, out: Path, work: Path) -> None:
+    """Write the averaged weights of an unfinished run as a diffusers folder.
+
+    Raises:
+        FileNotFoundError: nothing was saved in `work` yet.
+    """
+    prior, trainer = prepare(options)
+    trainer.restore(work / "state.pt")
+    trainer.apply_average()
+    save_prior(prior, out, torch.float16)
+
+
+def main() -> None:
+    """Command line: pre-train, or with --export write the state of a run that is still going."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="diffusers folder to write")
+    parser.add_argument("--work", type=Path, required=True, help="folder of the resumable state")
+    parser.add_argument("--minutes", type=float, default=60.0, help="wall-clock budget")
+    parser.add_argument("--export", action="store_true", help="only write what is in --work so far")
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    options = PretrainingOptions(max_seconds=60 * arguments.minutes)
+    torch.set_num_threads(1)
+    if arguments.export:
+        export(options, arguments.out, arguments.work)
+    else:
+        pretrain(options, arguments.out, arguments.work)
+
+
+if __name__ == "__main__":
+    main()

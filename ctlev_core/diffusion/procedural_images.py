@@ -1,0 +1,213 @@
+"""The endless stream of captioned pictures the small prior is pre-trained on. Never events, never a data set.
+
+Six pictures in ten are people: colour renderings of the procedural body in random poses and in poses of the procedural
+motions that are not held out for tests, with the skeleton drawn in the manner of OpenPose. The others are everyday
+objects (`procedural_objects`), without a skeleton. A scene is drawn once and shown in several styles: photograph, grey
+photograph, line drawing on black, coloured line drawing. A network that knows outlines needs far fewer event images to
+learn what an event camera sees.
+
+Scene i is a function of (seed, i) alone, style s of scene i of (seed, i, s).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+
+from ctlev_core.body.layer import joint_transforms, load_body
+from ctlev_core.body.motions import SEEN, UNSEEN, pose_at, sample_style
+from ctlev_core.body.rotations import matrix_from_euler
+from ctlev_core.camera import is_inside, project
+from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object
+from ctlev_core.render.scene import CameraRange, render_person, sample_background, sample_camera, sample_subject
+from ctlev_core.render.skeleton import draw_skeleton
+from ctlev_core.skeletons import SMPL_JOINTS, SMPL_TO_DHP19
+
+PEOPLE_SHARE = 0.6
+MOTION_SHARE = 0.55
+"""Of the people, how many take their pose from a procedural motion, never a held-out one; the others' is random."""
+POSE_NOISE_RAD = 0.15
+PLAIN_SHARE = 0.4
+"""How many scenes have a plain background, so that their line drawings are clean."""
+CAMERA = CameraRange(distance_m=(3.0, 4.2), pitch_rad=(-0.3, 0.5), focal_per_side=(1.3, 1.9))
+STYLES = ("photo", "grey", "lines", "coloured lines")
+STYLE_WEIGHTS = (0.22, 0.16, 0.37, 0.25)
+SAY_STYLE_SHARE = 0.4
+PERSON_CAPTIONS = (
+    "a moving human", "a moving human", "a moving human", "a photo of a person", "a photo of a moving person",
+    "a human", "a photo of a man", "a photo of a woman", "a dancing person", "a person in the street",
+)  # fmt: skip
+OBJECT_CAPTIONS = (
+    "a photo of {noun}", "a photo of a {noun}", "a photo of a {colour} {noun}", "a {colour} {noun}", "a {noun}",
+    "a picture of a {colour} {noun}",
+)  # fmt: skip
+STYLE_CAPTIONS = {
+    "photo": "a colour {}",
+    "grey": "a grey {}",
+    "lines": "a line drawing of {}",
+    "coloured lines": "a coloured line drawing of {}",
+}
+# Words the captions above never use, so that users' prompts find them in the vocabulary as whole words.
+EXTRA_WORDS = """
+    event events camera image images recording motion moving walking running jumping kicking punching dancing waving
+    sitting standing turning lifting throwing reaching bending stretching hopping crouching crawling climbing
+    falling people child boy girl player runner dancer animal vehicle plane aircraft sedan taxi van train motorcycle
+    motorbike ship sailboat building home church castle barn door window wall tower plant leaf grass rose fruit pear
+    orange lemon strawberry bread pizza mug glass jug pot kettle spoon fork knife plate bowl sofa couch bed desk
+    stool bench mirror picture frame candle torch lantern watch bell drum piano violin trumpet flute laptop computer
+    keyboard screen mouse horse cow sheep pig elephant lion tiger bear rabbit turtle snake frog duck chicken owl
+    penguin shark dolphin whale crab spider ant bee beetle dragonfly leopard panda kangaroo crocodile dinosaur
+    anchor barrel wrench saw pliers axe rocket helicopter balloon kite ball football basketball tennis racket
+    skateboard helmet glove shirt dress trousers small large big tall round square bright dark old new fast slow
+    left right front back side view of the in on with
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A drawn scene before it gets a style.
+
+    Attributes:
+        image: [S, S, 3] uint8 RGB colours.
+        skeleton: [S, S, 3] uint8 RGB; black where there is nobody.
+        has_skeleton: is `skeleton` a condition at all?
+        noun: a key of `OBJECTS`, or `person`.
+        colour: of the object; empty for people.
+    """
+
+    image: np.ndarray
+    skeleton: np.ndarray
+    has_skeleton: bool
+    noun: str
+    colour: str
+
+
+def sample_pose(rng: np.random.Generator) -> np.ndarray:
+    """A random pose [24, 3, 3] within rough human ranges, from relaxed standing to acrobatics."""
+    angles = {name: np.zeros(3) for name in SMPL_JOINTS}  # degrees about x (first), y, z
+    strength = rng.uniform(0.15, 1.0)
+
+    def draw(low: float, high: float) -> float:
+        return strength * rng.triangular(low, min(max(0.0, low), high), high)
+
+    together = rng.random() < 0.25  # both legs alike: sitting, squatting, jumping
+    hip, knee = draw(-100, 25), draw(0, 135)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        if not together:
+            hip, knee = draw(-110, 35), draw(0, 130)
+        angles[f"{side}_hip"] = np.array([hip, draw(-30, 30), sign * draw(-15, 50)])
+        angles[f"{side}_knee"] = np.array([knee, 0.0, 0.0])
+        angles[f"{side}_ankle"] = np.array([draw(-25, 35), 0.0, 0.0])
+        # Arms hang at the sides by default; the rest pose is a T.
+        elevation = -78 + strength * rng.beta(1.1, 1.6) * 160
+        angles[f"{side}_shoulder"] = np.array([draw(-40, 40), -sign * draw(-40, 110), sign * elevation])
+        angles[f"{side}_elbow"] = np.array([draw(-60, 60), -sign * strength * rng.uniform(0, 140), 0.0])
+    bend, twist, lean = draw(-25, 60), draw(-45, 45), draw(-30, 30)
+    for name in ("spine1", "spine2", "spine3"):
+        angles[name] = np.array([bend, twist, lean]) / 3
+    angles["neck"] = np.array([draw(-20, 30), draw(-40, 40), draw(-15, 15)])
+    if rng.random() < 0.2:
+        angles["pelvis"] = rng.uniform(-180, 180, 3)
+    else:
+        angles["pelvis"] = np.array([draw(-15, 30), 0.0, draw(-15, 15)])
+    # Intrinsic Y X Z: swing forward and up first, twist last.
+    return matrix_from_euler("YXZ", np.array([angles[name][[1, 0, 2]] for name in SMPL_JOINTS]))
+
+
+def draw_person(rng: np.random.Generator, size: int) -> Scene:
+    """A rendered person with their skeleton; the pose is random."""
+    subject = sample_subject(rng, colour=True)
+    if rng.random() < MOTION_SHARE:
+        motion = str(rng.choice(SEEN + UNSEEN))
+        rotations = pose_at(motion, np.zeros(1), sample_style(motion, rng, POSE_NOISE_RAD))[0][0]
+    else:
+        rotations = sample_pose(rng)
+    transl = np.zeros(3)
+    _, joints = joint_transforms(load_body(), rotations[None], subject.betas, transl[None])
+    camera = sample_camera(rng, joints[0], (size, size), CAMERA)
+    background = sample_background(rng, (size, size), colour=True)
+    if rng.random() < PLAIN_SHARE:
+        background[:] = background.mean(axis=(0, 1))
+    linear = render_person(rng, subject, rotations, transl, camera, background, (size, size))
+    image = (np.clip(linear, 0, 1) ** (1 / 2.2) * 255).round().astype(np.uint8)
+    joints2d = project(camera, joints[0])[list(SMPL_TO_DHP19)]
+    visible = is_inside(joints2d, (size, size))
+    if rng.random() < 0.1:  # real labels miss joints
+        visible &= rng.random(len(visible)) < 0.85
+    return Scene(image, draw_skeleton(joints2d, visible, "dhp19", (size, size)), True, "person", "")
+
+
+def draw_thing(rng: np.random.Generator, size: int) -> Scene:
+    """A drawn object on a plain or stained background, without a skeleton."""
+    noun, colour = rng.choice(list(OBJECTS)), rng.choice(list(COLOURS))
+    background = sample_background(rng, (size, size), colour=True) ** (1 / 2.2) * 255
+    if rng.random() < PLAIN_SHARE:
+        background[:] = rng.choice((8, 60, 200, 250)) if rng.random() < 0.5 else background.mean(axis=(0, 1))
+    image = draw_object(noun, colour, background.astype(np.uint8), rng)
+    return Scene(image, np.zeros((size, size, 3), np.uint8), False, noun, colour)
+
+
+def draw_scene(seed: int, index: int, size: int) -> Scene:
+    """Scene `index` of the stream, a function of its arguments alone."""
+    rng = np.random.default_rng([seed, index])
+    draw = draw_person if rng.random() < PEOPLE_SHARE else draw_thing
+    return draw(rng, size)
+
+
+def apply_style(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, str]:
+    """A random style for a scene.
+
+    Returns:
+        The picture [S, S, 3] uint8 and its caption.
+    """
+    style = str(rng.choice(STYLES, p=STYLE_WEIGHTS))
+    image = scene.image.astype(np.float32)
+    if style == "grey" or style == "lines":
+        image = np.repeat(image @ np.array([[0.299], [0.587], [0.114]], np.float32), 3, axis=2)
+    if style.endswith("lines"):
+        image = _outlines(image, rng)
+    if rng.random() < 0.2:  # film grain
+        image = image + rng.normal(0, rng.uniform(3, 14), image.shape[:2])[..., None]
+    picture = np.clip(image, 0, 255).round().astype(np.uint8)
+    return picture, _caption(scene, style, rng)
+
+
+def _outlines(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Bright outlines on black: the gradient magnitude of each channel, thinned by a random threshold."""
+    smooth = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 0.9))
+    sobel = partial(cv2.Sobel, smooth, cv2.CV_32F, ksize=3, scale=0.125)
+    magnitude = np.hypot(sobel(dx=1, dy=0), sobel(dx=0, dy=1))
+    full = np.percentile(magnitude.max(axis=2), rng.uniform(93, 98.5)) + 4.0
+    lines = np.clip((magnitude / full - rng.uniform(0.1, 0.35)) * rng.uniform(1.0, 1.8), 0, 1)
+    return lines * rng.uniform(150, 255)
+
+
+def _caption(scene: Scene, style: str, rng: np.random.Generator) -> str:
+    if scene.has_skeleton:
+        caption = str(rng.choice(PERSON_CAPTIONS))
+    else:
+        # A grey picture has no colour to name.
+        templates = OBJECT_CAPTIONS if style.startswith(("photo", "coloured")) else OBJECT_CAPTIONS[:2]
+        caption = str(rng.choice(templates)).format(noun=scene.noun, colour=scene.colour)
+    if rng.random() < SAY_STYLE_SHARE:
+        subject = caption.removeprefix("a photo of ").removeprefix("a picture of ")
+        caption = STYLE_CAPTIONS[style].format(subject if "lines" in style else subject.removeprefix("a "))
+    return caption
+
+
+def caption_corpus() -> list[str]:
+    """Every kind of caption the stream can give, and further everyday words: what the tokenizer is trained on."""
+    plain = [*PERSON_CAPTIONS]
+    for noun in OBJECTS:
+        plain += [template.format(noun=noun, colour=colour) for template in OBJECT_CAPTIONS for colour in COLOURS]
+    styled = [form.format(caption) for form in STYLE_CAPTIONS.values() for caption in PERSON_CAPTIONS]
+    # Repeated: byte-pair encoding makes a word of its own of what it sees often enough.
+    return 4 * (plain + styled) + 40 * EXTRA_WORDS.split()
+
+
+def draw_block(seed: int, block: int, block_size: int, size: int) -> list[Scene]:
+    """Scenes block * block_size .. (block + 1) * block_size - 1; what a worker process makes at a time."""
+    return [draw_scene(seed, index, size) for index in range(block * block_size, (block + 1) * block_size)]

@@ -1,0 +1,92 @@
+"""The patch code must lose nothing, whatever the image: what it loses no generator can put back."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.fft import dctn
+
+from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder, patch_basis
+
+
+def random_images(count=4, side=16, seed=0):
+    return torch.rand((count, 3, side, side), generator=torch.Generator().manual_seed(seed)) * 2 - 1
+
+
+def event_images(count=8, side=16, seed=0):
+    """Isolated red and blue pixels on black, in [-1, 1]."""
+    random = np.random.default_rng(seed)
+    images = np.full((count, 3, side, side), -1.0, np.float32)
+    for channel in (0, 2):
+        images[:, channel][random.random((count, side, side)) < 0.05] = 1.0
+    return torch.from_numpy(images)
+
+
+def test_basis_is_orthonormal():
+    basis = patch_basis()
+    torch.testing.assert_close(basis @ basis.T, torch.eye(48, dtype=torch.float64), atol=1e-14, rtol=0)
+
+
+def test_luminance_channels_are_the_dct_of_each_block():
+    images = random_images(1, 8)
+    latents = PatchAutoencoder().encode(images)[0].mode()[0].numpy()
+    grey = images[0].sum(0).numpy() / np.sqrt(3)
+    for row in range(2):
+        for column in range(2):
+            block = grey[4 * row : 4 * row + 4, 4 * column : 4 * column + 4]
+            expected = dctn(block, norm="ortho").ravel()
+            np.testing.assert_allclose(latents[:16, row, column], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("images", [random_images(), event_images(), -torch.ones(1, 3, 8, 8), torch.ones(1, 3, 8, 12)])
+def test_reconstruction_is_exact(images):
+    code = fit_patch_autoencoder(random_images(seed=1))
+    assert (code(images) - images).abs().max() < 1e-5
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.01, 100.0))
+def test_reconstruction_is_exact_for_any_scale(seed, scale):
+    random = np.random.default_rng(seed)
+    channel_scale = tuple((scale * np.exp(random.normal(0, 1, 48))).tolist())
+    code = PatchAutoencoder(tuple(random.normal(0, 1, 48).tolist()), channel_scale)
+    images = random_images(2, 8, seed)
+    assert (code(images) - images).abs().max() < 1e-5
+
+
+def test_fitted_latents_have_unit_spread_and_half_whitened_channels():
+    # Smooth images: high frequencies are quieter than low ones.
+    images = torch.nn.functional.interpolate(random_images(64, 4), size=32, mode="bicubic")
+    code = fit_patch_autoencoder(images)
+    latents = code.encode(images)[0].mode() * code.config.scaling_factor
+    assert abs(float(latents.square().mean().sqrt()) - 1) < 0.01
+    raw = PatchAutoencoder().encode(images)[0].mode().std(dim=(0, 2, 3))
+    spread = latents.std(dim=(0, 2, 3))
+    expected = raw.sqrt() * code.config.scaling_factor
+    heard = raw > 0.01  # quieter channels sit on the floor
+    torch.testing.assert_close(spread[heard], expected[heard], rtol=0.01, atol=0)
+
+
+def test_saved_and_loaded_code_is_the_same(tmp_path):
+    code = fit_patch_autoencoder(random_images())
+    code.save_pretrained(tmp_path)
+    loaded = PatchAutoencoder.from_pretrained(tmp_path)
+    assert loaded.config.scaling_factor == code.config.scaling_factor
+    assert torch.equal(loaded.analysis, code.analysis) and torch.equal(loaded.synthesis, code.synthesis)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: PatchAutoencoder().encode(torch.zeros(1, 3, 10, 8)), "multiples of 4"),
+        (lambda: PatchAutoencoder().encode(torch.zeros(1, 1, 8, 8)), r"\[N, 3, H, W\]"),
+        (lambda: PatchAutoencoder(channel_scale=(0.0,) * 48), "must be positive"),
+        (lambda: PatchAutoencoder(channel_mean=(1.0,)), "must hold 48"),
+        (lambda: PatchAutoencoder(latent_channels=4), "48 channels"),
+        (lambda: fit_patch_autoencoder(torch.zeros(0, 3, 8, 8)), "at least one image"),
+    ],
+)
+def test_wrong_input_is_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

@@ -1,0 +1,136 @@
+"""Priors are ordinary diffusers folders: what is written loads again, also in diffusers itself."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+from diffusers.pipelines.controlnet.pipeline_controlnet import StableDiffusionControlNetPipeline
+from diffusers.pipelines.stable_diffusion.pipeline_stable_diffusion import StableDiffusionPipeline
+from tiny_prior import SIDE, make_prior, shared_prior
+
+from ctlev_core.diffusion.prior import encode_prompts, load_prior, save_prior
+from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder
+from data_contracts.events import DataError
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("prior") / "tiny"
+    save_prior(shared_prior(), path)
+    return path
+
+
+@pytest.fixture
+def broken(folder, tmp_path):
+    """A copy to damage."""
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def test_round_trip_keeps_every_weight(folder):
+    saved, loaded = shared_prior(), load_prior(folder)
+    for name in ("unet", "controlnet", "text_encoder", "vae"):
+        before, after = getattr(saved, name).state_dict(), getattr(loaded, name).state_dict()
+        assert before.keys() == after.keys()
+        assert all(torch.equal(before[key], after[key]) for key in before), name
+    assert loaded.image_size == (SIDE, SIDE)
+    assert loaded.scheduler_config["prediction_type"] == "v_prediction"
+    assert not any(parameter.requires_grad for parameter in loaded.unet.parameters())
+    prompts = ["a photo of a cup", "unseen wörds 42!", ""]
+    assert torch.equal(encode_prompts(saved, prompts), encode_prompts(loaded, prompts))
+
+
+def test_half_precision_is_written_for_networks_but_not_for_the_code(tmp_path):
+    prior = make_prior()
+    before = prior.unet.conv_in.weight.clone()
+    save_prior(prior, tmp_path / "half", torch.float16)
+    assert torch.equal(prior.unet.conv_in.weight, before)
+    loaded = load_prior(tmp_path / "half")
+    assert torch.equal(loaded.unet.conv_in.weight, before.half().float())
+    assert torch.equal(loaded.vae.analysis, prior.vae.analysis)
+
+
+def test_diffusers_loads_the_folder(folder):
+    pipeline = StableDiffusionControlNetPipeline.from_pretrained(folder, vae=load_prior(folder).vae)
+    pipeline.set_progress_bar_config(disable=True)
+    image = pipeline(
+        "a photo of a cup", image=torch.zeros(1, 3, SIDE, SIDE), num_inference_steps=2, output_type="np"
+    ).images
+    assert image.shape == (1, SIDE, SIDE, 3) and np.isfinite(image).all()
+
+
+def test_text_checkpoint_is_a_stable_diffusion_folder(folder, tmp_path):
+    save_prior(load_prior(folder, with_controlnet=False), tmp_path / "text")
+    assert not (tmp_path / "text" / "controlnet").exists()
+    pipeline = StableDiffusionPipeline.from_pretrained(tmp_path / "text", vae=load_prior(folder).vae)
+    assert pipeline.unet.config.in_channels == 48
+
+
+def test_stable_diffusion_layout_loads(folder, tmp_path):
+    """AutoencoderKL with its own factor and scale, weights without ControlNet, ControlNet in a folder of its own."""
+    path = shutil.copytree(folder, tmp_path / "sd")
+    shutil.move(path / "controlnet", tmp_path / "control")
+    shutil.rmtree(path / "vae")
+    vae = AutoencoderKL(
+        block_out_channels=(8, 8, 8, 8),
+        down_block_types=("DownEncoderBlock2D",) * 4,
+        up_block_types=("UpDecoderBlock2D",) * 4,
+        latent_channels=48,
+        norm_num_groups=4,
+        scaling_factor=0.18215,
+    )
+    vae.save_pretrained(path / "vae")
+    config = json.loads((tmp_path / "control" / "config.json").read_text())
+    config["controlnet_conditioning_channel_order"] = "bgr"
+    (tmp_path / "control" / "config.json").write_text(json.dumps(config))
+    plain = load_prior(path)
+    assert plain.controlnet is None and not plain.reversed_condition
+    prior = load_prior(path, controlnet=tmp_path / "control")
+    assert prior.scaling_factor == 0.18215 and prior.reversed_condition
+    assert prior.image_size == (8 * SIDE // 4, 8 * SIDE // 4)
+
+
+def test_missing_parts_are_named(broken, tmp_path):
+    with pytest.raises(DataError, match="nowhere: the prior must be a diffusers folder"):
+        load_prior(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="nowhere: the ControlNet must be"):
+        load_prior(broken, controlnet=tmp_path / "nowhere")
+    shutil.rmtree(broken / "tokenizer")
+    with pytest.raises(DataError, match="missing: tokenizer; found: controlnet, scheduler"):
+        load_prior(broken)
+
+
+def test_pickled_weights_are_not_read(broken):
+    next((broken / "unet").glob("*.safetensors")).rename(broken / "unet" / "diffusion_pytorch_model.bin")
+    with pytest.raises(DataError, match=r"unet: no \.safetensors file"):
+        load_prior(broken)
+
+
+def test_truncated_weights_and_foreign_autoencoders_are_refused(broken):
+    config = broken / "vae" / "config.json"
+    config.write_text(config.read_text().replace("PatchAutoencoder", "AsymmetricAutoencoderKL"))
+    with pytest.raises(DataError, match="must be one of AutoencoderKL, PatchAutoencoder, got 'Asymmetric"):
+        load_prior(broken)
+    config.write_text(config.read_text().replace("AsymmetricAutoencoderKL", "PatchAutoencoder"))
+    weights = next((broken / "unet").glob("*.safetensors"))
+    weights.write_bytes(weights.read_bytes()[:1000])
+    with pytest.raises(DataError, match="unet: cannot be loaded as UNet2DConditionModel"):
+        load_prior(broken)
+
+
+def test_missing_controlnet_is_named_before_training(broken):
+    check_prior_folder(broken, needs_controlnet=True)
+    shutil.rmtree(broken / "controlnet")
+    with pytest.raises(DataError, match="no subfolder 'controlnet'"):
+        check_prior_folder(broken, needs_controlnet=True)
+
+
+def test_bundled_prior_loads_and_is_small():
+    check_prior_folder(BUNDLED_PRIOR, needs_controlnet=True)
+    prior = load_prior()
+    assert prior.image_size == (64, 64) and prior.controlnet is not None
+    assert sum(path.stat().st_size for path in BUNDLED_PRIOR.rglob("*")) < 25e6
+    words = prior.tokenizer.tokenize("A photo of a moving human, a street light")
+    assert "human</w>" in words and "street</w>" in words
