@@ -4,10 +4,9 @@ import time
 
 import numpy as np
 import pytest
+from flow_scripts import digests, run_script
 
 from data_contracts.events import Events
-
-from .conftest import digests, run_script
 
 
 def refused(home, *arguments, preset="folder"):

@@ -1,10 +1,9 @@
 """The text route on real recordings: the published counts, and the whole chain."""
 
 import pytest
+from flow_scripts import REAL_RECORDINGS, run_script
 
 from data_contracts.manifest import ManifestRef, read_manifest
-
-from .conftest import run_script
 
 # From the published table of these files: events, duration, ON, OFF.
 PUBLISHED = {
@@ -24,14 +23,11 @@ SMALL = (
 
 @pytest.fixture(scope="module")
 def finished_home(tmp_path_factory, request):
-    from ..conftest import REAL_DATA
-
-    root = REAL_DATA / "events"
-    if not root.is_dir():
+    if not REAL_RECORDINGS.is_dir():
         pytest.skip("the real recordings are not beside this checkout")
     home = tmp_path_factory.mktemp("folder")
     finished = run_script(
-        "full_experiment", "--preset", "folder", "--set", f"dataset.options.root={root}", *SMALL, home=home
+        "full_experiment", "--preset", "folder", "--set", f"dataset.options.root={REAL_RECORDINGS}", *SMALL, home=home
     )
     assert finished.status == 0, finished.errors
     return home

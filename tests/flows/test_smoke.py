@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from flow_scripts import REPOSITORY, digests, run_script, script
 
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef, read_manifest
-
-from .conftest import REPOSITORY, digests, run_script, script
 
 # Everything but the report is a pure function of options and data: on one machine, digests must repeat exactly.
 # The report's digest covers the time each stage took.
