@@ -229,7 +229,7 @@ def format_column(cells: Sequence[Cell]) -> list[str]:
         if _is_fraction(cell) and math.isfinite(cell):
             shortest = f"{float(cell):.4g}"
             decimals = max(decimals, len(shortest.partition(".")[2]) if "e" not in shortest else 0)
-    return [_format(cell, min(decimals, 5)) for cell in cells]
+    return [_format(cell, decimals) for cell in cells]
 
 
 def _is_fraction(cell: object) -> TypeGuard[float]:

@@ -126,10 +126,10 @@ def test_columns_are_formatted_alike(cells, texts):
     assert format_column(cells) == texts
 
 
-@given(st.lists(st.floats(1e-3, 1e6), min_size=1, max_size=5))
-def test_formatting_keeps_three_significant_digits(values):
+@given(st.lists(st.floats(1e-4, 1e8), min_size=1, max_size=5))
+def test_formatting_keeps_four_significant_digits(values):
     for value, text in zip(values, format_column(values), strict=True):
-        assert float(text.replace(",", "")) == pytest.approx(value, rel=5.1e-4 if value < 1e3 else 1e-3)
+        assert float(text.replace(",", "")) == pytest.approx(value, rel=5.1e-4)
 
 
 def test_grid_enlarges_without_smoothing_and_leaves_missing_cells_clear():
