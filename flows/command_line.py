@@ -116,8 +116,8 @@ def main(
             print_plan(rows)
             return 0
         _use_cores(rows)
-        local_server.wait()
-        result = flow(options)
+        with local_server.connected():
+            result = flow(options)
     except (DataError, PluginError, ValidationError, FileNotFoundError, PermissionError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -18,6 +18,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 START_TIMEOUT_S = 300.0
@@ -29,6 +30,7 @@ _QUIET = {
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
 }
 _server: subprocess.Popen[bytes] | None = None
+_url = ""
 
 
 def configure(home: Path, *, verbose: bool) -> None:
@@ -42,7 +44,7 @@ def configure(home: Path, *, verbose: bool) -> None:
 
 def start(home: Path) -> None:
     """Start the private server in the background, unless the user named a server in PREFECT_API_URL."""
-    global _server
+    global _server, _url
     if os.environ.get("PREFECT_API_URL"):
         return
     with socket.socket() as probe:
@@ -58,25 +60,35 @@ def start(home: Path) -> None:
             command, env=environment, stdout=file, stderr=file, stdin=subprocess.DEVNULL, preexec_fn=_die_with_parent
         )
     atexit.register(stop)
-    os.environ["PREFECT_API_URL"] = f"http://127.0.0.1:{port}/api"
+    _url = f"http://127.0.0.1:{port}/api"
 
 
-def wait() -> None:
-    """Return when the server answers.
+@contextlib.contextmanager
+def connected() -> Iterator[None]:
+    """Inside this block Prefect talks to the private server, where one was started; waits until it answers.
 
     Raises:
         RuntimeError: it ended or did not answer in time; the message names its log.
     """
     if _server is None:
+        yield
         return
-    url = os.environ["PREFECT_API_URL"] + "/health"
+    _wait(_server)
+    from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+
+    # Heartbeats tell a server that outlives its runs that they crashed; this one does not, and each costs 0.7 s.
+    with temporary_settings({PREFECT_API_URL: _url, PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+        yield
+
+
+def _wait(server: subprocess.Popen[bytes]) -> None:
     log = Path(os.environ["PREFECT_HOME"]).parent / "logs" / "prefect_server.log"
     deadline = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline:
-        if _server.poll() is not None:
-            raise RuntimeError(f"the local Prefect server ended with code {_server.returncode}; see {log}")
+        if server.poll() is not None:
+            raise RuntimeError(f"the local Prefect server ended with code {server.returncode}; see {log}")
         try:
-            with urllib.request.urlopen(url, timeout=5) as response:
+            with urllib.request.urlopen(f"{_url}/health", timeout=5) as response:
                 if response.status == 200:
                     return
         except (urllib.error.URLError, OSError):
