@@ -7,7 +7,8 @@ from pathlib import Path
 from types import ModuleType
 
 from ctlev_core import plugins
-from data_contracts.events import DataError, Events
+from data_contracts.errors import DataError
+from data_contracts.events import Events
 
 
 def find_format(path: Path) -> ModuleType:

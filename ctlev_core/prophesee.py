@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_contracts.events import EVENT_DTYPES, DataError, Events, SensorSize, check_events
+from data_contracts.errors import DataError
+from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
 WORD_DTYPES = {"EVT2": np.dtype("<u4"), "EVT3": np.dtype("<u2")}
 MAX_SENSOR_SIZE = 2048

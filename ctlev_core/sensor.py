@@ -18,7 +18,8 @@ import numpy as np
 from pydantic import Field
 
 from data_contracts.config import Frozen
-from data_contracts.events import DataError, Events, SensorSize, check_events
+from data_contracts.errors import DataError
+from data_contracts.events import Events, SensorSize, check_events
 
 
 class SensorOptions(Frozen):

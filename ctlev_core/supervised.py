@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from data_contracts.events import DataError
+from ctlev_core.supervised_options import SupervisedOptions
+from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import History
 
 CHECKPOINT_NAME = "training.pt"
@@ -31,29 +32,6 @@ _STREAM_ORDER, _STREAM_STEP = 0, 1
 
 LossFunction = Callable[[np.ndarray, np.random.Generator], torch.Tensor]
 """Rows [B] of the training set and the random stream of this step -> scalar loss with a graph."""
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """How long and how fast to train.
-
-    Attributes:
-        num_steps: optimiser steps.
-        batch_size: samples a step.
-        learning_rate: peak of the linear warm-up; from there it falls linearly to nearly zero.
-        warmup_steps: steps until the peak.
-        weight_decay: of AdamW, on every parameter.
-        log_every: steps between two rows of the history; a row is the mean loss since the last one.
-        checkpoint_every: steps between two checkpoints.
-    """
-
-    num_steps: int
-    batch_size: int
-    learning_rate: float
-    warmup_steps: int
-    weight_decay: float
-    log_every: int = 10
-    checkpoint_every: int = 200
 
 
 def resolve_device(name: str) -> torch.device:
@@ -95,10 +73,10 @@ def batch_rows(count: int, batch_size: int, seed: int, step: int) -> np.ndarray:
     return rows
 
 
-def learning_rate_at(step: int, schedule: Schedule) -> float:
+def learning_rate_at(step: int, options: SupervisedOptions) -> float:
     """Linear warm-up times linear decay; positive at every step."""
-    warmup = min(1.0, (step + 1) / schedule.warmup_steps) if schedule.warmup_steps else 1.0
-    return schedule.learning_rate * warmup * (1 - step / schedule.num_steps)
+    warmup = min(1.0, (step + 1) / options.warmup_steps) if options.warmup_steps else 1.0
+    return options.learning_rate * warmup * (1 - step / options.num_steps)
 
 
 def build_seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:
@@ -112,7 +90,7 @@ def train_model(
     model: nn.Module,
     compute_loss: LossFunction,
     count: int,
-    schedule: Schedule,
+    options: SupervisedOptions,
     *,
     seed: int,
     work: Path,
@@ -125,7 +103,7 @@ def train_model(
         model: on its device, freshly initialised.
         compute_loss: the loss of given rows; it must draw random numbers from the generator it is given only.
         count: rows of the training set, at least 1.
-        schedule: budget and step sizes.
+        options: budget and step sizes.
         seed: of the order of the rows and of the augmentation.
         work: folder of the resumable state. A checkpoint with another `run_digest` is ignored and overwritten.
         run_digest: identity of data, options and seed.
@@ -133,38 +111,38 @@ def train_model(
     Returns:
         One row each `log_every` steps, and one for the last step.
     Raises:
-        FloatingPointError: the loss is not finite; the message names the step.
+        TrainingError: the loss is not finite; the message names the step.
     """
     work.mkdir(parents=True, exist_ok=True)
-    optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay)
     history, pending, first_step = _resume(work / CHECKPOINT_NAME, model, optimizer, run_digest)
     model.train()
     progress = tqdm(
-        total=schedule.num_steps, initial=first_step, desc=description, unit="step", leave=False, disable=None
+        total=options.num_steps, initial=first_step, desc=description, unit="step", leave=False, disable=None
     )
     with progress:
-        for step in range(first_step, schedule.num_steps):
+        for step in range(first_step, options.num_steps):
             for group in optimizer.param_groups:
-                group["lr"] = learning_rate_at(step, schedule)
-            rows = batch_rows(count, schedule.batch_size, seed, step)
+                group["lr"] = learning_rate_at(step, options)
+            rows = batch_rows(count, options.batch_size, seed, step)
             loss = compute_loss(rows, np.random.default_rng([seed, _STREAM_STEP, step]))
             value = loss.item()
             if not math.isfinite(value):
-                raise FloatingPointError(
-                    f"{description}: the loss is {value} at step {step} of {schedule.num_steps}; "
-                    f"lower learning_rate (now {schedule.learning_rate:g})"
+                raise TrainingError(
+                    f"{description}: the loss is {value} at step {step} of {options.num_steps}; "
+                    f"lower learning_rate (now {options.learning_rate:g})"
                 )
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
             pending.append(value)
             done = step + 1
-            if done % schedule.log_every == 0 or done == schedule.num_steps:
+            if done % options.log_every == 0 or done == options.num_steps:
                 history.step.append(done)
                 history.loss.append(sum(pending) / len(pending))
                 pending.clear()
                 progress.set_postfix(loss=f"{history.loss[-1]:.4g}", refresh=False)
-            if done % schedule.checkpoint_every == 0 and done < schedule.num_steps:
+            if done % options.checkpoint_every == 0 and done < options.num_steps:
                 _write_checkpoint(work / CHECKPOINT_NAME, model, optimizer, history, pending, done, run_digest)
             progress.update()
     return history

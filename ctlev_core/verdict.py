@@ -29,9 +29,8 @@ def verdict(rows: list[dict[str, Any]], settings: Sequence[str]) -> str:
     if not scored:
         return "No downstream model was scored."
     metric = scored[0]["metric"]
-    found = {
-        setting: [row for row in scored if row["setting"] == setting and row["metric"] == metric] for setting in settings
-    }
+    scored = [row for row in scored if row["metric"] == metric]
+    found = {setting: [row for row in scored if row["setting"] == setting] for setting in settings}
     parts = [f"{setting} {_value(found[setting]):.3f}" for setting in settings if found[setting]]
     summary = f"{metric} on held-out real data ({'lower' if lower_is_better(metric) else 'higher'} is better): "
     summary += ", ".join(parts) + "."

@@ -9,15 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_contracts.errors import DataError
+
 SensorSize = tuple[int, int]
 """(width, height) in pixels."""
 
 POLARITY_CHANNELS = ("positive", "negative")
 """Channel order of every array with a polarity axis: channel 0 = ON (p = 1), channel 1 = OFF (p = 0)."""
-
-
-class DataError(ValueError):
-    """Input data is wrong. The message says what, expected, got and where."""
 
 
 @dataclass(frozen=True, eq=False)

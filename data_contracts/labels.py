@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_contracts.events import DataError, SensorSize
+from data_contracts.errors import DataError
+from data_contracts.events import SensorSize
 
 SPLITS = ("train", "validation", "test", "condition")
 """`condition`: labels without events, used only as conditions to sample from. Fixed at ingest."""

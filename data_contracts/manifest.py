@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from data_contracts.config import Frozen
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History, Labels
 from data_contracts.tables import TABLES, TableSchema, check_table
 

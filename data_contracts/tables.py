@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.labels import SPLITS
 
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from ctlev_core import plugins
 from ctlev_core.plugins import PluginError, validate_options
-from data_contracts.events import DataError
+from data_contracts.errors import DataError, TrainingError
 from data_contracts.experiment import Experiment
 from flows import local_server
 from tasks.stage import PlannedStage, planning
@@ -118,7 +118,7 @@ def main(
         _use_cores(rows)
         with local_server.connected():
             result = flow(options)
-    except (DataError, PluginError, ValidationError, FileNotFoundError, PermissionError) as error:
+    except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -13,7 +13,7 @@ from ctlev_core.labelling import labels_at_windows
 from ctlev_core.windows import cut
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, concat_labels, label_columns, labels_of
 from tasks.stage import Output, stage

@@ -12,7 +12,7 @@ from ctlev_core import plugins
 from ctlev_core.intervals import cluster_bootstrap
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 

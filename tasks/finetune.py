@@ -11,7 +11,7 @@ import pyarrow as pa
 from ctlev_core import plugins
 from data_contracts import tables
 from data_contracts.config import GeneratorChoice
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest, conditions_of, history_table
 from tasks.stage import Output, stage
 

@@ -14,7 +14,8 @@ from ctlev_core import event_files, plugins
 from ctlev_core.plugins import Plugin
 from data_contracts import tables
 from data_contracts.config import DatasetChoice
-from data_contracts.events import DataError, check_events
+from data_contracts.errors import DataError
+from data_contracts.events import check_events
 from data_contracts.labels import Labels, Recording, check_labels
 from data_contracts.manifest import concat_labels, label_columns
 from tasks.stage import Output, stage

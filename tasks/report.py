@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from ctlev_core.html_report import Curves, ImageGrid, Section, Table, render_report
 
+from ctlev_core.html_report import Curves, ImageGrid, Section, Table, render_report
 from ctlev_core.verdict import lower_is_better, verdict
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest, ManifestRef

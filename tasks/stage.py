@@ -39,7 +39,7 @@ from pydantic import BaseModel
 
 from ctlev_core import plugins
 from data_contracts.config import Choice, cache_material
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
 from tasks.store import RawFileDigests, Store

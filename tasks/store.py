@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.manifest import RUN_FILE, ManifestRef, file_digest, read_manifest
 
 

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 BUNDLED_BODY = Path(__file__).with_name("procedural_body.npz")
 NUM_JOINTS = len(SMPL_JOINTS)

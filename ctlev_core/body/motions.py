@@ -16,7 +16,7 @@ from ctlev_core.body.keyframes import HELD_OUT, MOTIONS, SEEN, STANDING, UNSEEN,
 from ctlev_core.body.layer import NUM_JOINTS, joint_transforms, load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle, matrix_from_euler, slerp
 from ctlev_core.skeletons import SMPL_JOINTS
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 __all__ = ["HELD_OUT", "MOTIONS", "SEEN", "UNSEEN", "MotionStyle", "pose_at", "sample_pose", "sample_style"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from data_contracts.config import Frozen
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, Labels
 
 VERSION = 1

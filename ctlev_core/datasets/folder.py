@@ -23,7 +23,8 @@ from pydantic import Field
 
 from ctlev_core import event_files
 from data_contracts.config import RUN_SETTING, Frozen
-from data_contracts.events import DataError, Events
+from data_contracts.errors import DataError
+from data_contracts.events import Events
 from data_contracts.labels import Labels, Part, Recording
 
 VERSION = 1

@@ -19,7 +19,8 @@ from pydantic import Field
 from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.skeletons import SMPL_TO_DHP19
 from data_contracts.config import Frozen
-from data_contracts.events import DataError, Events
+from data_contracts.errors import DataError
+from data_contracts.events import Events
 from data_contracts.labels import Labels, Part, Recording, check_labels
 
 if TYPE_CHECKING:

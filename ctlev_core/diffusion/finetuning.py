@@ -37,6 +37,7 @@ from ctlev_core.diffusion.training import (
     validation_losses,
 )
 from data_contracts.config import cache_material
+from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History
 
 Tune = Literal["unet", "controlnet", "both"]
@@ -107,19 +108,19 @@ def cache_latents(prior: Prior, frames: np.ndarray, conditions: Conditions) -> L
 
 
 def check_training_data(frames: np.ndarray, conditions: Conditions, image_size: tuple[int, int]) -> None:
-    """Raise `ValueError` unless frames and conditions are images of the prior's size, one condition a frame."""
+    """Raise `DataError` unless frames and conditions are images of the prior's size, one condition a frame."""
     width, height = image_size
     arrays = {"frames": frames} if conditions.images is None else {"frames": frames, "conditions": conditions.images}
     for name, array in arrays.items():
         if array.ndim != 4 or array.shape[1:] != (height, width, 3) or array.dtype != np.uint8:
-            raise ValueError(
+            raise DataError(
                 f"{name} must be [N, {height}, {width}, 3] uint8, the size this prior was trained on, "
                 f"got {list(array.shape)} {array.dtype}; set the image size of the encoding"
             )
         if len(array) != len(conditions.prompts):
-            raise ValueError(f"{len(array)} {name} do not match {len(conditions.prompts)} prompts")
+            raise DataError(f"{len(array)} {name} do not match {len(conditions.prompts)} prompts")
     if len(frames) == 0:
-        raise ValueError("fine-tuning needs at least one frame, got none")
+        raise DataError("fine-tuning needs at least one frame, got none")
 
 
 def forget_weights(prior: Prior, seed: int) -> Prior:

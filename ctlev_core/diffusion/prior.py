@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder, find_controlnet
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 BUNDLED_PRIOR = Path(__file__).resolve().parents[1] / "priors" / "small"
 COMPONENTS = ("tokenizer", "text_encoder", "vae", "unet", "scheduler")

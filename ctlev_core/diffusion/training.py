@@ -21,14 +21,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ctlev_core.diffusion.options import TrainingOptions
+from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
 MAX_NON_FINITE = 10
 BETAS = (0.9, 0.999)
-
-
-class TrainingError(RuntimeError):
-    """Training cannot go on, or saved state does not belong to this run."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from data_contracts.config import RUN_SETTING, Frozen, cache_material
-from data_contracts.events import DataError
+from ctlev_core.supervised_options import SupervisedOptions
+from data_contracts.config import cache_material
+from data_contracts.errors import DataError
 from data_contracts.labels import History, Labels
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ VERSION = 1
 NAME = "classifier"
 
 
-class Options(Frozen):
+class Options(SupervisedOptions):
     """Network and training budget."""
 
     architecture: Literal["resnet10-quarter", "resnet10-half", "resnet18", "resnet34"] = Field(
@@ -38,21 +39,8 @@ class Options(Frozen):
     pretrained: str = Field(
         default="", description="folder of a published ResNet (transformers layout, same architecture) to start from"
     )
-    num_steps: int = Field(default=600, ge=1, description="optimiser steps; the paper does not state them")
-    batch_size: int = Field(default=32, ge=1, description="images a step")
     learning_rate: float = Field(default=2e-3, gt=0, description="peak of AdamW's learning rate")
-    warmup_steps: int = Field(default=40, ge=0, description="steps to the peak")
-    weight_decay: float = Field(default=1e-2, ge=0, description="of AdamW")
     flip: bool = Field(default=False, description="mirror half of the training images")
-    log_every: int = Field(
-        default=10, ge=1, description="steps a row of the loss history", json_schema_extra=RUN_SETTING
-    )
-    checkpoint_every: int = Field(
-        default=200, ge=1, description="steps between checkpoints", json_schema_extra=RUN_SETTING
-    )
-    device: str = Field(
-        default="auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING
-    )
 
 
 def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, out: Path, work: Path) -> History:
@@ -90,15 +78,7 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
         model,
         compute_loss,
         len(frames),
-        supervised.Schedule(
-            options.num_steps,
-            options.batch_size,
-            options.learning_rate,
-            options.warmup_steps,
-            options.weight_decay,
-            options.log_every,
-            options.checkpoint_every,
-        ),
+        options,
         seed=seed,
         work=work,
         run_digest=supervised.digest(NAME, VERSION, cache_material(options), seed, frames, targets),

@@ -16,8 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.skeletons import JOINT_SETS
-from data_contracts.config import RUN_SETTING, Frozen, cache_material
-from data_contracts.events import DataError
+from ctlev_core.supervised_options import SupervisedOptions
+from data_contracts.config import cache_material
+from data_contracts.errors import DataError
 from data_contracts.labels import History, Labels, check_labels
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ VERSION = 1
 NAME = "pose2d"
 
 
-class Options(Frozen):
+class Options(SupervisedOptions):
     """Network, loss, decoding and training budget."""
 
     width: float = Field(default=1.0, gt=0, description="factor on the channel counts; 1 = DHP19, 218,592 parameters")
@@ -48,24 +49,11 @@ class Options(Frozen):
         description="centre of the highest pixel (DHP19), centroid of the heatmap around it, or centroid of all of it",
     )
     num_steps: int = Field(default=20_000, ge=1, description="optimiser steps; the paper does not state them")
-    batch_size: int = Field(default=32, ge=1, description="images a step")
-    learning_rate: float = Field(default=1e-3, gt=0, description="peak of AdamW's learning rate")
-    warmup_steps: int = Field(default=40, ge=0, description="steps to the peak")
-    weight_decay: float = Field(default=1e-2, ge=0, description="of AdamW")
     flip: bool = Field(
         default=False, description="mirror half of the training images, with left and right joints exchanged"
     )
     shift_px: int = Field(
         default=0, ge=0, description="move training images by up to so many px in x and y; black moves in"
-    )
-    log_every: int = Field(
-        default=10, ge=1, description="steps a row of the loss history", json_schema_extra=RUN_SETTING
-    )
-    checkpoint_every: int = Field(
-        default=200, ge=1, description="steps between checkpoints", json_schema_extra=RUN_SETTING
-    )
-    device: str = Field(
-        default="auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING
     )
 
 
@@ -108,15 +96,7 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
         model,
         compute_loss,
         len(grey),
-        supervised.Schedule(
-            options.num_steps,
-            options.batch_size,
-            options.learning_rate,
-            options.warmup_steps,
-            options.weight_decay,
-            options.log_every,
-            options.checkpoint_every,
-        ),
+        options,
         seed=seed,
         work=work,
         run_digest=supervised.digest(NAME, VERSION, cache_material(options), seed, grey, joints2d, visible),

@@ -16,7 +16,8 @@ import numpy as np
 from pydantic import Field, PositiveInt
 
 from data_contracts.config import Frozen
-from data_contracts.events import DataError, Events, SensorSize
+from data_contracts.errors import DataError
+from data_contracts.events import Events, SensorSize
 
 VERSION = 1
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_contracts.events import DataError, Events, check_events
+from data_contracts.errors import DataError
+from data_contracts.events import Events, check_events
 
 VERSION = 1
 SUFFIXES = (".aedat4",)

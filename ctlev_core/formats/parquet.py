@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_contracts.events import EVENT_DTYPES, DataError, Events, check_events
+from data_contracts.errors import DataError
+from data_contracts.events import EVENT_DTYPES, Events, check_events
 
 VERSION = 1
 SUFFIXES = (".parquet",)

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 # Name -> blocks per stage, channels per stage, channels of the first convolution; basic (two-convolution) blocks.
 ARCHITECTURES: dict[str, dict[str, Any]] = {

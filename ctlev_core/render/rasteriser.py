@@ -12,7 +12,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 NEAR_M = 0.05
 

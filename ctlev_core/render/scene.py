@@ -12,7 +12,7 @@ from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, shape_
 from ctlev_core.camera import Camera, project
 from ctlev_core.render.rasteriser import NEAR_M, rasterise
 from ctlev_core.skeletons import SMPL_JOINTS
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 __all__ = [
     "Camera", "CameraRange", "Light", "Subject", "project", "render_body_frames", "render_person",

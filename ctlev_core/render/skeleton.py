@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ctlev_core.skeletons import JOINT_SETS
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 # The hue wheel of OpenPose-18, RGB: limb i has colour i, joint i of OpenPose's order has colour i.
 COLOURS = (

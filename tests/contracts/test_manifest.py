@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 
 from data_contracts import tables
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_labels
 from data_contracts.manifest import (
     ManifestRef,

@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 
 from data_contracts import tables
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.tables import check_table
 
 

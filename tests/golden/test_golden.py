@@ -81,6 +81,4 @@ def test_output_is_the_one_of_this_version(kind, name, tmp_path):
 
 def test_order_of_sampled_conditions_is_pinned():
     found = digest(balanced_choice(("a", "b", "b", "c", "a", "b"), 20, seed=7))
-    assert DIGESTS.get("balanced_choice") == found, (
-        f'balanced_choice is now "{found}"; see the head of this file'
-    )
+    assert DIGESTS.get("balanced_choice") == found, f'balanced_choice is now "{found}"; see the head of this file'

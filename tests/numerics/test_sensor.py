@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.sensor import PRESETS, SensorOptions, sample_pixel_maps, simulate_events
-from data_contracts.events import DataError, check_events
+from data_contracts.errors import DataError
+from data_contracts.events import check_events
 
 IDEAL = PRESETS["ideal"]
 

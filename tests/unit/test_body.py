@@ -9,7 +9,7 @@ import trimesh
 from ctlev_core.body import layer, motions, procedural
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 BODY = layer.load_body()
 STILL = np.zeros((24, 3))

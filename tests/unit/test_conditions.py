@@ -7,7 +7,7 @@ from ctlev_core.conditions import skeleton, text
 from ctlev_core.plugins import PluginError, load_options
 from ctlev_core.render.skeleton import draw_skeleton
 from data_contracts.config import ConditionChoice
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from ctlev_core import supervised
 from ctlev_core.downstream import classifier, pose2d
 from ctlev_core.skeletons import JOINT_SETS
-from data_contracts.events import DataError
+from ctlev_core.supervised_options import SupervisedOptions
+from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import Labels
 
 FAST_POSE = {
@@ -163,7 +164,7 @@ def test_training_leaves_inputs_and_the_global_random_state_alone(tmp_path):
 def test_loss_that_is_not_finite_stops_the_training(tmp_path):
     frames, labels = blobs(20)
     options = pose2d.Options(**{**FAST_POSE, "learning_rate": 1e30, "batch_norm": False}, num_steps=20)
-    with pytest.raises(FloatingPointError, match=r"at step \d+ of 20; lower learning_rate"):
+    with pytest.raises(TrainingError, match=r"at step \d+ of 20; lower learning_rate"):
         pose2d.train(frames, labels, options, seed=0, out=tmp_path / "m", work=tmp_path / "w")
     assert not (tmp_path / "m").exists()
 
@@ -249,10 +250,10 @@ def test_batches_walk_through_permutations(count, batch_size, seed):
 
 
 def test_learning_rate_warms_up_and_falls():
-    schedule = supervised.Schedule(100, 1, 0.5, 10, 0.0)
+    schedule = SupervisedOptions(num_steps=100, learning_rate=0.5, warmup_steps=10)
     rates = [supervised.learning_rate_at(step, schedule) for step in range(100)]
     assert rates[0] == pytest.approx(0.05) and max(rates) == rates[9] and min(rates[9:]) == rates[-1] > 0
-    assert supervised.learning_rate_at(0, supervised.Schedule(100, 1, 0.5, 0, 0.0)) == 0.5
+    assert supervised.learning_rate_at(0, SupervisedOptions(num_steps=100, learning_rate=0.5, warmup_steps=0)) == 0.5
 
 
 def test_classifier_learns_stripes_and_gives_features(tmp_path):

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ctlev_core.encodings.event_histogram import Options, encode, map_points, render_image
-from data_contracts.events import DataError, Events
+from data_contracts.errors import DataError
+from data_contracts.events import Events
 
 
 def make_events(rows: list[tuple[int, int, int]], sensor_size: tuple[int, int] = (4, 3)) -> Events:

@@ -11,7 +11,8 @@ from pydantic import ValidationError
 from ctlev_core import plugins
 from ctlev_core.datasets import folder
 from data_contracts.config import DatasetChoice, cache_material
-from data_contracts.events import DataError, Events
+from data_contracts.errors import DataError
+from data_contracts.events import Events
 from data_contracts.labels import Part, check_labels
 
 

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core import event_files, plugins, prophesee, prophesee_decoding
-from data_contracts.events import DataError, Events
+from data_contracts.errors import DataError
+from data_contracts.events import Events
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "events"
 REAL_AEDAT4 = REAL / "person" / "tonic_sample.aedat4"

@@ -10,7 +10,7 @@ from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, export, new_prior, pretrain
 from ctlev_core.diffusion.prior import load_prior
 from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object
-from ctlev_core.diffusion.training import TrainingError
+from data_contracts.errors import TrainingError
 
 TINY = PretrainingOptions(
     training=TrainingOptions(num_steps=4, batch_size=4, warmup_steps=1, log_every=1, validation_every=2, ema_decay=0.5),

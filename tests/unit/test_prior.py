@@ -13,7 +13,7 @@ from tiny_prior import SIDE, make_prior, shared_prior
 
 from ctlev_core.diffusion.prior import encode_prompts, load_prior, save_prior
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 
 @pytest.fixture(scope="module")

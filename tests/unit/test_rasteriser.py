@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ctlev_core.camera import Camera, is_inside, project
 from ctlev_core.render.rasteriser import NEAR_M, render_attributes, vertex_normals
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 SIZE = (24, 18)
 K = np.array([[20.0, 0, 12.3], [0, 22.0, 8.7], [0, 0, 1]])

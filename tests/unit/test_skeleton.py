@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ctlev_core.render import skeleton
 from ctlev_core.render.skeleton import draw_skeleton
 from ctlev_core.skeletons import JOINT_SETS
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 
 NAMES = JOINT_SETS["dhp19"].joints
 SIZE = (64, 64)

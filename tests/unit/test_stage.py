@@ -15,7 +15,7 @@ from pydantic import Field
 from ctlev_core.plugins import PluginError
 from data_contracts import tables
 from data_contracts.config import RUN_SETTING, DatasetChoice, Frozen, Windows, cache_material
-from data_contracts.events import DataError
+from data_contracts.errors import DataError
 from data_contracts.manifest import read_manifest
 from tasks.stage import planning, stage
 from tasks.store import Store

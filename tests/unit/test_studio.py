@@ -10,7 +10,8 @@ import pytest
 
 from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.datasets import studio
-from data_contracts.events import DataError, check_events
+from data_contracts.errors import DataError
+from data_contracts.events import check_events
 from data_contracts.labels import check_labels
 
 OPTIONS = studio.Options(num_train_recordings=24, num_test_recordings=40, num_condition_recordings=26)

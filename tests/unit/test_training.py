@@ -16,10 +16,10 @@ from ctlev_core.diffusion.training import (
     Batch,
     Denoiser,
     NoiseSchedule,
-    TrainingError,
     generator_for,
     sample_rows,
 )
+from data_contracts.errors import TrainingError
 from data_contracts.labels import Conditions
 
 OPTIONS = FineTuningOptions(num_steps=6, batch_size=4, warmup_steps=2, log_every=2, num_validation=0, ema_decay=0.5)
