@@ -144,6 +144,14 @@ class Metric(Protocol):
         ...
 
 
+class MetricOfRows(Metric, Protocol):
+    """A metric that is a mean over rows, so that two models can be compared row by row."""
+
+    def compute_rows(self, predicted: Any, target: Any, options: Any) -> np.ndarray:
+        """One score a row [N], NaN where a row has none."""
+        ...
+
+
 @dataclass(frozen=True)
 class Plugin:
     """A loaded plug-in together with its validated options."""

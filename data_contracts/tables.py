@@ -190,15 +190,25 @@ SCORES = TableSchema(
         Column("data_digest", pa.string(), "manifest digest of the data it was scored on"),
     ),
 )
+SAMPLE_SCORES = TableSchema(
+    "sample_scores",
+    1,
+    None,
+    (
+        Column("sample_id", pa.string(), "the join key"),
+        _RECORDING,
+        Column("metric", pa.string(), "metric plug-in"),
+        Column("value", pa.float64(), "score of this sample alone; missing where it has none", nullable=True),
+    ),
+)
 REPORT = TableSchema(
     "report",
     1,
     None,
     (Column("table", pa.string(), "name of a table of the report"), Column("file", pa.string(), "its Parquet file")),
 )
-TABLES = {
-    t.name: t for t in (RECORDINGS, PARTS, LABELS, FRAMES, CONDITIONS, TRAINING, SYNTHETIC, SCORES, REPORT)
-}  # fmt: skip
+_ALL = (RECORDINGS, PARTS, LABELS, FRAMES, CONDITIONS, TRAINING, SYNTHETIC, SCORES, SAMPLE_SCORES, REPORT)
+TABLES = {schema.name: schema for schema in _ALL}
 
 
 def check_table(table: pa.Table, schema: TableSchema, where: str) -> pa.Table:

@@ -17,7 +17,7 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 
-@stage(version=1, schema=tables.SCORES)
+@stage(version=2, schema=tables.SCORES)
 def score_model(
     out: Output,
     model: Manifest,
@@ -30,7 +30,10 @@ def score_model(
     split: str,
     seed: int,
 ) -> pa.Table:
-    """Every metric on one split, for all rows and for each class, with an interval over recordings."""
+    """Every metric on one split, for all rows and for each class, with an interval over recordings.
+
+    Beside the table lie the scores of the single samples, from which two models can be compared in pairs.
+    """
     plugin = plugins.load_options(downstream)
     rows = data.rows_where(split=split)
     if len(rows) == 0:
@@ -49,8 +52,14 @@ def score_model(
         "data_digest": data.ref.digest,
     }
     found: list[dict[str, Any]] = []
+    sample_scores: list[pa.Table] = []
+    sample_ids = [data.column("sample_id")[row] for row in rows]
     for choice in metrics:
         metric = plugins.load_options(choice)
+        if hasattr(metric.module, "compute_rows"):
+            values = metric.module.compute_rows(prediction, labels, metric.options)
+            columns = {"sample_id": sample_ids, "recording_id": recordings, "metric": [metric.name] * len(rows)}
+            sample_scores.append(pa.table({**columns, "value": pa.array(values, pa.float64(), from_pandas=True)}))
         for group, members in _groups(labels.class_names):
             scores, low, high = _score(metric, prediction, labels.take(members), members, recordings[members])
             found += [
@@ -65,6 +74,8 @@ def score_model(
                 }
                 for name, value in scores.items()
             ]
+    if sample_scores:
+        out.write_table(pa.concat_tables(sample_scores), tables.SAMPLE_SCORES)
     return pa.Table.from_pylist(found, schema=tables.SCORES.arrow())
 
 

@@ -13,7 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.html_report import Curves, ImageGrid, Section, Table, render_report
-from ctlev_core.verdict import lower_is_better, verdict
+from ctlev_core.intervals import bootstrap_interval
+from ctlev_core.verdict import Difference, lower_is_better, verdict
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest, ManifestRef
 from tasks.stage import Output, stage
@@ -49,11 +50,32 @@ def report(
         _recordings_table(recordings, frames),
         _cost_table([recordings, frames, conditions, checkpoint, synthetic, *models, *scores]),
     ]
-    page = render_report(title=title, lead=notice, verdict=verdict(rows, settings), sections=sections)
+    page = render_report(
+        title=title, lead=notice, verdict=verdict(rows, settings, _difference(scores)), sections=sections
+    )
     (out.folder / "report.html").write_text(page, encoding="utf-8")
     pq.write_table(all_scores, out.folder / "scores.parquet")
     pq.write_table(recordings.table, out.folder / "recordings.parquet")
     return pa.table({"table": ["scores", "recordings"], "file": ["scores.parquet", "recordings.parquet"]})
+
+
+def _difference(scores: list[Manifest]) -> Difference | None:
+    """Real + synthetic minus real, sample by sample over the same test data, with its interval over recordings."""
+    values: dict[str, list[np.ndarray]] = {"real": [], "real+synthetic": []}
+    recordings: list[str] = []
+    for manifest in scores:
+        setting = manifest.column("setting")[0]
+        if setting in values and f"{tables.SAMPLE_SCORES.name}.parquet" in manifest.files:
+            table = manifest.attached(tables.SAMPLE_SCORES)
+            first = [name == table["metric"][0].as_py() for name in table["metric"].to_pylist()]
+            table = table.filter(pa.array(first))
+            values[setting].append(table["value"].to_numpy(zero_copy_only=False))
+            recordings = table["recording_id"].to_pylist()
+    if not all(values.values()):
+        return None
+    real, mixed = (np.mean(np.stack(of_seeds), axis=0) for of_seeds in values.values())
+    low, high = bootstrap_interval(mixed - real, recordings)
+    return Difference(float(np.nanmean(mixed - real)), low, high)
 
 
 def publish_report(ref: ManifestRef, home: Path, name: str) -> str:

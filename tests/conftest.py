@@ -10,7 +10,14 @@ import pytest
 
 from data_contracts.events import Events
 
-for _name, _value in {"HF_HUB_OFFLINE": "1", "DO_NOT_TRACK": "1", "TRANSFORMERS_VERBOSITY": "error"}.items():
+# Sleeping OpenMP threads: spinning ones slow the tests several times on a busy machine.
+_ENVIRONMENT = {
+    "HF_HUB_OFFLINE": "1",
+    "DO_NOT_TRACK": "1",
+    "TRANSFORMERS_VERBOSITY": "error",
+    "OMP_WAIT_POLICY": "PASSIVE",
+}
+for _name, _value in _ENVIRONMENT.items():
     os.environ.setdefault(_name, _value)
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.verdict import lower_is_better, verdict
+from ctlev_core.verdict import Difference, lower_is_better, verdict
 from tasks.condition import balanced_choice
 
 
@@ -28,34 +28,32 @@ def test_balanced_choice_of_more_rows_starts_with_the_same_rows():
     np.testing.assert_array_equal(balanced_choice(names, 6, 3), balanced_choice(names, 12, 3)[:6])
 
 
-def row(setting, value, low=None, high=None, metric="mpjpe2d_px", seed=0):
-    return {
-        "setting": setting,
-        "group": "all",
-        "metric": metric,
-        "value": value,
-        "low": low,
-        "high": high,
-        "seed": seed,
-    }
+def row(setting, value, metric="mpjpe2d_px"):
+    return {"setting": setting, "group": "all", "metric": metric, "value": value}
 
 
 SETTINGS = ("real", "synthetic", "real+synthetic")
+ROWS = [row("real", 7.0), row("real", 7.2), row("synthetic", 8.0), row("real+synthetic", 6.3)]
 
 
-def test_verdict_says_better_only_with_its_certainty():
-    rows = [row("real", 7.0, 6.8, 7.2), row("synthetic", 8.0, 7.0, 9.0), row("real+synthetic", 6.3, 6.1, 6.5)]
-    text = verdict(rows, SETTINGS)
-    assert "real 7.000, synthetic 8.000, real+synthetic 6.300" in text and "lower is better" in text
-    assert "10.0% better; the intervals do not overlap" in text
-    overlapping = [*rows[:2], row("real+synthetic", 6.3, 6.1, 6.9)]
-    assert "10.0% better; the intervals overlap, so this alone decides nothing" in verdict(overlapping, SETTINGS)
+def test_verdict_averages_seeds_and_says_which_way_is_better():
+    text = verdict(ROWS, SETTINGS)
+    assert "real 7.100, synthetic 8.000, real+synthetic 6.300." in text and "lower is better" in text
 
 
-@pytest.mark.parametrize(("metric", "expected"), [("accuracy", "worse"), ("mpjpe2d_px", "better")])
-def test_verdict_knows_which_way_is_better(metric, expected):
-    rows = [row("real", 0.8, metric=metric), row("real+synthetic", 0.6, metric=metric)]
-    assert f"25.0% {expected}" in verdict(rows, SETTINGS)
+@pytest.mark.parametrize(
+    ("metric", "difference", "expected"),
+    [
+        ("mpjpe2d_px", Difference(-0.8, -1.0, -0.6), "better: paired difference -0.800 [-1.000, -0.600]"),
+        ("mpjpe2d_px", Difference(0.8, 0.6, 1.0), "worse: paired difference +0.800"),
+        ("accuracy", Difference(0.8, 0.6, 1.0), "better: paired difference +0.800"),
+        ("mpjpe2d_px", Difference(-0.8, -1.7, 0.1), "undecided: paired difference -0.800 [-1.700, +0.100]"),
+        ("mpjpe2d_px", Difference(-0.8, float("nan"), float("nan")), "too few test recordings to say"),
+    ],
+)
+def test_verdict_claims_only_what_the_interval_of_the_difference_shows(metric, difference, expected):
+    rows = [{**one, "metric": metric} for one in ROWS]
+    assert expected in verdict(rows, SETTINGS, difference)
 
 
 def test_directions():
