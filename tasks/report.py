@@ -12,9 +12,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.html_report import Curves, ImageGrid, Section, Table, render_report
 from ctlev_core.intervals import bootstrap_interval
-from ctlev_core.verdict import Difference, lower_is_better, verdict
+from ctlev_core.report.html import Curves, ImageGrid, Section, Table, render_report
+from ctlev_core.report.verdict import Difference, lower_is_better, verdict
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest, ManifestRef
 from tasks.stage import Output, stage

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.figures import curves_svg, image_grid_png, series_style
-from ctlev_core.html_report import Curves, ImageGrid, Table, Text, format_column, render_report
+from ctlev_core.report.figures import curves_svg, image_grid_png, series_style
+from ctlev_core.report.html import Curves, ImageGrid, Table, Text, format_column, render_report
 
 HOSTILE = "<script>alert(\"1\")</script> & 'x' http://example.org"
 VOID = {"meta", "img", "br"}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.verdict import Difference, lower_is_better, verdict
+from ctlev_core.report.verdict import Difference, lower_is_better, verdict
 from tasks.condition import balanced_choice
 
 

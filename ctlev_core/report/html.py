@@ -15,8 +15,8 @@ from typing import TypeGuard
 
 import numpy as np
 
-from ctlev_core import figures
-from ctlev_core.report_style import SCRIPT, STYLE
+from ctlev_core.report import figures
+from ctlev_core.report.style import SCRIPT, STYLE
 
 Cell = str | float | int | bool | None
 NO_VALUE = "–"
