@@ -155,7 +155,7 @@ SYNTHETIC = TableSchema(
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),
-        Column("recording_id", pa.string(), "always `synthetic`"),
+        Column("recording_id", pa.string(), "its own for every frame: no two share a scene or a sensor"),
         Column("condition_id", pa.string(), "sample_id of the condition it was made from"),
         Column("source_id", pa.string(), "the frame or label moment behind the condition"),
         _SUBJECT,

@@ -25,16 +25,17 @@ def sample(out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling:
     out.write_array("frames", frames)
     options: dict[str, Any] = plugin.options.model_dump()
     same = {
-        "recording_id": "synthetic",
         "split": "train",
         "generator": f"{plugin.name} {plugin.version}",
         "checkpoint_digest": checkpoint.ref.digest,
         "scheduler": options["scheduler"],
     }
+    names = [f"synthetic/{row:06d}" for row in range(count)]
     carried = ("source_id", "subject", "class_name", "prompt", "joint_set", "joints2d_px", "visible")
     return pa.table(
         {
-            "sample_id": [f"synthetic/{row:06d}" for row in range(count)],
+            "sample_id": names,
+            "recording_id": names,
             "condition_id": conditions.table["sample_id"],
             **{name: conditions.table[name] for name in carried},
             **{name: pa.array([value] * count, pa.string()) for name, value in same.items()},
