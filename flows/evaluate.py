@@ -56,7 +56,7 @@ def evaluate(
                     score_model(
                         model,
                         data,
-                        training_sets[setting] if split == "test" else [],
+                        training_sets[setting],
                         downstream=experiment.downstream,
                         metrics=list(experiment.metrics),
                         setting=row,

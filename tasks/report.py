@@ -41,10 +41,12 @@ def report(
     """Write `report.html`, `scores.parquet` and `recordings.parquet`."""
     all_scores = pa.concat_tables([manifest.table for manifest in scores])
     rows = all_scores.to_pylist()
+    headline, *details = _score_tables(rows, settings)
     sections: list[Section] = [
-        *_score_tables(rows, settings),
+        headline,
         _grid("Asked for, and sampled", conditions, synthetic),
         _real_grid(frames),
+        *details,
         _curves("Fine-tuning of the generator", [checkpoint], ["generator"]),
         _curves("Downstream training", models, model_names),
         _recordings_table(recordings, frames),
