@@ -75,7 +75,10 @@ class SamplingOptions(Frozen):
         default=20, gt=0, le=1000, description="evaluations of the network an image; paper: 1000"
     )
     guidance_scale: float = Field(default=1.0, ge=1, description="classifier-free guidance; 1 = none, twice as fast")
-    monochrome: bool = Field(default=False, description="average the channels: for encodings that discard polarity")
+    palette: Literal["rgb", "red_blue", "grey"] = Field(
+        default="rgb",
+        description="colours an event image can have: red_blue = green set to 0, grey = channels averaged (no polarity)",
+    )
     dark_level: int = Field(
         default=20,
         ge=0,

@@ -144,8 +144,10 @@ def decode_frames(prior: Prior, latents: Tensor, options: SamplingOptions) -> np
     """Frames [B, H, W, 3] uint8 of scaled latents; dark values become exactly 0."""
     images = prior.vae.decode((latents / prior.scaling_factor).to(prior.vae.dtype)).sample.float()
     values = ((images + 1) * 127.5).clamp(0, 255)
-    if options.monochrome:
+    if options.palette == "grey":
         values = values.mean(dim=1, keepdim=True).expand_as(values)
+    elif options.palette == "red_blue":
+        values = values * torch.tensor([1.0, 0.0, 1.0], device=values.device)[:, None, None]
     values = torch.where(values < options.dark_level, 0.0, values)
     return values.round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
 

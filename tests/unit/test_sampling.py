@@ -72,7 +72,7 @@ def test_killed_run_reuses_finished_shards(tmp_path, monkeypatch):
 def test_shards_of_other_options_or_checkpoints_are_not_reused(tmp_path):
     conditions = conditions_of(2)
     first = sample_frames(shared_prior(), conditions, FAST, seeds=[0, 1], work=tmp_path, identity="a")
-    monochrome = FAST.model_copy(update={"monochrome": True})
+    monochrome = FAST.model_copy(update={"palette": "grey"})
     assert not np.array_equal(
         first, sample_frames(shared_prior(), conditions, monochrome, seeds=[0, 1], work=tmp_path, identity="a")
     )
@@ -132,14 +132,16 @@ def test_unknown_scheduler_is_named():
         make_scheduler("euler", shared_prior().scheduler_config, 20)
 
 
-def test_dark_level_and_monochrome():
+def test_dark_level_and_palette():
     prior = shared_prior()
     images = torch.tensor([10.0, 30.0, 200.0])[None, :, None, None].expand(1, 3, 8, 8) / 127.5 - 1
     latents = prior.vae.encode(images)[0].mode() * prior.scaling_factor
     colour = decode_frames(prior, latents, SamplingOptions(dark_level=20))
     assert colour[0, 0, 0].tolist() == [0, 30, 200]
-    grey = decode_frames(prior, latents, SamplingOptions(dark_level=20, monochrome=True))
+    grey = decode_frames(prior, latents, SamplingOptions(dark_level=20, palette="grey"))
     assert grey[0, 0, 0].tolist() == [80, 80, 80]
+    red_blue = decode_frames(prior, latents, SamplingOptions(dark_level=0, palette="red_blue"))
+    assert red_blue[0, 0, 0].tolist() == [10, 0, 200]
     beyond = decode_frames(prior, 3 * latents, SamplingOptions(dark_level=0))
     assert beyond[0, 0, 0, 2] == 255, "values are clipped, not wrapped"
 
@@ -191,7 +193,7 @@ def test_generators_train_and_sample(tmp_path, module):
     assert history.step == [1, 2, 3]
     checkpoint = load_prior(tmp_path / "checkpoint")
     assert (checkpoint.controlnet is not None) == (module is controlnet)
-    settings = module.SampleOptions(num_inference_steps=2, monochrome=True)
+    settings = module.SampleOptions(num_inference_steps=2, palette="grey")
     sampled = module.sample(
         tmp_path / "checkpoint", conditions, settings, seeds=range(len(frames)), work=tmp_path / "shards"
     )
