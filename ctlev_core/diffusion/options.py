@@ -77,7 +77,7 @@ class SamplingOptions(Frozen):
     guidance_scale: float = Field(default=1.0, ge=1, description="classifier-free guidance; 1 = none, twice as fast")
     palette: Literal["rgb", "red_blue", "grey"] = Field(
         default="rgb",
-        description="colours an event image can have: red_blue = green set to 0, grey = channels averaged (no polarity)",
+        description="colours event images have: red_blue = no green, grey = channels averaged (no polarity)",
     )
     dark_level: int = Field(
         default=20,
