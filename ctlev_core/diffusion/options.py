@@ -33,7 +33,10 @@ class TrainingOptions(Frozen):
         default=0.995, ge=0, lt=1, description="of the averaged weights that are kept; 0 = no averaging"
     )
     snr_gamma: float | None = Field(
-        default=5.0, gt=0, description="min-SNR loss weights (Hang et al., ICCV 2023); null = plain"
+        default=None,
+        gt=0,
+        description="min-SNR loss weights (Hang et al., ICCV 2023); null = plain; with "
+        "v-prediction min-SNR hardly trains the noisy steps, which decide layout and prompt",
     )
     log_every: int = Field(default=20, gt=0, description="steps between two points of the loss curve")
     validation_every: int = Field(default=400, gt=0, description="steps between two points of the validation curve")

@@ -8,7 +8,7 @@ import json
 import logging
 import math
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -19,8 +19,8 @@ from pydantic import Field
 from ctlev_core.diffusion import procedural_images
 from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
-from ctlev_core.diffusion.prior import Prior, conditions_to_tensor, images_to_tensor, save_prior
-from ctlev_core.diffusion.small_prior import IMAGE_SIZE, WIDTHS, build_prior
+from ctlev_core.diffusion.prior import Prior, conditions_to_tensor, images_to_tensor, load_prior, save_prior
+from ctlev_core.diffusion.small_prior import IMAGE_SIZE, SCHEDULER_CONFIG, WIDTHS, build_prior
 from ctlev_core.diffusion.training import (
     Batch,
     Denoiser,
@@ -48,8 +48,6 @@ class PretrainingOptions(Frozen):
         default=TrainingOptions(
             num_steps=40_000,
             ema_decay=0.999,
-            # Above the usual 5: the quiet channels of the patch code are decided at higher signal-to-noise ratios.
-            snr_gamma=10.0,
             warmup_steps=200,
             final_learning_rate=0.0,
             validation_every=500,
@@ -67,6 +65,9 @@ class PretrainingOptions(Frozen):
     condition_dropout: float = Field(default=0.1, ge=0, le=1, description="share of people without their skeleton")
     image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
     widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
+    start: Path | None = Field(
+        default=None, description="diffusers folder of a small prior to go on from; random weights when null"
+    )
     seed: int = Field(default=0, ge=0, description="of weights, pictures, order and noise")
     workers: int = Field(
         default=1, ge=0, json_schema_extra=RUN_SETTING, description="processes that draw; 0 = in the same one"
@@ -157,7 +158,9 @@ def draw_validation_rows(options: PretrainingOptions) -> list[Row]:
 
 
 def new_prior(options: PretrainingOptions) -> Prior:
-    """The untrained prior: fitted patch code, trained tokenizer, random networks."""
+    """The prior before training: fitted patch code, trained tokenizer and random networks, or those of `start`."""
+    if options.start is not None:
+        return replace(load_prior(options.start), scheduler_config=dict(SCHEDULER_CONFIG))
     scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
     rng = np.random.default_rng([options.seed, STYLE_STREAM])
     images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
@@ -241,10 +244,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="diffusers folder to write")
     parser.add_argument("--work", type=Path, required=True, help="folder of the resumable state")
     parser.add_argument("--minutes", type=float, default=60.0, help="wall-clock budget")
+    parser.add_argument("--start", type=Path, help="diffusers folder to go on from")
     parser.add_argument("--export", action="store_true", help="only write what is in --work so far")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    options = PretrainingOptions(max_seconds=60 * arguments.minutes)
+    options = PretrainingOptions(max_seconds=60 * arguments.minutes, start=arguments.start)
     torch.set_num_threads(1)
     if arguments.export:
         export(options, arguments.out, arguments.work)
