@@ -34,9 +34,21 @@ def refused(home, *arguments, preset="folder"):
     ],
 )
 def test_wrong_command_line(tmp_path, arguments, expected):
-    line, _ = refused(tmp_path, *arguments, preset="smoke")
+    line, _ = refused(tmp_path, *arguments, "--dry-run", preset="smoke")
     assert expected in line
     assert not (tmp_path / "artefacts").exists()
+
+
+def test_wrong_option_stops_a_real_run_too(tmp_path):
+    line, _ = refused(tmp_path, "--set", "num_synthetic=-5", preset="smoke")
+    assert "option 'num_synthetic': input should be greater than 0, got -5" in line
+    assert not (tmp_path / "artefacts").exists()
+
+
+def test_home_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    finished = run_script("full_experiment", "--preset", "smoke", "--home", str(tmp_path / "file" / "x"), home=tmp_path)
+    assert finished.status == 2 and "the home folder cannot be written" in finished.errors
 
 
 def make_recording(path, *, t=None, x=None):
