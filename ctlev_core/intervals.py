@@ -13,6 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+MIN_RECORDINGS = 5
+"""With fewer test recordings a bootstrap over them says too little: the tables then give no interval."""
+
 _CHUNK_NUMBERS = 4_000_000
 
 

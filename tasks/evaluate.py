@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.intervals import cluster_bootstrap
+from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
@@ -17,7 +17,7 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 
-@stage(version=2, schema=tables.SCORES)
+@stage(version=3, schema=tables.SCORES)
 def score_model(
     out: Output,
     model: Manifest,
@@ -98,6 +98,8 @@ def _score(
         return metric.module.compute(picked, labels.take(chosen), metric.options)
 
     scores = compute(np.arange(len(members)))
+    if len(set(recordings.tolist())) < MIN_RECORDINGS:
+        return scores, {}, {}
     low, high = cluster_bootstrap(compute, recordings)
     return scores, low, high
 

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.intervals import bootstrap_interval
+from ctlev_core.intervals import MIN_RECORDINGS, bootstrap_interval
 from ctlev_core.report.html import Curves, ImageGrid, Section, Table, render_report
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
 from data_contracts import tables
@@ -76,7 +76,9 @@ def _difference(scores: list[Manifest]) -> Difference | None:
     if not all(values.values()):
         return None
     real, mixed = (np.mean(np.stack(of_seeds), axis=0) for of_seeds in values.values())
-    low, high = bootstrap_interval(mixed - real, recordings)
+    low = high = float("nan")
+    if len(set(recordings)) >= MIN_RECORDINGS:
+        low, high = bootstrap_interval(mixed - real, recordings)
     return Difference(float(np.nanmean(mixed - real)), low, high)
 
 

@@ -53,6 +53,8 @@ def verdict(rows: list[dict[str, Any]], settings: Sequence[str], difference: Dif
     change = f"{difference.value:+.3f} [{difference.low:+.3f}, {difference.high:+.3f}]"
     if math.isnan(difference.low):
         return f"{summary} There are too few test recordings to say whether adding synthetic data helped."
+    if difference.low == difference.high == 0:
+        return f"{summary} Adding synthetic data changed nothing."
     if difference.low <= 0 <= difference.high:
         return f"{summary} Whether adding synthetic data helped is undecided: paired difference {change}."
     better = (difference.value < 0) == lower_is_better(metric)

@@ -48,6 +48,7 @@ def test_verdict_averages_seeds_and_says_which_way_is_better():
         ("mpjpe2d_px", Difference(0.8, 0.6, 1.0), "worse: paired difference +0.800"),
         ("accuracy", Difference(0.8, 0.6, 1.0), "better: paired difference +0.800"),
         ("mpjpe2d_px", Difference(-0.8, -1.7, 0.1), "undecided: paired difference -0.800 [-1.700, +0.100]"),
+        ("mpjpe2d_px", Difference(0.0, 0.0, 0.0), "Adding synthetic data changed nothing."),
         ("mpjpe2d_px", Difference(-0.8, float("nan"), float("nan")), "too few test recordings to say"),
     ],
 )
