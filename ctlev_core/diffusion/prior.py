@@ -159,6 +159,11 @@ def save_prior(prior: Prior, folder: Path, dtype: torch.dtype | None = None) -> 
             parameter.data = parameter.data.to(dtype or parameter.dtype)
         written.save_pretrained(folder / name, safe_serialization=True)
     (folder / "model_index.json").write_text(json.dumps(index, indent=2) + "\n")
+    for config_file in folder.glob("*/config.json"):
+        # Where the weights were loaded from is nobody's business, and would give equal checkpoints unequal digests.
+        config = _read_json(config_file)
+        config.pop("_name_or_path", None)
+        config_file.write_text(json.dumps(config, indent=2) + "\n")
 
 
 def _library(model: Any) -> str:

@@ -134,3 +134,13 @@ def test_bundled_prior_loads_and_is_small():
     assert sum(path.stat().st_size for path in BUNDLED_PRIOR.rglob("*")) < 25e6
     words = prior.tokenizer.tokenize("A photo of a moving human, a street light")
     assert "human</w>" in words and "street</w>" in words
+
+
+def test_written_folder_does_not_tell_where_the_prior_was(tmp_path):
+    shutil.copytree(BUNDLED_PRIOR, tmp_path / "elsewhere")
+    save_prior(load_prior(), tmp_path / "first")
+    save_prior(load_prior(tmp_path / "elsewhere"), tmp_path / "second")
+    for file in (tmp_path / "first").rglob("*"):
+        if file.is_file():
+            again = tmp_path / "second" / file.relative_to(tmp_path / "first")
+            assert again.read_bytes() == file.read_bytes(), file.name
