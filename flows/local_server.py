@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import ctypes
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -20,6 +18,8 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+
+from ctlev_core.processes import die_with_parent
 
 START_TIMEOUT_S = 300.0
 _QUIET = {
@@ -57,7 +57,7 @@ def start(home: Path) -> None:
     environment = {**os.environ, "PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"}
     with log.open("wb") as file:
         _server = subprocess.Popen(
-            command, env=environment, stdout=file, stderr=file, stdin=subprocess.DEVNULL, preexec_fn=_die_with_parent
+            command, env=environment, stdout=file, stderr=file, stdin=subprocess.DEVNULL, preexec_fn=_detached
         )
     atexit.register(stop)
     _url = f"http://127.0.0.1:{port}/api"
@@ -108,8 +108,7 @@ def stop() -> None:
     _server = None
 
 
-def _die_with_parent() -> None:
-    """Ask the Linux kernel to end the server when this process ends, even by SIGKILL."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG = 1
+def _detached() -> None:
+    """In the server's process: it ends with us, but Ctrl-C in the terminal is for us to handle."""
+    die_with_parent()
     os.setpgid(0, 0)

@@ -30,6 +30,7 @@ from ctlev_core.diffusion.training import (
     sample_rows,
     validation_losses,
 )
+from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
 from data_contracts.labels import History
 
@@ -90,7 +91,9 @@ class ImageStream:
         self._prior, self._options = prior, options
         self._batches_per_block = options.block_scenes * options.block_passes // options.training.batch_size
         # Spawned, not forked: forking a process that runs torch threads can hang.
-        self._pool = ProcessPoolExecutor(options.workers, get_context("spawn")) if options.workers else None
+        self._pool = (
+            ProcessPoolExecutor(options.workers, get_context("spawn"), die_with_parent) if options.workers else None
+        )
         self._ahead: dict[int, Future] = {}
         self._block: tuple[int, list[procedural_images.Scene]] = (-1, [])
 
@@ -199,7 +202,9 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
     def validate() -> tuple[float, float]:
         with torch.no_grad():  # the text encoder is trained as well, so the embeddings are of the moment
             batch = make_batch(prior, held_back)
-        losses = validation_losses(denoiser, schedule, batch, seed=options.seed, batch_size=32)
+        losses = validation_losses(
+            denoiser, schedule, batch, seed=options.seed, batch_size=32, snr_gamma=options.training.snr_gamma
+        )
         speed = trainer.step * options.training.batch_size / max(trainer.seconds, 1e-9)
         loss = trainer.history.loss[-1] if trainer.history.loss else math.nan
         logger.info(
