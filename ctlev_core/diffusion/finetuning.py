@@ -185,9 +185,7 @@ def fine_tune(
 
     def validate() -> tuple[float, float]:
         batch = cache.batch(validation_rows, generator_for(seed, DROPOUT_STREAM), 0.0, device)
-        return validation_losses(
-            denoiser, schedule, batch, seed=seed, batch_size=options.batch_size, snr_gamma=options.snr_gamma
-        )
+        return validation_losses(denoiser, schedule, batch, seed=seed, batch_size=options.batch_size)
 
     history = run_training(
         trainer,

@@ -33,10 +33,10 @@ class TrainingOptions(Frozen):
         default=0.995, ge=0, lt=1, description="of the averaged weights that are kept; 0 = no averaging"
     )
     snr_gamma: float | None = Field(
-        default=20.0,
+        default=None,
         gt=0,
-        description="largest weight of the error of the clean latents, in the manner of min-SNR (Hang et al., ICCV 2023); "
-        "null = none",
+        description="min-SNR loss weights (Hang et al., ICCV 2023); null = plain; with "
+        "v-prediction min-SNR hardly trains the noisy steps, which decide layout and prompt",
     )
     log_every: int = Field(default=20, gt=0, description="steps between two points of the loss curve")
     validation_every: int = Field(default=400, gt=0, description="steps between two points of the validation curve")

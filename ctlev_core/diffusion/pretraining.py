@@ -202,9 +202,7 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
     def validate() -> tuple[float, float]:
         with torch.no_grad():  # the text encoder is trained as well, so the embeddings are of the moment
             batch = make_batch(prior, held_back)
-        losses = validation_losses(
-            denoiser, schedule, batch, seed=options.seed, batch_size=32, snr_gamma=options.training.snr_gamma
-        )
+        losses = validation_losses(denoiser, schedule, batch, seed=options.seed, batch_size=32)
         speed = trainer.step * options.training.batch_size / max(trainer.seconds, 1e-9)
         loss = trainer.history.loss[-1] if trainer.history.loss else math.nan
         logger.info(

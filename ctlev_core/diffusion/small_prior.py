@@ -30,15 +30,14 @@ CONDITION_WIDTHS = (16, 32, 64)  # two strided stages: 64 px conditions to 16 x 
 # The noise schedule of Stable Diffusion v1.4, but with beta_end 0.02 instead of 0.012. There the last step keeps 7 % of
 # the signal's amplitude, enough to read the brightness of the whole picture from 48 x 256 latents; sampling, which
 # starts from pure noise, would always begin half grey and leave a fog over black event images. Here 1.5 % remain.
-# The network predicts the clean latents, not noise or velocity: 48 channels of noise do not fit through a trunk of 64,
-# but images do, since they lie near a low-dimensional manifold (Li and He, Back to Basics, 2025).
+# v-prediction stays well conditioned at every noise level.
 SCHEDULER_CONFIG = {
     "_class_name": "DDPMScheduler",
     "num_train_timesteps": 1000,
     "beta_start": 0.00085,
     "beta_end": 0.02,
     "beta_schedule": "scaled_linear",
-    "prediction_type": "sample",
+    "prediction_type": "v_prediction",
     "clip_sample": False,
     "steps_offset": 1,
 }
@@ -147,7 +146,6 @@ def build_prior(
             # diffusers takes this as the number of heads, not as their size.
             attention_head_dim=tuple(max(1, width // HEAD_CHANNELS) for width in widths),  # pyright: ignore
             norm_num_groups=16,
-            resnet_time_scale_shift="scale_shift",
             # The pooled prompt also joins the time embedding: a tiny network learns cross-attention too slowly.
             addition_embed_type="text",
             addition_embed_type_num_heads=TEXT_CHANNELS // HEAD_CHANNELS,

@@ -96,47 +96,32 @@ class NoiseSchedule:
     Source: Ho et al., DDPM, 2020 (eq. 4); Salimans and Ho, 2022 (v-prediction); Hang et al., 2023 (min-SNR weights).
     """
 
-    PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
-
     def __init__(self, scheduler_config: dict[str, Any]) -> None:
         from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
         self._scheduler: Any = DDPMScheduler.from_config(scheduler_config)
         self.prediction_type = str(self._scheduler.config["prediction_type"])
-        if self.prediction_type not in self.PREDICTION_TYPES:
-            known = ", ".join(self.PREDICTION_TYPES)
-            raise ValueError(f"prediction_type must be one of {known}, got {self.prediction_type!r}")
+        if self.prediction_type not in ("epsilon", "v_prediction"):
+            raise ValueError(f"prediction_type must be epsilon or v_prediction, got {self.prediction_type!r}")
         self.alphas_cumprod = self._scheduler.alphas_cumprod
         self.num_timesteps = len(self.alphas_cumprod)
 
     def noised(self, latents: Tensor, noise: Tensor, timesteps: Tensor) -> tuple[Tensor, Tensor]:
-        """Noisy latents, and the target: the noise, v = sqrt(a) noise - sqrt(1 - a) latents, or the clean latents."""
+        """Noisy latents, and the target: the noise, or v = sqrt(a) noise - sqrt(1 - a) latents."""
         noisy = self._scheduler.add_noise(latents, noise, timesteps)
         if self.prediction_type == "epsilon":
             return noisy, noise
-        if self.prediction_type == "sample":
-            return noisy, latents
         return noisy, self._scheduler.get_velocity(latents, noise, timesteps)
 
     def loss_weights(self, timesteps: Tensor, snr_gamma: float | None) -> Tensor:
-        """Weights [B] of the squared error of the network's output, 1 on average over the schedule.
-
-        In terms of the error of the clean latents they are min(snr, gamma) for noise prediction, as in min-SNR, and
-        min(snr + 1, gamma) for the other two, which makes those two the same loss. Min-SNR without the + 1 would weigh
-        the noisiest steps, which decide layout and prompt, with their vanishing snr.
-        """
-        weights = self._weights(snr_gamma)
-        return (weights / weights.mean())[timesteps]
-
-    def _weights(self, snr_gamma: float | None) -> Tensor:
-        # Everything in terms of a and 1 - a, so that no end of the schedule divides by zero.
-        signal, noise = self.alphas_cumprod, 1 - self.alphas_cumprod
-        limit = math.inf if snr_gamma is None else snr_gamma
-        if self.prediction_type == "epsilon":
-            return torch.clamp(limit * noise / signal.clamp(min=1e-8), max=1.0)
-        if self.prediction_type == "v_prediction":
-            return torch.clamp(limit * noise, max=1.0)
-        return torch.clamp(1 / noise.clamp(min=1e-8), max=limit)
+        """Min-SNR weights [B], min(snr, gamma) / snr, over another snr + 1 instead of snr for v-prediction."""
+        if snr_gamma is None:
+            return torch.ones(len(timesteps))
+        alpha_bar = self.alphas_cumprod[timesteps]
+        # min(snr, g) / (snr + 1) and min(snr, g) / snr, multiplied out: no end of the schedule divides 0 by 0.
+        signal, noise = alpha_bar, 1 - alpha_bar
+        clipped = torch.minimum(signal, snr_gamma * noise)
+        return clipped if self.prediction_type == "v_prediction" else clipped / signal.clamp(min=1e-8)
 
 
 def denoising_loss(
@@ -153,15 +138,9 @@ def denoising_loss(
 
 
 def validation_losses(
-    denoiser: Denoiser,
-    schedule: NoiseSchedule,
-    batch: Batch,
-    *,
-    seed: int,
-    batch_size: int,
-    snr_gamma: float | None = None,
+    denoiser: Denoiser, schedule: NoiseSchedule, batch: Batch, *, seed: int, batch_size: int
 ) -> tuple[float, float]:
-    """Loss with the true and with shuffled conditions, over the same noise.
+    """Unweighted loss with the true and with shuffled conditions, over the same noise.
 
     The difference says how much the network uses its condition; the loss alone does not. Prompts are shuffled where
     there are no condition images.
@@ -180,7 +159,7 @@ def validation_losses(
             rows = slice(start, start + batch_size)
             part = Batch(batch.latents[rows], embeddings[rows], None if conditions is None else conditions[rows])
             with torch.no_grad():
-                loss = denoising_loss(denoiser, schedule, part, generator_for(seed, start), snr_gamma)
+                loss = denoising_loss(denoiser, schedule, part, generator_for(seed, start), None)
             total += float(loss) * len(part.latents)
         losses.append(total / count)
     return losses[0], losses[1]
