@@ -176,8 +176,12 @@ class Stage:
         work.mkdir(parents=True, exist_ok=True)
         opened = {name: _opened(value) for name, value in arguments.items()}
         started, wall, cpu = time.time(), time.perf_counter(), time.process_time()
-        table = self.function(Output(folder, work), **opened)
-        write_manifest(folder, table, self.schema)
+        try:
+            table = self.function(Output(folder, work), **opened)
+            write_manifest(folder, table, self.schema)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         record = {
             "stage": self.name,
             "stage_version": self.version,

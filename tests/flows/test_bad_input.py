@@ -1,5 +1,6 @@
 """Wrong input ends in one clear line and status 2, before anything long starts; what was computed stays."""
 
+import shutil
 import time
 
 import numpy as np
@@ -128,8 +129,11 @@ def test_events_that_break_their_promises(tmp_path, column, change, expected):
     assert expected in line and "two" in line
 
 
-def test_what_was_computed_stays(smoke_home):
-    before = digests(smoke_home)
-    refused(smoke_home, "--set", "generator.options.batch_size=0", preset="smoke")
-    refused(smoke_home, "--set", "encoding.options.image_size=[48,48]", preset="smoke")
-    assert before.items() <= digests(smoke_home).items()
+def test_what_was_computed_stays(smoke_home, tmp_path):
+    home = shutil.copytree(smoke_home, tmp_path / "home")
+    before = digests(home)
+    refused(home, "--set", "generator.options.batch_size=0", preset="smoke")
+    line, _ = refused(home, "--set", "encoding.options.image_size=[48,48]", preset="smoke")
+    assert "the size this prior was trained on" in line
+    assert before.items() <= digests(home).items()
+    assert not list((home / "tmp").iterdir())
