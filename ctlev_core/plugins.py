@@ -100,8 +100,8 @@ class Generator(Protocol):
     Options: type[Frozen]
     SampleOptions: type[Frozen]
 
-    def prior_folder(self, options: Any) -> Path:
-        """The folder of the pre-trained weights, checked to be there; its content enters the cache key."""
+    def prior_folders(self, options: Any) -> list[Path]:
+        """The folders of the pre-trained weights, checked to be there; their content enters the cache key."""
         ...
 
     def train(

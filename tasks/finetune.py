@@ -13,13 +13,12 @@ from data_contracts import tables
 from data_contracts.config import GeneratorChoice
 from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest, conditions_of, history_table
-from tasks.stage import Output, stage
+from tasks.stage import Output, files_of, stage
 
 
 def _prior_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     plugin = plugins.load_options(arguments["generator"])
-    folder = plugin.module.prior_folder(plugin.options)
-    return [(path.relative_to(folder).as_posix(), path) for path in sorted(folder.rglob("*")) if path.is_file()]
+    return files_of(plugin.module.prior_folders(plugin.options))
 
 
 @stage(version=1, schema=tables.TRAINING, raw_files=_prior_files)

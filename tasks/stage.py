@@ -198,6 +198,16 @@ class Stage:
         return store.publish(self.name, key, folder, record)
 
 
+def files_of(folders: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Every file of some folders, named by the folder's number and the path inside, for `raw_files`."""
+    return [
+        (f"{number}/{path.relative_to(folder).as_posix()}", path)
+        for number, folder in enumerate(folders)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    ]
+
+
 def stage(
     *, version: int, schema: TableSchema, raw_files: RawFiles | None = None
 ) -> Callable[[Callable[..., pa.Table]], Stage]:

@@ -67,7 +67,9 @@ class PretrainingOptions(Frozen):
     image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
     widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
     start: Path | None = Field(
-        default=None, description="diffusers folder of a small prior to go on from; random weights when null"
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="diffusers folder of a small prior to go on from; random weights when null",
     )
     seed: int = Field(default=0, ge=0, description="of weights, pictures, order and noise")
     workers: int = Field(

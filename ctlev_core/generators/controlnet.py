@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.diffusion.options import FineTuningOptions, SamplingOptions
+from data_contracts.config import RUN_SETTING
 from data_contracts.labels import Conditions, History
 
 VERSION = 1
@@ -27,9 +28,10 @@ class Options(FineTuningOptions):
     tune: Literal["controlnet", "unet", "both"] = Field(
         default="controlnet", description="what learns; the paper: the ControlNet alone"
     )
-    # The path is part of the cache key, because only the prior's folder is digested.
     controlnet: Path | None = Field(
-        default=None, description="separate diffusers folder of the ControlNet; the prior's own subfolder when null"
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="separate diffusers folder of the ControlNet; the prior's own subfolder when null",
     )
 
 
@@ -37,15 +39,16 @@ class SampleOptions(SamplingOptions):
     """Sampling options."""
 
 
-def prior_folder(options: Options) -> Path:
-    """The diffusers folder the weights come from.
+def prior_folders(options: Options) -> list[Path]:
+    """The diffusers folders the weights come from: the prior, and the ControlNet where it lies apart.
 
     Raises:
         DataError: it is missing, or a part of it is.
     """
     from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder
 
-    return check_prior_folder(options.prior or BUNDLED_PRIOR, controlnet=options.controlnet, needs_controlnet=True)
+    prior = check_prior_folder(options.prior or BUNDLED_PRIOR, controlnet=options.controlnet, needs_controlnet=True)
+    return [prior] if options.controlnet is None else [prior, options.controlnet]
 
 
 def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:

@@ -31,7 +31,7 @@ class SampleOptions(SamplingOptions):
     """Sampling options."""
 
 
-def prior_folder(options: Options) -> Path:
+def prior_folders(options: Options) -> list[Path]:
     """The diffusers folder the weights come from.
 
     Raises:
@@ -39,7 +39,7 @@ def prior_folder(options: Options) -> Path:
     """
     from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder
 
-    return check_prior_folder(options.prior or BUNDLED_PRIOR)
+    return [check_prior_folder(options.prior or BUNDLED_PRIOR)]
 
 
 def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:

@@ -188,7 +188,7 @@ def test_generators_train_and_sample(tmp_path, module):
     save_prior(make_prior(), tmp_path / "prior")
     frames, conditions = make_data(with_images=module is controlnet)
     options = module.Options(prior=tmp_path / "prior", num_steps=3, batch_size=2, num_validation=0, log_every=1)
-    assert module.prior_folder(options) == tmp_path / "prior"
+    assert module.prior_folders(options) == [tmp_path / "prior"]
     history = module.train(frames, conditions, options, seed=0, out=tmp_path / "checkpoint", work=tmp_path / "work")
     assert history.step == [1, 2, 3]
     checkpoint = load_prior(tmp_path / "checkpoint")

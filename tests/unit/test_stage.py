@@ -220,3 +220,17 @@ def test_two_processes_make_an_artefact_once():
     assert sorted(line.split()[1] for lines in outputs for line in lines if line != "started") == ["False", "True"]
     assert sum(lines.count("started") for lines in outputs) == 1
     assert time.monotonic() - started < 50
+
+
+def test_content_of_raw_folders_enters_the_key_and_their_place_does_not(tmp_path):
+    from tasks.stage import files_of
+
+    def key(*folders):
+        reads = stage(version=1, schema=tables.TRAINING, raw_files=lambda arguments: files_of(folders))(first.function)
+        return reads.key({"windows": Windows(), "seed": 0}, Store())
+
+    for name, content in (("a", "one"), ("b", "one"), ("c", "two")):
+        (tmp_path / name / "unet").mkdir(parents=True)
+        (tmp_path / name / "unet" / "config.json").write_text(content)
+    assert key(tmp_path / "a") == key(tmp_path / "b") != key(tmp_path / "c")
+    assert key(tmp_path / "a", tmp_path / "b") != key(tmp_path / "a")
