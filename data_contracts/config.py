@@ -25,14 +25,11 @@ def cache_material(options: BaseModel) -> dict[str, Any]:
         for name, info in type(options).model_fields.items()
         if isinstance(info.json_schema_extra, dict) and info.json_schema_extra.get("run_setting")
     }
-    material: dict[str, Any] = {}
-    for name in type(options).model_fields:
-        if name in excluded:
-            continue
+    material = options.model_dump(mode="json", exclude=excluded)
+    for name in material:
         value = getattr(options, name)
-        material[name] = (
-            cache_material(value) if isinstance(value, BaseModel) else options.model_dump(mode="json")[name]
-        )
+        if isinstance(value, BaseModel):
+            material[name] = cache_material(value)
     return material
 
 
