@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +20,8 @@ def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarr
 
     Returns:
         N rows at the windows' ends. A window between two labels takes the nearest one. A joint is visible when it is
-        visible in at least half of the rows averaged.
+        visible in at least half of the rows averaged. Class, SMPL parameters and joints in 3D are those of the last
+        row in the window: rotations have no plain mean.
     Source: DHP19 labels a frame with the NaN-mean of the Vicon rows in its window
         (SensorsINI/DHP19, ExtractEventsToFramesAndMeanLabels.m); it has no visibility flags.
     """
@@ -29,17 +31,18 @@ def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarr
     empty = first >= last
     nearest = _nearest(labels.t_us, (t_start_us + t_end_us) // 2)
     first, last = np.where(empty, nearest, first), np.where(empty, nearest + 1, last)
-    names = tuple(labels.class_names[row] for row in last - 1)
+    at_end = labels.take(last - 1)
     if labels.joints2d is None or labels.visible is None:
-        return Labels(names, t_end_us)
-    joints = np.empty((len(names), *labels.joints2d.shape[1:]), np.float32)
-    visible = np.empty((len(names), labels.visible.shape[1]), bool)
+        return replace(at_end, t_us=t_end_us)
+    joints = np.empty((len(first), *labels.joints2d.shape[1:]), np.float32)
+    visible = np.empty((len(first), labels.visible.shape[1]), bool)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the mean of NaN alone is NaN, which is what we mean
         for row, (start, stop) in enumerate(zip(first, last, strict=True)):
             joints[row] = np.nanmean(labels.joints2d[start:stop].astype(np.float64), axis=0)
             visible[row] = labels.visible[start:stop].mean(axis=0) >= 0.5
-    return Labels(names, t_end_us, joints, visible & np.isfinite(joints).all(axis=-1), labels.joint_set)
+    visible &= np.isfinite(joints).all(axis=-1)
+    return replace(at_end, t_us=t_end_us, joints2d=joints, visible=visible)
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -20,7 +20,7 @@ from pydantic import BaseModel, ValidationError
 
 from data_contracts.config import Choice, Frozen
 from data_contracts.events import Events, SensorSize
-from data_contracts.labels import Conditions, History, Labels, Recording
+from data_contracts.labels import Conditions, History, ImageTrack, Labels, Recording
 
 KINDS = ("datasets", "formats", "encodings", "conditions", "generators", "downstream", "metrics")
 
@@ -48,6 +48,38 @@ class Dataset(Protocol):
         ...
 
 
+class DatasetWithChunks(Dataset, Protocol):
+    """A dataset whose recordings may be larger than memory."""
+
+    def read_event_chunks(self, recording: Recording, options: Any) -> Iterator[Events]:
+        """The events of `read_events` in consecutive pieces."""
+        ...
+
+
+class DatasetWithWindows(Dataset, Protocol):
+    """A dataset whose authors cut recordings into windows in a way of their own."""
+
+    def read_windows(self, recording: Recording, options: Any) -> np.ndarray:
+        """Index ranges [W, 2] int64 into the events of `read_events`, in order; used by the window method `dataset`."""
+        ...
+
+
+class DatasetWithEventImages(Dataset, Protocol):
+    """A dataset that releases finished event images of some recordings."""
+
+    def read_event_images(self, recording: Recording, options: Any) -> ImageTrack:
+        """Of a recording with `has_event_images`."""
+        ...
+
+
+class DatasetWithIntensity(Dataset, Protocol):
+    """A dataset with grey pictures taken beside the events, what Event-GAN learns from."""
+
+    def read_intensity_frames(self, recording: Recording, options: Any) -> ImageTrack:
+        """Of a recording with `has_intensity`."""
+        ...
+
+
 class Format(Protocol):
     """A raw event file format."""
 
@@ -60,6 +92,13 @@ class Format(Protocol):
 
     def read(self, path: Path) -> Events:
         """The whole file, checked with `check_events`."""
+        ...
+
+    def read_chunks(self, path: Path, num_events: int) -> Iterator[Events]:
+        """The events of `read` in consecutive pieces of about `num_events`, in memory that does not grow with the file.
+
+        Every piece is checked and has the sensor size of the whole file.
+        """
         ...
 
 

@@ -89,8 +89,9 @@ class MetricChoice(Choice):
 class Windows(Frozen):
     """How a recording is cut into windows; each window becomes one frame."""
 
-    method: Literal["count", "duration", "whole"] = Field(
-        default="count", description="what every window has the same of"
+    method: Literal["count", "duration", "whole", "dataset"] = Field(
+        default="count",
+        description="what every window has the same of; dataset = as the dataset's authors cut their recordings",
     )
     num_events: int = Field(default=7500, gt=0, description="events a window (count); DHP19's mean per camera")
     duration_us: int = Field(default=8333, gt=0, description="length of a window (duration); CDEHP has 120 a second")

@@ -34,7 +34,10 @@ class Recording:
         parts: which split the recording belongs to; more than one part where a recording is split in time.
         class_name: class or motion, empty where the dataset has none.
         sensor_size: (width, height) px; None when only the file itself tells.
-        has_events: False for recordings that carry labels only.
+        has_events: False for recordings that carry labels only, or event images in the place of events.
+        has_event_images: the dataset's authors released finished event images of it; the dataset's
+            `read_event_images` reads them.
+        has_intensity: grey pictures were taken beside the events; the dataset's `read_intensity_frames` reads them.
         files: raw files the recording is read from; their content enters the cache key.
     """
 
@@ -44,7 +47,39 @@ class Recording:
     class_name: str = ""
     sensor_size: SensorSize | None = None
     has_events: bool = True
+    has_event_images: bool = False
+    has_intensity: bool = False
     files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTrack:
+    """Pictures of one recording in the order of their times: intensity frames, or event images as released.
+
+    Attributes:
+        images: [N, H, W] uint8, grey.
+        t_us: [N] int64, microseconds on the clock of events and labels; of an exposure the middle, of an event image
+            the end of its window.
+    """
+
+    images: np.ndarray
+    t_us: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+
+LABEL_ARRAYS: dict[str, tuple[type, int | None]] = {
+    "joints2d": (np.float32, 2),
+    "visible": (np.bool_, None),
+    "joints3d": (np.float32, 3),
+    "smpl_pose": (np.float32, 72),
+    "smpl_betas": (np.float32, 10),
+    "smpl_transl": (np.float32, 3),
+}
+"""The optional arrays of `Labels`: dtype, and length of the last axis (None: one value a joint)."""
+_OF_JOINTS = ("joints2d", "visible", "joints3d")
+_OF_SMPL = ("smpl_pose", "smpl_betas", "smpl_transl")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +92,10 @@ class Labels:
         joints2d: [N, J, 2] float32, px, (x right, y down), pixel centres at integer + 0.5; NaN = unknown.
         visible: [N, J] bool; False = outside the image, occluded or unknown.
         joint_set: name of the joint order, a key of `ctlev_core.skeletons.JOINT_SETS`; empty without joints.
+        joints3d: [N, J, 3] float32, mm, camera frame (x right, y down, z forward), same order; NaN = unknown.
+        smpl_pose: [N, 72] float32, rad, axis-angle of the 24 SMPL joints, the root's (global orientation) first.
+        smpl_betas: [N, 10] float32, shape coefficients.
+        smpl_transl: [N, 3] float32, m, camera frame.
     """
 
     class_names: tuple[str, ...]
@@ -64,20 +103,25 @@ class Labels:
     joints2d: np.ndarray | None = None
     visible: np.ndarray | None = None
     joint_set: str = ""
+    joints3d: np.ndarray | None = None
+    smpl_pose: np.ndarray | None = None
+    smpl_betas: np.ndarray | None = None
+    smpl_transl: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.class_names)
 
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The optional arrays that are there, by name."""
+        return {name: getattr(self, name) for name in LABEL_ARRAYS if getattr(self, name) is not None}
+
     def take(self, rows: Sequence[int] | np.ndarray) -> Labels:
         """The given rows, in the given order."""
         rows = np.asarray(rows, dtype=np.int64)
-        return replace(
-            self,
-            class_names=tuple(self.class_names[row] for row in rows),
-            t_us=self.t_us[rows],
-            joints2d=None if self.joints2d is None else self.joints2d[rows],
-            visible=None if self.visible is None else self.visible[rows],
-        )
+        names = tuple(self.class_names[row] for row in rows)
+        taken = {name: array[rows] for name, array in self.arrays.items()}
+        return replace(self, class_names=names, t_us=self.t_us[rows], **taken)
 
 
 def check_labels(labels: Labels, where: str) -> Labels:
@@ -87,13 +131,22 @@ def check_labels(labels: Labels, where: str) -> Labels:
         raise DataError(f"{where}: t_us must be [{count}] int64, got {labels.t_us.shape} {labels.t_us.dtype}")
     if (labels.joints2d is None) != (labels.visible is None):
         raise DataError(f"{where}: joints2d and visible must be given together")
+    arrays = labels.arrays
+    given = [name for name in _OF_SMPL if name in arrays]
+    if given and len(given) != len(_OF_SMPL):
+        raise DataError(f"{where}: {', '.join(_OF_SMPL)} must be given together, got {', '.join(given)}")
+    num_joints = next((arrays[name].shape[1:2] for name in _OF_JOINTS if name in arrays), ())
+    for name, array in arrays.items():
+        dtype, last = LABEL_ARRAYS[name]
+        expected = (count, *(num_joints if name in _OF_JOINTS else ()), *(() if last is None else (last,)))
+        if array.shape != expected or array.dtype != dtype:
+            kind = np.dtype(dtype).name
+            raise DataError(f"{where}: {name} must be {list(expected)} {kind}, got {list(array.shape)} {array.dtype}")
+        if name in _OF_SMPL and not np.isfinite(array).all():
+            row = int(np.argwhere(~np.isfinite(array))[0, 0])
+            raise DataError(f"{where}: {name} of row {row} is not finite")
     if labels.joints2d is None or labels.visible is None:
         return labels
-    if labels.joints2d.ndim != 3 or labels.joints2d.shape[0] != count or labels.joints2d.shape[2] != 2:
-        raise DataError(f"{where}: joints2d must be [{count}, J, 2], got {labels.joints2d.shape}")
-    if labels.visible.shape != labels.joints2d.shape[:2] or labels.visible.dtype != bool:
-        got = f"{labels.visible.shape} {labels.visible.dtype}"
-        raise DataError(f"{where}: visible must be {labels.joints2d.shape[:2]} bool, got {got}")
     wrong = labels.visible & ~np.isfinite(labels.joints2d).all(axis=-1)
     if wrong.any():
         row, joint = np.argwhere(wrong)[0]

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
-from data_contracts.labels import Conditions, History, Labels
+from data_contracts.labels import LABEL_ARRAYS, Conditions, History, Labels
 from data_contracts.tables import TABLES, TableSchema, check_table
 
 MANIFEST_FILE = "manifest.parquet"
@@ -166,27 +166,29 @@ def _check_file(path: Path, expected: dict, full: bool) -> None:
         raise DataError(f"{path}: content has changed since it was written")
 
 
+_LABEL_COLUMNS = {
+    "joints2d": "joints2d_px",
+    "visible": "visible",
+    "joints3d": "joints3d_mm",
+    "smpl_pose": "smpl_pose_rad",
+    "smpl_betas": "smpl_betas",
+    "smpl_transl": "smpl_transl_m",
+}
+
+
 def label_columns(labels: Labels) -> dict[str, pa.Array]:
-    """The columns `joint_set`, `joints2d_px` and `visible` of a table, from labels."""
+    """The label columns of a table, `joint_set` and one for each array of `Labels`; null where there is none."""
     count = len(labels)
-    joint_set = pa.array([labels.joint_set] * count, pa.string())
-    if labels.joints2d is None or labels.visible is None:
-        return {
-            "joint_set": joint_set,
-            "joints2d_px": pa.nulls(count, pa.list_(pa.float32())),
-            "visible": pa.nulls(count, pa.list_(pa.bool_())),
-        }
-
-    def flat(values: np.ndarray, dtype: pa.DataType) -> pa.Array:
-        width = int(np.prod(values.shape[1:]))
-        offsets = pa.array(np.arange(count + 1, dtype=np.int32) * width)
-        return pa.ListArray.from_arrays(offsets, pa.array(values.reshape(-1), dtype))
-
-    return {
-        "joint_set": joint_set,
-        "joints2d_px": flat(labels.joints2d, pa.float32()),
-        "visible": flat(labels.visible, pa.bool_()),
-    }
+    columns = {"joint_set": pa.array([labels.joint_set] * count, pa.string())}
+    for name, column in _LABEL_COLUMNS.items():
+        element = pa.from_numpy_dtype(LABEL_ARRAYS[name][0])
+        values = getattr(labels, name)
+        if values is None:
+            columns[column] = pa.nulls(count, pa.list_(element))
+            continue
+        offsets = pa.array(np.arange(count + 1, dtype=np.int32) * int(np.prod(values.shape[1:])))
+        columns[column] = pa.ListArray.from_arrays(offsets, pa.array(values.reshape(-1), element))
+    return columns
 
 
 def labels_of(table: pa.Table) -> Labels:
@@ -195,15 +197,21 @@ def labels_of(table: pa.Table) -> Labels:
     class_names = tuple(table["class_name"].to_pylist())
     times = "t_us" if "t_us" in table.column_names else "t_end_us"
     t_us = table[times].to_numpy() if times in table.column_names else np.zeros(count, np.int64)
-    joints = table["joints2d_px"].combine_chunks()
     joint_sets = set(table["joint_set"].to_pylist())
-    if count == 0 or joints.null_count == count:
-        return Labels(class_names, t_us.astype(np.int64))
-    if joints.null_count or len(joint_sets) != 1:
-        raise DataError(f"rows must share one joint set and all have joints, got {sorted(joint_sets)}")
-    joints2d = joints.flatten().to_numpy(zero_copy_only=False).reshape(count, -1, 2)
-    visible = table["visible"].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(count, -1)
-    return Labels(class_names, t_us.astype(np.int64), joints2d, visible.astype(bool), joint_sets.pop())
+    if len(joint_sets) > 1:
+        raise DataError(f"rows must share one joint set, got {sorted(joint_sets)}")
+    arrays: dict[str, np.ndarray] = {}
+    for name, column in _LABEL_COLUMNS.items():
+        lists = table[column].combine_chunks()
+        if lists.null_count == count:
+            continue
+        if lists.null_count:
+            raise DataError(f"rows must all have {column} or none, got {count - lists.null_count} of {count}")
+        dtype, last = LABEL_ARRAYS[name]
+        values = lists.flatten().to_numpy(zero_copy_only=False).astype(dtype, copy=False)
+        of_joints = name in ("joints2d", "joints3d")
+        arrays[name] = values.reshape((count, -1, last) if of_joints else (count, -1))
+    return Labels(class_names, t_us.astype(np.int64), joint_set="".join(joint_sets), **arrays)
 
 
 def concat_labels(parts: Iterable[Labels]) -> Labels:
@@ -211,15 +219,15 @@ def concat_labels(parts: Iterable[Labels]) -> Labels:
     parts = [part for part in parts if len(part)]
     if not parts:
         return Labels((), np.zeros(0, np.int64))
-    if len({(part.joint_set, part.joints2d is None) for part in parts}) != 1:
-        raise DataError(f"cannot mix labels of joint sets {sorted({part.joint_set for part in parts})}")
-    names = tuple(name for part in parts for name in part.class_names)
-    t_us = np.concatenate([part.t_us for part in parts])
-    if parts[0].joints2d is None:
-        return Labels(names, t_us)
-    joints2d = np.concatenate([part.joints2d for part in parts if part.joints2d is not None])
-    visible = np.concatenate([part.visible for part in parts if part.visible is not None])
-    return Labels(names, t_us, joints2d, visible, parts[0].joint_set)
+    kinds = {(part.joint_set, *part.arrays) for part in parts}
+    if len(kinds) != 1:
+        raise DataError(f"cannot mix labels of different kinds: {sorted(kinds)}")
+    return Labels(
+        class_names=tuple(name for part in parts for name in part.class_names),
+        t_us=np.concatenate([part.t_us for part in parts]),
+        joint_set=parts[0].joint_set,
+        **{name: np.concatenate([part.arrays[name] for part in parts]) for name in parts[0].arrays},
+    )
 
 
 def conditions_of(manifest: Manifest) -> Conditions:

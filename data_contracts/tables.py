@@ -65,6 +65,10 @@ _LABELS = (
     Column("joint_set", pa.string(), "joint order (ctlev_core.skeletons); empty without joints"),
     Column("joints2d_px", pa.list_(pa.float32()), "J x (x, y), flattened; NaN = unknown", nullable=True, finite=False),
     Column("visible", pa.list_(pa.bool_()), "J flags", nullable=True),
+    Column("joints3d_mm", pa.list_(pa.float32()), "J x (x, y, z), camera; NaN = unknown", nullable=True, finite=False),
+    Column("smpl_pose_rad", pa.list_(pa.float32()), "24 x axis-angle, the root's first", nullable=True),
+    Column("smpl_betas", pa.list_(pa.float32()), "10 shape coefficients", nullable=True),
+    Column("smpl_transl_m", pa.list_(pa.float32()), "x, y, z, camera", nullable=True),
 )
 
 RECORDINGS = TableSchema(
@@ -100,7 +104,7 @@ PARTS = TableSchema(
 )
 LABELS = TableSchema(
     "labels",
-    1,
+    2,
     None,
     (
         _RECORDING,
@@ -112,7 +116,7 @@ LABELS = TableSchema(
 )
 FRAMES = TableSchema(
     "frames",
-    1,
+    2,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),
@@ -128,7 +132,7 @@ FRAMES = TableSchema(
 )
 CONDITIONS = TableSchema(
     "conditions",
-    1,
+    2,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key"),
@@ -151,7 +155,7 @@ TRAINING = TableSchema(
 )
 SYNTHETIC = TableSchema(
     "synthetic",
-    1,
+    2,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),

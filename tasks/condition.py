@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 
@@ -80,7 +82,7 @@ def _label_only(
         with_events = recordings.table.to_pylist()
         size = next((r["sensor_width_px"], r["sensor_height_px"]) for r in with_events if r["sensor_width_px"])
         mapped = plugin.module.map_points(labels.joints2d, size, plugin.options).astype(np.float32)
-        labels = Labels(labels.class_names, labels.t_us, mapped, labels.visible, labels.joint_set)
+        labels = replace(labels, joints2d=mapped)
     return names, table["subject"].to_pylist(), labels
 
 

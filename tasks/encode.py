@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,7 +77,7 @@ def _to_image(labels: Labels, sensor_size: tuple[int, int], plugin: plugins.Plug
     if labels.joints2d is None:
         return labels
     mapped = plugin.module.map_points(labels.joints2d, sensor_size, plugin.options)
-    return Labels(labels.class_names, labels.t_us, mapped.astype(np.float32), labels.visible, labels.joint_set)
+    return replace(labels, joints2d=mapped.astype(np.float32))
 
 
 def _visible_inside(labels: Labels, image_size: tuple[int, ...]) -> Labels:
@@ -86,7 +87,7 @@ def _visible_inside(labels: Labels, image_size: tuple[int, ...]) -> Labels:
     width, height = image_size
     x, y = labels.joints2d[..., 0], labels.joints2d[..., 1]
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    return Labels(labels.class_names, labels.t_us, labels.joints2d, labels.visible & inside, labels.joint_set)
+    return replace(labels, visible=labels.visible & inside)
 
 
 def _check_frames(rows: list[dict[str, Any]], histograms: list[np.ndarray], windows: Windows) -> None:

@@ -50,7 +50,7 @@ def _list_recordings(plugin: Plugin) -> list[Recording]:
     return recordings
 
 
-@stage(version=1, schema=tables.RECORDINGS, raw_files=_raw_files)
+@stage(version=2, schema=tables.RECORDINGS, raw_files=_raw_files)
 def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     """Read every recording once, check it, and keep events and labels in the project's own form."""
     plugin = plugins.load_options(dataset)
