@@ -166,7 +166,7 @@ def _check_file(path: Path, expected: dict, full: bool) -> None:
         raise DataError(f"{path}: content has changed since it was written")
 
 
-_LABEL_COLUMNS = {
+LABEL_COLUMNS = {
     "joints2d": "joints2d_px",
     "visible": "visible",
     "joints3d": "joints3d_mm",
@@ -174,13 +174,14 @@ _LABEL_COLUMNS = {
     "smpl_betas": "smpl_betas",
     "smpl_transl": "smpl_transl_m",
 }
+"""Column of a table for each array of `Labels`."""
 
 
 def label_columns(labels: Labels) -> dict[str, pa.Array]:
     """The label columns of a table, `joint_set` and one for each array of `Labels`; null where there is none."""
     count = len(labels)
     columns = {"joint_set": pa.array([labels.joint_set] * count, pa.string())}
-    for name, column in _LABEL_COLUMNS.items():
+    for name, column in LABEL_COLUMNS.items():
         element = pa.from_numpy_dtype(LABEL_ARRAYS[name][0])
         values = getattr(labels, name)
         if values is None:
@@ -201,7 +202,7 @@ def labels_of(table: pa.Table) -> Labels:
     if len(joint_sets) > 1:
         raise DataError(f"rows must share one joint set, got {sorted(joint_sets)}")
     arrays: dict[str, np.ndarray] = {}
-    for name, column in _LABEL_COLUMNS.items():
+    for name, column in LABEL_COLUMNS.items():
         lists = table[column].combine_chunks()
         if lists.null_count == count:
             continue

@@ -10,7 +10,7 @@ import pyarrow as pa
 from ctlev_core import plugins
 from data_contracts import tables
 from data_contracts.config import SamplingChoice
-from data_contracts.manifest import Manifest, conditions_of
+from data_contracts.manifest import LABEL_COLUMNS, Manifest, conditions_of
 from tasks.stage import Output, stage
 
 
@@ -31,7 +31,7 @@ def sample(out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling:
         "scheduler": options["scheduler"],
     }
     names = [f"synthetic/{row:06d}" for row in range(count)]
-    carried = ("source_id", "subject", "class_name", "prompt", "joint_set", "joints2d_px", "visible")
+    carried = ("source_id", "subject", "class_name", "prompt", "joint_set", *LABEL_COLUMNS.values())
     return pa.table(
         {
             "sample_id": names,

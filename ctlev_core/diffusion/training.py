@@ -25,6 +25,7 @@ from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
 MAX_NON_FINITE = 10
+MAX_SAMPLE_WEIGHT = 20.0
 BETAS = (0.9, 0.999)
 
 
@@ -101,23 +102,33 @@ class NoiseSchedule:
 
         self._scheduler: Any = DDPMScheduler.from_config(scheduler_config)
         self.prediction_type = str(self._scheduler.config["prediction_type"])
-        if self.prediction_type not in ("epsilon", "v_prediction"):
-            raise ValueError(f"prediction_type must be epsilon or v_prediction, got {self.prediction_type!r}")
+        if self.prediction_type not in ("epsilon", "v_prediction", "sample"):
+            raise ValueError(f"prediction_type must be epsilon, v_prediction or sample, got {self.prediction_type!r}")
         self.alphas_cumprod = self._scheduler.alphas_cumprod
         self.num_timesteps = len(self.alphas_cumprod)
 
     def noised(self, latents: Tensor, noise: Tensor, timesteps: Tensor) -> tuple[Tensor, Tensor]:
-        """Noisy latents, and the target: the noise, or v = sqrt(a) noise - sqrt(1 - a) latents."""
+        """Noisy latents, and the target: the noise, the latents, or v = sqrt(a) noise - sqrt(1 - a) latents."""
         noisy = self._scheduler.add_noise(latents, noise, timesteps)
-        if self.prediction_type == "epsilon":
-            return noisy, noise
+        if self.prediction_type != "v_prediction":
+            return noisy, noise if self.prediction_type == "epsilon" else latents
         return noisy, self._scheduler.get_velocity(latents, noise, timesteps)
 
     def loss_weights(self, timesteps: Tensor, snr_gamma: float | None) -> Tensor:
-        """Min-SNR weights [B], min(snr, gamma) / snr, over another snr + 1 instead of snr for v-prediction."""
+        """Weights [B] of the squared errors.
+
+        With `snr_gamma` min-SNR weights: min(snr, gamma) of the error in the latents, which over snr is of that in the
+        noise and over snr + 1 of that in v. Without: 1; for networks that predict the latents what makes the loss equal
+        to that of v, snr + 1, up to `MAX_SAMPLE_WEIGHT` and with mean 1 over the schedule.
+        """
+        alpha_bar = self.alphas_cumprod[timesteps]
+        if snr_gamma is None and self.prediction_type == "sample":
+            weights = (1 / (1 - self.alphas_cumprod)).clamp(max=MAX_SAMPLE_WEIGHT)
+            return weights[timesteps] / weights.mean()
         if snr_gamma is None:
             return torch.ones(len(timesteps))
-        alpha_bar = self.alphas_cumprod[timesteps]
+        if self.prediction_type == "sample":
+            return (alpha_bar / (1 - alpha_bar)).clamp(max=snr_gamma)
         # min(snr, g) / (snr + 1) and min(snr, g) / snr, multiplied out: no end of the schedule divides 0 by 0.
         signal, noise = alpha_bar, 1 - alpha_bar
         clipped = torch.minimum(signal, snr_gamma * noise)
