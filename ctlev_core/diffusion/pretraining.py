@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import logging
 import math
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -19,7 +19,14 @@ from pydantic import Field
 from ctlev_core.diffusion import procedural_images
 from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
-from ctlev_core.diffusion.prior import Prior, conditions_to_tensor, images_to_tensor, load_prior, save_prior
+from ctlev_core.diffusion.prior import (
+    Prior,
+    conditions_to_tensor,
+    encode_prompts,
+    images_to_tensor,
+    load_prior,
+    save_prior,
+)
 from ctlev_core.diffusion.small_prior import IMAGE_SIZE, SCHEDULER_CONFIG, WIDTHS, build_prior
 from ctlev_core.diffusion.training import (
     Batch,
@@ -38,6 +45,7 @@ FIT_IMAGES = 384
 VALIDATION_IMAGES = 128
 VALIDATION_OFFSET = 2**31
 VALIDATION_STREAM, STYLE_STREAM = 1, 2  # entropy that keeps the random streams apart
+DrawScene = Callable[[np.random.Generator, int], procedural_images.Scene]
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +55,7 @@ class PretrainingOptions(Frozen):
 
     training: TrainingOptions = Field(
         default=TrainingOptions(
-            num_steps=40_000,
+            num_steps=20_000,
             ema_decay=0.999,
             warmup_steps=200,
             final_learning_rate=0.0,
@@ -57,13 +65,15 @@ class PretrainingOptions(Frozen):
         ),
         description="the loop",
     )
-    max_seconds: float | None = Field(default=3600.0, gt=0, description="wall-clock budget; null = all steps")
+    max_seconds: float | None = Field(
+        default=None, gt=0, description="wall-clock budget; null = all steps, and only then is a run repeatable"
+    )
     block_scenes: int = Field(default=768, gt=0, description="scenes drawn at a time by the worker process")
     block_passes: int = Field(
-        default=2, gt=0, description="how often each scene is shown, every time in a random style"
+        default=3, gt=0, description="how often each scene is shown, every time in a random style"
     )
     text_dropout: float = Field(default=0.1, ge=0, le=1, description="share of empty prompts, for guidance")
-    condition_dropout: float = Field(default=0.1, ge=0, le=1, description="share of people without their skeleton")
+    condition_dropout: float = Field(default=0.2, ge=0, le=1, description="share of people without their skeleton")
     image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
     widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
     start: Path | None = Field(
@@ -134,32 +144,26 @@ class ImageStream:
 
 
 def make_batch(prior: Prior, rows: list[Row]) -> Batch:
-    """Latents, prompt embeddings (with their gradient) and conditions, rows with a skeleton first."""
+    """Latents, prompt embeddings and conditions, rows with a skeleton first."""
     rows = sorted(rows, key=lambda row: row.skeleton is None)
     images = images_to_tensor(np.stack([row.image for row in rows]))
-    latents = prior.vae.encode(images)[0].mode() * prior.scaling_factor
-    tokens = prior.tokenizer(
-        [row.caption for row in rows],
-        padding="max_length",
-        max_length=prior.tokenizer.model_max_length,
-        truncation=True,
-        return_tensors="pt",
-    )
-    embeddings = prior.text_encoder(tokens.input_ids)[0]
+    with torch.no_grad():
+        latents = prior.vae.encode(images)[0].mode() * prior.scaling_factor
+    embeddings = encode_prompts(prior, [row.caption for row in rows])
     skeletons = [row.skeleton for row in rows if row.skeleton is not None]
     conditions = conditions_to_tensor(np.stack(skeletons)) if skeletons else None
     return Batch(latents, embeddings, conditions)
 
 
-def draw_validation_rows(options: PretrainingOptions) -> list[Row]:
-    """Held-back people, each with a skeleton, from a stream of their own."""
-    people = []
+def draw_validation_rows(options: PretrainingOptions, draw: DrawScene) -> list[Row]:
+    """Held-back pictures from a stream of their own, with a skeleton where they show a person."""
+    rows = []
     for index in range(VALIDATION_IMAGES):
         rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + index])
-        scene = procedural_images.draw_person(rng, options.image_size)
+        scene = draw(rng, options.image_size)
         image, caption = procedural_images.apply_style(scene, rng)
-        people.append(Row(image, caption, scene.skeleton))
-    return people
+        rows.append(Row(image, caption, scene.skeleton if scene.has_skeleton else None))
+    return rows
 
 
 def new_prior(options: PretrainingOptions) -> Prior:
@@ -175,10 +179,10 @@ def new_prior(options: PretrainingOptions) -> Prior:
 
 
 def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:
-    """The untrained prior and the trainer of everything in it but the patch code."""
+    """The untrained prior and the trainer of its U-Net and ControlNet; patch code and text encoder stay as they are."""
     prior = new_prior(options)
     parameters = []
-    for model in (prior.unet, prior.controlnet, prior.text_encoder):
+    for model in (prior.unet, prior.controlnet):
         if model is not None:
             parameters += list(model.train().requires_grad_(True).parameters())
     identity = hashlib.sha256(json.dumps(cache_material(options), sort_keys=True).encode()).hexdigest()
@@ -186,30 +190,33 @@ def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:
 
 
 def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
-    """Pre-train U-Net, ControlNet and text encoder together; write the averaged weights, in half precision, to `out`.
+    """Pre-train U-Net and ControlNet together; write the averaged weights, in half precision, to `out`.
 
     Args:
         options: size, length and mixture.
         out: becomes a diffusers folder.
         work: resumable state; a killed run goes on from there.
     Returns:
-        Loss curves; the validation losses are of people with their own and with somebody else's skeleton.
+        Loss curves; the validation losses are of people with their own and with somebody else's skeleton. Those of
+        objects with their own and with another's caption are logged beside them: both gaps must grow, or the prior
+        does not heed what it is asked for.
     """
     prior, trainer = prepare(options)
     denoiser = Denoiser(prior.unet, prior.controlnet)
     schedule = NoiseSchedule(prior.scheduler_config)
-    held_back = draw_validation_rows(options)
+    people = make_batch(prior, draw_validation_rows(options, procedural_images.draw_person))
+    objects = make_batch(prior, draw_validation_rows(options, procedural_images.draw_thing))
     stream = ImageStream(prior, options)
 
     def validate() -> tuple[float, float]:
-        with torch.no_grad():  # the text encoder is trained as well, so the embeddings are of the moment
-            batch = make_batch(prior, held_back)
-        losses = validation_losses(denoiser, schedule, batch, seed=options.seed, batch_size=32)
+        losses = validation_losses(denoiser, schedule, people, seed=options.seed, batch_size=32)
+        of_objects = validation_losses(denoiser, schedule, objects, seed=options.seed, batch_size=32)
         speed = trainer.step * options.training.batch_size / max(trainer.seconds, 1e-9)
         loss = trainer.history.loss[-1] if trainer.history.loss else math.nan
         logger.info(
-            "step %d, %.0f s, %.1f img/s, loss %.4f, validation: own skeleton %.4f, another's %.4f",
-            trainer.step, trainer.seconds, speed, loss, *losses,
+            "step %d, %.0f s, %.1f img/s, loss %.4f, validation: own skeleton %.4f, another's %.4f; "
+            "own caption %.4f, another's %.4f",
+            trainer.step, trainer.seconds, speed, loss, *losses, *of_objects,
         )  # fmt: skip
         return losses
 
@@ -229,37 +236,3 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
         stream.close()
     save_prior(prior, out, torch.float16)
     return history
-
-
-def export(options: PretrainingOptions, out: Path, work: Path) -> None:
-    """Write the averaged weights of an unfinished run as a diffusers folder.
-
-    Raises:
-        FileNotFoundError: nothing was saved in `work` yet.
-    """
-    prior, trainer = prepare(options)
-    trainer.restore(work / "state.pt")
-    trainer.apply_average()
-    save_prior(prior, out, torch.float16)
-
-
-def main() -> None:
-    """Command line: pre-train, or with --export write the state of a run that is still going."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="diffusers folder to write")
-    parser.add_argument("--work", type=Path, required=True, help="folder of the resumable state")
-    parser.add_argument("--minutes", type=float, default=60.0, help="wall-clock budget")
-    parser.add_argument("--start", type=Path, help="diffusers folder to go on from")
-    parser.add_argument("--export", action="store_true", help="only write what is in --work so far")
-    arguments = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    options = PretrainingOptions(max_seconds=60 * arguments.minutes, start=arguments.start)
-    torch.set_num_threads(1)
-    if arguments.export:
-        export(options, arguments.out, arguments.work)
-    else:
-        pretrain(options, arguments.out, arguments.work)
-
-
-if __name__ == "__main__":
-    main()

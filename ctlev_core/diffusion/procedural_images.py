@@ -1,6 +1,6 @@
 """The endless stream of captioned pictures the small prior is pre-trained on. Never events, never a data set.
 
-Six pictures in ten are people: colour renderings of the procedural body in random poses and in poses of the procedural
+Half of the pictures are people: colour renderings of the procedural body in random poses and in poses of the procedural
 motions that are not held out for tests, with the skeleton drawn in the manner of OpenPose. The others are everyday
 objects (`procedural_objects`), without a skeleton. A scene is drawn once and shown in several styles: photograph, grey
 photograph, line drawing on black, coloured line drawing. A network that knows outlines needs far fewer event images to
@@ -26,7 +26,7 @@ from ctlev_core.render.scene import CameraRange, render_person, sample_backgroun
 from ctlev_core.render.skeleton import draw_skeleton
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_TO_DHP19
 
-PEOPLE_SHARE = 0.6
+PEOPLE_SHARE = 0.5
 MOTION_SHARE = 0.55
 """Of the people, how many take their pose from a procedural motion, never a held-out one; the others' is random."""
 POSE_NOISE_RAD = 0.15

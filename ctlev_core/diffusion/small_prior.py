@@ -133,6 +133,7 @@ def build_prior(
                 pad_token_id=tokenizer.pad_token_id,
             )
         )
+        spread_words(text_encoder)
         upper = len(widths) - 1  # a condition image says where; attention is needed at the lowest resolution only
         unet = UNet2DConditionModel(
             sample_size=image_size // PATCH_PX,
@@ -146,6 +147,7 @@ def build_prior(
             # diffusers takes this as the number of heads, not as their size.
             attention_head_dim=tuple(max(1, width // HEAD_CHANNELS) for width in widths),  # pyright: ignore
             norm_num_groups=16,
+            resnet_time_scale_shift="scale_shift",  # Dhariwal and Nichol, 2021: adaptive group normalisation
             # The pooled prompt also joins the time embedding: a tiny network learns cross-attention too slowly.
             addition_embed_type="text",
             addition_embed_type_num_heads=TEXT_CHANNELS // HEAD_CHANNELS,
@@ -154,6 +156,18 @@ def build_prior(
         break_zeros(controlnet)
     side = image_size
     return Prior(tokenizer, text_encoder, vae, unet, controlnet, dict(SCHEDULER_CONFIG), (side, side))
+
+
+def spread_words(text_encoder: Any) -> None:
+    """Give every word of the text encoder a random direction of its own, of unit variance; it is then never trained.
+
+    Trained together with the U-Net, the text encoder collapsed: a small network finds the condition image first, has
+    little to gain from prompts for a long time, and lets them grow alike. Fixed embeddings cannot; the U-Net learns
+    what each of them means. Positions matter a tenth as much as words, context what two random layers mix in.
+    """
+    words, positions = text_encoder.embeddings.token_embedding, text_encoder.embeddings.position_embedding
+    torch.nn.init.normal_(words.weight, std=1.0)
+    torch.nn.init.normal_(positions.weight, std=0.1)
 
 
 def break_zeros(controlnet: Any) -> None:

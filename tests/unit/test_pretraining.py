@@ -7,8 +7,8 @@ import torch
 from ctlev_core.body.motions import HELD_OUT
 from ctlev_core.diffusion import pretraining, procedural_images
 from ctlev_core.diffusion.options import TrainingOptions
-from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, export, new_prior, pretrain
-from ctlev_core.diffusion.prior import load_prior
+from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
+from ctlev_core.diffusion.prior import encode_prompts, load_prior
 from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object
 from data_contracts.errors import TrainingError
 
@@ -49,8 +49,8 @@ def test_scenes_do_not_depend_on_order_or_block():
 def test_mixture_of_people_and_objects():
     scenes = procedural_images.draw_block(0, 0, 60, 32)
     people = [scene for scene in scenes if scene.has_skeleton]
-    # 60 draws at 0.6: four standard deviations either way.
-    assert 20 <= len(people) <= 52
+    # 60 draws at 0.5: four standard deviations either way.
+    assert 15 <= len(people) <= 45
     assert all(scene.skeleton.any() for scene in people), (
         "a person whose skeleton is out of the picture teaches nothing"
     )
@@ -133,10 +133,22 @@ def test_pretraining_resumes_and_writes_a_prior(tmp_path):
     # Started again on its own state, a finished run only writes its result again.
     pretrain(TINY, tmp_path / "again", tmp_path / "work")
     assert same_weights(whole, load_prior(tmp_path / "again"))
-    export(TINY, tmp_path / "exported", tmp_path / "work")
-    assert same_weights(whole, load_prior(tmp_path / "exported"))
     with pytest.raises(TrainingError, match="of another run"):
-        export(TINY.model_copy(update={"seed": 1}), tmp_path / "other", tmp_path / "work")
+        pretrain(TINY.model_copy(update={"seed": 1}), tmp_path / "other", tmp_path / "work")
+
+
+def test_the_text_encoder_tells_prompts_apart_and_is_not_trained(tmp_path):
+    """A trained one had collapsed: its embeddings differed by 0.01, and no fine-tuning could tell classes apart."""
+    before = new_prior(TINY)
+    pretrain(TINY, tmp_path / "out", tmp_path / "work")
+    for prior in (before, load_prior(tmp_path / "out"), load_prior()):
+        prompts = [f"A photo of {name}" for name in ("person", "spot", "street", "leopard")]
+        embeddings = encode_prompts(prior, prompts)
+        distances = (embeddings[:, None] - embeddings[None]).square().mean(dim=(2, 3)).sqrt()
+        assert distances[~torch.eye(len(prompts), dtype=torch.bool)].min() > 0.2
+    kept = load_prior(tmp_path / "out").text_encoder.state_dict()
+    for name, weight in before.text_encoder.state_dict().items():
+        assert torch.equal(kept[name].half(), weight.half()), name
 
 
 def test_wall_clock_budget_ends_training(tmp_path):
