@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from data_contracts.errors import DataError
+
 
 @dataclass(frozen=True)
 class JointSet:
@@ -23,6 +25,13 @@ def _joint_set(*joints: str) -> JointSet:
     return JointSet(joints, tuple(joints.index(name) for name in swapped))
 
 
+SMPL_JOINTS = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+)  # fmt: skip
+SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+
 JOINT_SETS = {
     # Order of DHP19's labels (SensorsINI/DHP19, heatmap_generation_example.ipynb): right before left, hips swapped in.
     "dhp19": _joint_set(
@@ -34,14 +43,47 @@ JOINT_SETS = {
         "right_knee", "left_knee",
         "right_foot", "left_foot",
     ),
+    # Order of CDEHP's labels (CDEHP-Dataset/cdehp-dataset.github.io, annotation.md): left before right, all joints
+    # by side; it says "buttock" for hip.
+    "cdehp": _joint_set(
+        "head",
+        "left_shoulder", "right_shoulder",
+        "left_elbow", "right_elbow",
+        "left_hand", "right_hand",
+        "left_hip", "right_hip",
+        "left_knee", "right_knee",
+        "left_foot", "right_foot",
+    ),
+    "smpl": _joint_set(*SMPL_JOINTS),
 }  # fmt: skip
-
-SMPL_JOINTS = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
-    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
-    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
-)  # fmt: skip
-SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 
 # The SMPL joint behind each DHP19 joint; a hand of DHP19 is a marker at the wrist, a foot one at the ankle.
 SMPL_TO_DHP19 = (15, 17, 16, 19, 18, 2, 1, 21, 20, 5, 4, 8, 7)
+
+# SMPL names a joint of the fingers and one of the toes `hand` and `foot`; the marker sets mean wrist and ankle.
+_MARKER_ON_SMPL = {
+    f"{side}_{marker}": f"{side}_{joint}"
+    for side in ("left", "right")
+    for marker, joint in (("hand", "wrist"), ("foot", "ankle"))
+}
+
+
+def joint_indices(source: str, target: str) -> list[int]:
+    """Where in joint set `source` each joint of `target` is, to reorder joints: `joints[:, indices]`.
+
+    Joints correspond by name; of SMPL, the wrist is the hand of the other sets and the ankle the foot.
+
+    Raises:
+        DataError: an unknown joint set, or `source` lacks a joint of `target`.
+    """
+    for name in (source, target):
+        if name not in JOINT_SETS:
+            raise DataError(f"unknown joint set {name!r}; known: {', '.join(JOINT_SETS)}")
+    names = JOINT_SETS[target].joints
+    if source == "smpl" and target != "smpl":
+        names = tuple(_MARKER_ON_SMPL.get(name, name) for name in names)
+    known = JOINT_SETS[source].joints
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise DataError(f"joint set {source!r} lacks joints of {target!r}: {', '.join(missing)}")
+    return [known.index(name) for name in names]
