@@ -69,6 +69,18 @@ class ImageTrack:
         return len(self.t_us)
 
 
+def check_image_track(track: ImageTrack, where: str) -> ImageTrack:
+    """Raise `DataError` unless there are pictures, grey and 8-bit, with one time each in ascending order."""
+    images, t_us = track.images, track.t_us
+    if images.ndim != 3 or images.dtype != np.uint8 or len(images) == 0:
+        raise DataError(f"{where}: images must be [N, H, W] uint8 with N > 0, got {images.shape} {images.dtype}")
+    if t_us.shape != (len(images),) or t_us.dtype != np.int64:
+        raise DataError(f"{where}: t_us must be [{len(images)}] int64, got {t_us.shape} {t_us.dtype}")
+    if t_us[0] < 0 or (t_us[1:] < t_us[:-1]).any():
+        raise DataError(f"{where}: t_us must be non-negative and must not decrease")
+    return track
+
+
 LABEL_ARRAYS: dict[str, tuple[type, int | None]] = {
     "joints2d": (np.float32, 2),
     "visible": (np.bool_, None),

@@ -73,7 +73,7 @@ _LABELS = (
 
 RECORDINGS = TableSchema(
     "recordings",
-    1,
+    2,
     "recording_id",
     (
         _RECORDING,
@@ -89,6 +89,8 @@ RECORDINGS = TableSchema(
         Column("t_last_us", pa.int64(), "time stamp of the last event", minimum=0),
         Column("duration_us", pa.int64(), "t_last_us - t_first_us", minimum=0),
         Column("events_file", pa.string(), "Parquet file of the events; empty without events"),
+        Column("event_images_file", pa.string(), "array of released event images; empty without"),
+        Column("intensity_file", pa.string(), "array of grey pictures; empty without. Times lie beside: NAME.t_us.npy"),
     ),
 )
 PARTS = TableSchema(
@@ -102,6 +104,17 @@ PARTS = TableSchema(
         Column("event_stop", pa.int64(), "one past its last event", minimum=0),
     ),
 )
+WINDOWS = TableSchema(
+    "windows",
+    1,
+    None,
+    (
+        _RECORDING,
+        Column("event_start", pa.int64(), "first event of the window", minimum=0),
+        Column("event_stop", pa.int64(), "one past its last event", minimum=0),
+    ),
+)
+"""Windows as the dataset's authors cut them; no rows where the dataset leaves that to the user."""
 LABELS = TableSchema(
     "labels",
     2,
@@ -211,7 +224,7 @@ REPORT = TableSchema(
     None,
     (Column("table", pa.string(), "name of a table of the report"), Column("file", pa.string(), "its Parquet file")),
 )
-_ALL = (RECORDINGS, PARTS, LABELS, FRAMES, CONDITIONS, TRAINING, SYNTHETIC, SCORES, SAMPLE_SCORES, REPORT)
+_ALL = (RECORDINGS, PARTS, WINDOWS, LABELS, FRAMES, CONDITIONS, TRAINING, SYNTHETIC, SCORES, SAMPLE_SCORES, REPORT)
 TABLES = {schema.name: schema for schema in _ALL}
 
 
@@ -252,6 +265,7 @@ def _check_values(values: pa.Array, column: Column, label: str) -> None:
     if not column.nullable and values.null_count:
         refuse(values.is_null(), "a value")
     if pa.types.is_list(column.type):
+        _check_list_elements(values, column, label)
         return
     if pa.types.is_floating(column.type) and column.finite:
         refuse(pc.fill_null(pc.invert(pc.is_finite(values)), False), "a finite number")
@@ -261,6 +275,18 @@ def _check_values(values: pa.Array, column: Column, label: str) -> None:
         refuse(pc.fill_null(pc.greater(values, column.maximum), False), f"at most {column.maximum:g}")
     if column.choices is not None:
         refuse(pc.invert(pc.is_in(values, value_set=pa.array(column.choices))), f"one of {', '.join(column.choices)}")
+
+
+def _check_list_elements(values: pa.Array, column: Column, label: str) -> None:
+    """Finiteness of the numbers inside the lists of one column."""
+    elements = values.flatten()
+    if not column.finite or not pa.types.is_floating(elements.type):
+        return
+    wrong = pc.index(pc.fill_null(pc.invert(pc.is_finite(elements)), False), True).as_py()
+    if wrong >= 0:
+        row = pc.list_parent_indices(values)[wrong].as_py()
+        got = elements[wrong].as_py()
+        raise DataError(f"{label}, column {column.name!r}, row {row}: expected finite numbers, got {got!r}")
 
 
 def _check_unique(values: pa.Array, name: str, label: str) -> None:

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 from tqdm import tqdm
 
@@ -16,7 +17,7 @@ from data_contracts import tables
 from data_contracts.config import DatasetChoice
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
-from data_contracts.labels import Labels, Recording, check_labels
+from data_contracts.labels import Labels, Recording, check_image_track, check_labels
 from data_contracts.manifest import concat_labels, label_columns
 from tasks.stage import Output, stage
 
@@ -26,6 +27,7 @@ class _Ingested(NamedTuple):
 
     row: dict[str, Any]
     parts: list[dict[str, Any]]
+    windows: list[dict[str, Any]]
     labels: Labels
 
 
@@ -60,7 +62,10 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
         results = pool.map(lambda recording: _ingest_recording(plugin, recording, out), recordings)
         progress = tqdm(results, "ingest", len(recordings), unit="recording", leave=False, disable=None)
         ingested = list(progress)
-    out.write_table(pa.Table.from_pylist([p for i in ingested for p in i.parts]), tables.PARTS)
+    out.write_table(pa.Table.from_pylist([p for i in ingested for p in i.parts], tables.PARTS.arrow()), tables.PARTS)
+    out.write_table(
+        pa.Table.from_pylist([w for i in ingested for w in i.windows], tables.WINDOWS.arrow()), tables.WINDOWS
+    )
     out.write_table(_label_table(recordings, [i.labels for i in ingested]), tables.LABELS)
     return pa.Table.from_pylist([i.row for i in ingested], schema=tables.RECORDINGS.arrow())
 
@@ -73,40 +78,79 @@ def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ing
         "subject": recording.subject,
         "class_name": recording.class_name,
         "splits": "+".join(part.split for part in recording.parts),
-        "events_file": "",
+        **dict.fromkeys(("events_file", "event_images_file", "intensity_file"), ""),
         **dict.fromkeys(("sensor_width_px", "sensor_height_px", "num_events", "num_positive", "num_negative"), 0),
         **dict.fromkeys(("t_first_us", "t_last_us", "duration_us"), 0),
     }
     if recording.has_events:
-        name = f"events/{recording.recording_id}.parquet"
-        finished, attached = out.work / name, out.folder / name
-        for path in (finished, attached):
-            path.parent.mkdir(parents=True, exist_ok=True)
-        if finished.exists():  # by an earlier run that was interrupted
-            events = event_files.read_events_file(finished)
-        else:
-            events = check_events(plugin.module.read_events(recording, plugin.options), where)
-            if len(events) == 0:
-                raise DataError(f"{where}: the recording holds no events")
-            event_files.write_events_parquet(finished, events)
-        os.link(finished, attached)
-        row |= event_files.summarise(events)
-        row |= {
-            "events_file": name,
-            "sensor_width_px": events.sensor_size[0],
-            "sensor_height_px": events.sensor_size[1],
-        }
-    count = row["num_events"]
-    parts = [
-        {
-            "recording_id": recording.recording_id,
-            "split": part.split,
-            "event_start": round(part.start * count),
-            "event_stop": round(part.stop * count),
-        }
-        for part in recording.parts
-    ]
-    return _Ingested(row, parts, labels)
+        row |= _ingest_events(plugin, recording, out, where)
+    for kind, wanted in (("event_images", recording.has_event_images), ("intensity", recording.has_intensity)):
+        if wanted:
+            row |= _ingest_images(plugin, recording, out, kind, where)
+    count, name = row["num_events"], recording.recording_id
+    parts = [(part.split, round(part.start * count), round(part.stop * count)) for part in recording.parts]
+    return _Ingested(
+        row,
+        [{"recording_id": name, "split": split, "event_start": a, "event_stop": b} for split, a, b in parts],
+        _dataset_windows(plugin, recording, count, where),
+        labels,
+    )
+
+
+def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str) -> dict[str, Any]:
+    """Events into Parquet, piece by piece where the dataset reads in pieces."""
+    name = f"events/{recording.recording_id}.parquet"
+    finished, attached = out.work / name, out.folder / name
+    for path in (finished, attached):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    if finished.exists():  # by an earlier run that was interrupted
+        events = event_files.read_events_file(finished)
+    else:
+        events = check_events(plugin.module.read_events(recording, plugin.options), where)
+        if len(events) == 0:
+            raise DataError(f"{where}: the recording holds no events")
+        event_files.write_events_parquet(finished, events)
+    os.link(finished, attached)
+    width, height = events.sensor_size
+    summary = event_files.summarise(events)
+    return {"events_file": name, "sensor_width_px": width, "sensor_height_px": height, **summary}
+
+
+def _ingest_images(plugin: Plugin, recording: Recording, out: Output, kind: str, where: str) -> dict[str, Any]:
+    """Event images or intensity frames as arrays: pictures, and their times beside them."""
+    name = f"{kind}/{recording.recording_id}.npy"
+    read = plugin.module.read_event_images if kind == "event_images" else plugin.module.read_intensity_frames
+    track = check_image_track(read(recording, plugin.options), f"{where}, {kind.replace('_', ' ')}")
+    path = out.folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, track.images, allow_pickle=False)
+    np.save(path.with_suffix(".t_us.npy"), track.t_us, allow_pickle=False)
+    if kind == "intensity":
+        return {"intensity_file": name}
+    _, height, width = track.images.shape
+    return {
+        "event_images_file": name,
+        "sensor_width_px": width,
+        "sensor_height_px": height,
+        "t_first_us": int(track.t_us[0]),
+        "t_last_us": int(track.t_us[-1]),
+        "duration_us": int(track.t_us[-1] - track.t_us[0]),
+    }
+
+
+def _dataset_windows(plugin: Plugin, recording: Recording, count: int, where: str) -> list[dict[str, Any]]:
+    if not recording.has_events or not hasattr(plugin.module, "read_windows"):
+        return []
+    ranges = np.asarray(plugin.module.read_windows(recording, plugin.options))
+    if ranges.ndim != 2 or ranges.shape[1] != 2 or ranges.dtype != np.int64:
+        raise DataError(f"{where}: windows must be [W, 2] int64, got {ranges.shape} {ranges.dtype}")
+    flat = ranges.reshape(-1)
+    if len(flat) and (flat[0] < 0 or flat[-1] > count or (np.diff(flat) < 0).any()):
+        raise DataError(
+            f"{where}: windows must be ascending ranges within {count} events, got {ranges.tolist()[:4]} ..."
+        )
+    name = recording.recording_id
+    return [{"recording_id": name, "event_start": a, "event_stop": b} for a, b in ranges.tolist()]
 
 
 def _label_table(recordings: list[Recording], tracks: list[Labels]) -> pa.Table:

@@ -38,6 +38,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from ctlev_core import plugins
+from data_contracts.arrays import ArrayWriter
 from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
@@ -97,6 +98,10 @@ class Output:
     def write_array(self, name: str, array: np.ndarray) -> None:
         """Attach the array `<name>.npy`; row i belongs to row i of the manifest."""
         np.save(self.folder / f"{name}.npy", array, allow_pickle=False)
+
+    def open_array(self, name: str) -> ArrayWriter:
+        """The array `<name>.npy`, to be written row by row within a `with` block."""
+        return ArrayWriter(self.folder / f"{name}.npy")
 
     def write_table(self, table: pa.Table, schema: TableSchema) -> None:
         """Attach a second table beside the manifest."""

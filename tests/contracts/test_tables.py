@@ -69,7 +69,7 @@ def test_key_must_be_unique_and_split_known():
                     "t_first_us", "t_last_us", "duration_us",
                 )
             },
-            "events_file": ["x"] * 3,
+            **dict.fromkeys(("events_file", "event_images_file", "intensity_file"), ["x"] * 3),
         }
     )  # fmt: skip
     with pytest.raises(DataError, match=r"column 'recording_id', row 2: 'a' occurs twice"):
@@ -91,3 +91,25 @@ def test_every_schema_is_documented_and_accepts_no_rows(schema):
     assert all(column.doc for column in schema.columns)
     assert len({column.name for column in schema.columns}) == len(schema.columns)
     assert check_table(schema.arrow().empty_table(), schema, "test").num_rows == 0
+
+
+def test_numbers_inside_lists_must_be_finite_where_the_schema_says_so():
+    nan = float("nan")
+    labels = {"joints2d_px": [[1.0, nan]] * 2, "joints3d_mm": [None] * 2, "visible": [[True]] * 2}
+    table = pa.table(
+        {
+            "recording_id": ["a", "b"],
+            "subject": ["s"] * 2,
+            "class_name": [""] * 2,
+            "t_us": pa.array([0, 1], pa.int64()),
+            "joint_set": ["dhp19"] * 2,
+            "joints2d_px": pa.array(labels["joints2d_px"], pa.list_(pa.float32())),
+            "visible": pa.array(labels["visible"], pa.list_(pa.bool_())),
+            "joints3d_mm": pa.nulls(2, pa.list_(pa.float32())),
+            "smpl_pose_rad": pa.array([[0.0, 1.0], [2.0, nan]], pa.list_(pa.float32())),
+            "smpl_betas": pa.nulls(2, pa.list_(pa.float32())),
+            "smpl_transl_m": pa.nulls(2, pa.list_(pa.float32())),
+        }
+    )
+    with pytest.raises(DataError, match=r"column 'smpl_pose_rad', row 1: expected finite numbers, got nan"):
+        check_table(table, tables.LABELS, "test")

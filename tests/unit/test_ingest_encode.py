@@ -1,0 +1,146 @@
+"""The two stages between a dataset and its frames, run on a small dataset that offers everything a dataset may."""
+
+import types
+
+import numpy as np
+import pytest
+
+from ctlev_core import plugins
+from data_contracts import tables
+from data_contracts.config import DatasetChoice, EncodingChoice, Frozen, Windows
+from data_contracts.errors import DataError
+from data_contracts.events import Events
+from data_contracts.labels import ImageTrack, Labels, Part, Recording
+from data_contracts.manifest import read_manifest
+from tasks.encode import encode
+from tasks.ingest import ingest
+from tasks.store import Store
+
+SENSOR = (32, 24)
+
+
+def make_events(seed):
+    random = np.random.default_rng(seed)
+    return Events(
+        np.sort(random.integers(0, 1000, 100)).astype(np.int64),
+        random.integers(0, SENSOR[0], 100).astype(np.uint16),
+        random.integers(0, SENSOR[1], 100).astype(np.uint16),
+        random.integers(0, 2, 100).astype(np.uint8),
+        SENSOR,
+    )
+
+
+def make_dataset(*, images=False, windows=None):
+    """A dataset module of two recordings; finished event images in the place of events on demand."""
+
+    class Options(Frozen):
+        """None."""
+
+    def list_recordings(options):
+        kind = {"has_events": not images, "has_event_images": images, "has_intensity": True, "sensor_size": SENSOR}
+        return [
+            Recording(f"{split}/one", f"{split} subject", (Part(split),), class_name="walk", **kind)
+            for split in ("train", "test")
+        ]
+
+    def read_labels(recording, options):
+        t_us = np.array([0, 500, 1000], np.int64)
+        joints = np.full((3, 13, 2), 8.0, np.float32) + np.arange(3, dtype=np.float32)[:, None, None]
+        smpl = {"smpl_pose": 72, "smpl_betas": 10, "smpl_transl": 3}
+        return Labels(
+            ("walk",) * 3,
+            t_us,
+            joints,
+            np.ones((3, 13), bool),
+            "dhp19",
+            joints3d=np.full((3, 13, 3), np.nan, np.float32),
+            **{name: np.full((3, size), 0.5, np.float32) for name, size in smpl.items()},
+        )
+
+    def read_track(recording, options):
+        values = np.zeros((3, SENSOR[1], SENSOR[0]), np.uint8)
+        values[:, 8:12, 8:12] = np.array([50, 100, 200], np.uint8)[:, None, None]
+        return ImageTrack(values, np.array([0, 500, 1000], np.int64))
+
+    module = types.SimpleNamespace(
+        VERSION=1,
+        Options=Options,
+        list_recordings=list_recordings,
+        read_events=lambda recording, options: make_events(len(recording.recording_id)),
+        read_labels=read_labels,
+        read_event_images=read_track,
+        read_intensity_frames=read_track,
+    )
+    if windows is not None:
+        module.read_windows = lambda recording, options: np.array(windows, np.int64).reshape(-1, 2)
+    return module
+
+
+def run_stage(stage, **arguments):
+    """What a Prefect task does, without Prefect."""
+    return stage.run(stage.key(arguments, Store()), arguments)[0]
+
+
+@pytest.fixture
+def frames_of(home, monkeypatch):
+    """Ingest and encode a dataset module; returns both manifests."""
+
+    def run(module, windows=None, **encoding):
+        original = plugins.load
+        monkeypatch.setattr(
+            plugins, "load", lambda kind, name: module if (kind, name) == ("datasets", "test") else original(kind, name)
+        )
+        recordings = run_stage(ingest, dataset=DatasetChoice(name="test"))
+        choice = EncodingChoice(name="event_histogram", options=encoding)
+        frames = run_stage(encode, recordings=recordings, encoding=choice, windows=windows or Windows(num_events=40))
+        return read_manifest(recordings), read_manifest(frames)
+
+    return run
+
+
+def test_events_labels_and_intensity_frames_arrive(frames_of):
+    recordings, frames = frames_of(make_dataset())
+    assert len(frames) == 4 and frames.array("histograms").shape == (4, 2, 24, 32)
+    events = make_events(len("train/one"))
+    counts = np.zeros((2, 24, 32), int)
+    np.add.at(counts, (1 - events.p[:40].astype(int), events.y[:40], events.x[:40]), 1)
+    np.testing.assert_array_equal(frames.array("histograms")[0], counts)
+    assert frames.labels.smpl_pose is not None and frames.labels.smpl_pose.shape == (4, 72)
+    track = recordings.array("intensity/train/one")
+    assert track.shape == (3, 24, 32) and recordings.array("intensity/train/one.t_us").tolist() == [0, 500, 1000]
+    assert recordings.column("event_images_file") == ["", ""]
+
+
+def test_finished_event_images_become_frames_with_the_labels_of_their_moment(frames_of):
+    recordings, frames = frames_of(make_dataset(images=True), polarity=False, image_size=(16, 16))
+    assert recordings.column("num_events") == [0, 0] and recordings.column("t_last_us") == [1000, 1000]
+    assert len(frames) == 6 and frames.array("frames").shape == (6, 16, 16, 3)
+    # 32 x 24 onto 16 x 16: half the size, 2 px of bar above and below.
+    square = frames.array("frames")[:3, 6:8, 4:6]
+    assert [int(image.min()) for image in square] == [50, 100, 200]
+    assert [int(image.max()) for image in square] == [50, 100, 200]
+    assert frames.labels.joints2d is not None
+    np.testing.assert_allclose(frames.labels.joints2d[:3, 0], [[4.0, 6.0], [4.5, 6.5], [5.0, 7.0]])
+
+
+def test_finished_event_images_have_no_polarity(frames_of):
+    with pytest.raises(DataError, match="no polarity"):
+        frames_of(make_dataset(images=True), polarity=True)
+
+
+def test_windows_of_the_dataset_are_used_as_they_are(frames_of):
+    module = make_dataset(windows=[[0, 10], [10, 10], [10, 35]])
+    recordings, frames = frames_of(module, windows=Windows(method="dataset"))
+    assert len(recordings.attached(tables.WINDOWS)) == 6
+    assert frames.column("num_events") == [10, 25] * 2, "the empty window is dropped"
+
+
+def test_windows_that_the_dataset_does_not_have_are_an_error(frames_of):
+    with pytest.raises(DataError, match="without windows of its own"):
+        frames_of(make_dataset(), windows=Windows(method="dataset"))
+
+
+@pytest.mark.parametrize("wrong", [[[0, 200]], [[10, 5]], [[20, 30], [0, 10]]])
+def test_wrong_windows_are_refused(frames_of, wrong):
+    with pytest.raises(DataError, match="ascending ranges within 100 events"):
+        frames_of(make_dataset(windows=wrong), windows=Windows(method="dataset"))
