@@ -64,6 +64,14 @@ class DatasetWithWindows(Dataset, Protocol):
         ...
 
 
+class DatasetWithSynonyms(Dataset, Protocol):
+    """A dataset whose classes have several names, such as the WordNet lemmas of N-ImageNet."""
+
+    def read_synonyms(self, options: Any) -> dict[str, list[str]]:
+        """The names of each class that has more than its `class_name`; prompts draw from them."""
+        ...
+
+
 class DatasetWithEventImages(Dataset, Protocol):
     """A dataset that releases finished event images of some recordings."""
 

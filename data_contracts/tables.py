@@ -115,6 +115,12 @@ WINDOWS = TableSchema(
     ),
 )
 """Windows as the dataset's authors cut them; no rows where the dataset leaves that to the user."""
+SYNONYMS = TableSchema(
+    "synonyms",
+    1,
+    "class_name",
+    (_CLASS, Column("names", pa.list_(pa.string()), "what the class may be called in a prompt")),
+)
 LABELS = TableSchema(
     "labels",
     2,
@@ -224,7 +230,20 @@ REPORT = TableSchema(
     None,
     (Column("table", pa.string(), "name of a table of the report"), Column("file", pa.string(), "its Parquet file")),
 )
-_ALL = (RECORDINGS, PARTS, WINDOWS, LABELS, FRAMES, CONDITIONS, TRAINING, SYNTHETIC, SCORES, SAMPLE_SCORES, REPORT)
+_ALL = (
+    RECORDINGS,
+    PARTS,
+    WINDOWS,
+    SYNONYMS,
+    LABELS,
+    FRAMES,
+    CONDITIONS,
+    TRAINING,
+    SYNTHETIC,
+    SCORES,
+    SAMPLE_SCORES,
+    REPORT,
+)
 TABLES = {schema.name: schema for schema in _ALL}
 
 

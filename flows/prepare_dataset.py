@@ -31,7 +31,11 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         recordings, encoding=experiment.encoding, windows=experiment.windows, label=experiment.encoding.name
     )
     frame_conditions = condition_frames(
-        frames, condition=experiment.condition, seed=experiment.seed, label=f"{experiment.condition.name}, training"
+        recordings,
+        frames,
+        condition=experiment.condition,
+        seed=experiment.seed,
+        label=f"{experiment.condition.name}, training",
     )
     sample_conditions = condition_samples(
         recordings,

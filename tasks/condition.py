@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.plugins import Plugin
 from data_contracts import tables
 from data_contracts.config import ConditionChoice, EncodingChoice
 from data_contracts.labels import Labels
@@ -15,16 +16,19 @@ from data_contracts.manifest import Manifest, label_columns, labels_of
 from tasks.stage import Output, stage
 
 
-@stage(version=1, schema=tables.CONDITIONS)
-def condition_frames(out: Output, frames: Manifest, *, condition: ConditionChoice, seed: int) -> pa.Table:
+@stage(version=2, schema=tables.CONDITIONS)
+def condition_frames(
+    out: Output, recordings: Manifest, frames: Manifest, *, condition: ConditionChoice, seed: int
+) -> pa.Table:
     """Render the condition of every training frame; rows join the frames on `sample_id`."""
     rows = frames.rows_where(split="train")
     names = [frames.column("sample_id")[row] for row in rows]
     subjects = [frames.column("subject")[row] for row in rows]
-    return _render(out, names, names, subjects, frames.labels.take(rows), condition, _image_size(frames), seed)
+    plugin = _load_condition(condition, recordings)
+    return _render(out, names, names, subjects, frames.labels.take(rows), plugin, _image_size(frames), seed)
 
 
-@stage(version=1, schema=tables.CONDITIONS)
+@stage(version=2, schema=tables.CONDITIONS)
 def condition_samples(
     out: Output,
     recordings: Manifest,
@@ -50,7 +54,8 @@ def condition_samples(
     chosen = balanced_choice(labels.class_names, count, seed)
     sample_ids = [f"condition/{number:06d}" for number in range(count)]
     source_ids, subjects = [names[row] for row in chosen], [subjects[row] for row in chosen]
-    return _render(out, sample_ids, source_ids, subjects, labels.take(chosen), condition, _image_size(frames), seed)
+    plugin = _load_condition(condition, recordings)
+    return _render(out, sample_ids, source_ids, subjects, labels.take(chosen), plugin, _image_size(frames), seed)
 
 
 def balanced_choice(class_names: tuple[str, ...], count: int, seed: int) -> np.ndarray:
@@ -86,6 +91,16 @@ def _label_only(
     return names, table["subject"].to_pylist(), labels
 
 
+def _load_condition(condition: ConditionChoice, recordings: Manifest) -> Plugin:
+    """The condition plug-in; one that takes synonyms also gets the dataset's own, the user's before them."""
+    plugin = plugins.load_options(condition)
+    own = getattr(plugin.options, "synonyms", None)
+    if own is None:
+        return plugin
+    of_dataset = {row["class_name"]: row["names"] for row in recordings.attached(tables.SYNONYMS).to_pylist()}
+    return replace(plugin, options=plugin.options.model_copy(update={"synonyms": {**of_dataset, **own}}))
+
+
 def _image_size(frames: Manifest) -> tuple[int, int]:
     _, height, width, _ = frames.array("frames").shape
     return width, height
@@ -97,11 +112,10 @@ def _render(
     source_ids: list[str],
     subjects: list[str],
     labels: Labels,
-    condition: ConditionChoice,
+    plugin: Plugin,
     image_size: tuple[int, int],
     seed: int,
 ) -> pa.Table:
-    plugin = plugins.load_options(condition)
     seeds = [int(np.random.SeedSequence([seed, row]).generate_state(1)[0]) for row in range(len(labels))]
     rendered = plugin.module.render(labels, image_size, plugin.options, seeds)
     if rendered.images is not None:

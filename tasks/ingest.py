@@ -66,6 +66,9 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     out.write_table(
         pa.Table.from_pylist([w for i in ingested for w in i.windows], tables.WINDOWS.arrow()), tables.WINDOWS
     )
+    synonyms = plugin.module.read_synonyms(plugin.options) if hasattr(plugin.module, "read_synonyms") else {}
+    named = [{"class_name": name, "names": list(names)} for name, names in sorted(synonyms.items())]
+    out.write_table(pa.Table.from_pylist(named, tables.SYNONYMS.arrow()), tables.SYNONYMS)
     out.write_table(_label_table(recordings, [i.labels for i in ingested]), tables.LABELS)
     return pa.Table.from_pylist([i.row for i in ingested], schema=tables.RECORDINGS.arrow())
 

@@ -1,4 +1,4 @@
-"""The two stages between a dataset and its frames, run on a small dataset that offers everything a dataset may."""
+"""The stages between a dataset and its frames and conditions, on a small dataset that offers all a dataset may."""
 
 import types
 
@@ -7,11 +7,12 @@ import pytest
 
 from ctlev_core import plugins
 from data_contracts import tables
-from data_contracts.config import DatasetChoice, EncodingChoice, Frozen, Windows
+from data_contracts.config import ConditionChoice, DatasetChoice, EncodingChoice, Frozen, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording
 from data_contracts.manifest import read_manifest
+from tasks.condition import condition_frames
 from tasks.encode import encode
 from tasks.ingest import ingest
 from tasks.store import Store
@@ -144,3 +145,17 @@ def test_windows_that_the_dataset_does_not_have_are_an_error(frames_of):
 def test_wrong_windows_are_refused(frames_of, wrong):
     with pytest.raises(DataError, match="ascending ranges within 100 events"):
         frames_of(make_dataset(windows=wrong), windows=Windows(method="dataset"))
+
+
+def test_prompts_draw_from_the_names_the_dataset_knows(frames_of):
+    module = make_dataset()
+    module.read_synonyms = lambda options: {"walk": ["stroll", "amble"]}
+    recordings, frames = frames_of(module, windows=Windows(num_events=10))
+
+    def prompts(**options):
+        choice = ConditionChoice(name="text", options={"template": "{class_name}", **options})
+        made = run_stage(condition_frames, recordings=recordings.ref, frames=frames.ref, condition=choice, seed=0)
+        return set(read_manifest(made).column("prompt"))
+
+    assert prompts() == {"stroll", "amble"}
+    assert prompts(synonyms={"walk": ["march"]}) == {"march"}, "the user's names come first"
