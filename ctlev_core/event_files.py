@@ -12,17 +12,25 @@ from data_contracts.events import Events
 
 
 def find_format(path: Path) -> ModuleType:
-    """The format plug-in whose `sniff` recognises the file's content; the suffix is not asked.
+    """The one format plug-in whose `sniff` recognises the file's content; the suffix is not asked.
+
+    Formats whose files carry a signature are asked first, all of them. Those without (`HAS_SIGNATURE = False`: a table
+    of numbers, ATIS records) recognise what is merely plausible; they are asked only where no signature is found.
 
     Raises:
-        DataError: no such file, or no format recognises it; the message lists the known formats.
+        DataError: no such file; no format recognises it, then the message lists the known formats; or several do, then
+            it names them.
     """
     if not path.is_file():
         raise DataError(f"{path}: expected an event file, got {'a folder' if path.is_dir() else 'nothing there'}")
     formats = {name: plugins.load("formats", name) for name in plugins.names("formats")}
-    for module in formats.values():
-        if module.sniff(path):
-            return module
+    for has_signature in (True, False):
+        asked = [name for name in formats if getattr(formats[name], "HAS_SIGNATURE", True) == has_signature]
+        claims = [name for name in asked if formats[name].sniff(path)]
+        if len(claims) > 1:
+            raise DataError(f"{path}: could be any of the formats {', '.join(claims)}; expected exactly one to fit")
+        if claims:
+            return formats[claims[0]]
     known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in formats.items())
     raise DataError(
         f"{path}: not an event file of a known format ({path.stat().st_size} bytes); known formats: {known}"

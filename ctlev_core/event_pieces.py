@@ -60,20 +60,24 @@ def check_pieces(pieces: Iterable[Events], where: str) -> Iterator[Events]:
     Raises:
         DataError: a piece breaks `check_events`, starts before the last one ended, or has another sensor size.
     """
-    num_before = 0
-    last_t: int | None = None
+    num_before = last_t = 0
     sensor_size: SensorSize | None = None
     for piece in pieces:
-        check_events(piece, f"{where} (counted from event {num_before})" if num_before else where)
         if sensor_size is not None and piece.sensor_size != sensor_size:
             raise DataError(
                 f"{where}: sensor_size must be {sensor_size} throughout, got {piece.sensor_size} from event "
                 f"{num_before} on"
             )
         sensor_size = piece.sensor_size
+        check_piece(piece, where, num_before, last_t)
         if len(piece):
-            if last_t is not None and piece.t[0] < last_t:
-                raise DataError(f"{where}: t decreases at event {num_before}: {last_t} us, then {piece.t[0]} us")
             last_t = int(piece.t[-1])
             num_before += len(piece)
         yield piece
+
+
+def check_piece(piece: Events, where: str, num_before: int, last_t: int) -> Events:
+    """`check_events` for a piece that follows `num_before` events, the last of them at `last_t` (0 where none is)."""
+    if num_before and len(piece) and piece.t[0] < last_t:
+        raise DataError(f"{where}: t decreases at event {num_before}: {last_t} us, then {piece.t[0]} us")
+    return check_events(piece, f"{where} (events counted from event {num_before})" if num_before else where)
