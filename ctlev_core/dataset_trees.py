@@ -1,0 +1,126 @@
+"""Folders of downloaded datasets: found where they should be, listed safely, and errors that show the expected tree."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from data_contracts.errors import DataError
+
+T = TypeVar("T")
+
+ARCHIVES = (".zip", ".7z", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".rar")
+_NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+def check_root(root: Path, tree: str, is_root: Callable[[Path], bool]) -> Path:
+    """The root of a dataset.
+
+    Args:
+        root: what the user gave.
+        tree: the expected tree, for the error.
+        is_root: does a folder look like the root?
+    Raises:
+        DataError: no such folder, or it is not the root: one level too high or too low, not unpacked, or something
+            else; the message says which, and shows the tree.
+    """
+    if not root.is_dir():
+        problem = "a file, not a folder" if root.exists() else "no such folder"
+        raise DataError(f"{root}: {problem}; {tree}")
+    if is_root(root):
+        return root
+    for parent in list(root.resolve().parents)[:3]:
+        if is_root(parent):
+            raise DataError(f"{root}: lies inside the dataset; the root is {parent}; {tree}")
+    folders = [entry for entry in list_folder(root) if entry.is_dir()]
+    below = [entry for folder in folders for entry in list_folder(folder) if entry.is_dir()]
+    for candidate in folders + below:
+        if is_root(candidate):
+            raise DataError(f"{root}: not the dataset itself; the root is {candidate}; {tree}")
+    packed = [entry.name for entry in list_folder(root) if entry.suffix.lower() in ARCHIVES]
+    if packed:
+        raise DataError(f"{root}: holds archives that are not unpacked ({', '.join(packed[:3])}); {tree}")
+    raise DataError(f"{root}: not the expected folder; {tree}")
+
+
+def list_folder(folder: Path) -> list[Path]:
+    """Entries that are not hidden, sorted by name.
+
+    Raises:
+        DataError: the folder cannot be read, or a link in it leads nowhere.
+    """
+    try:
+        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    except OSError as error:
+        raise DataError(f"{folder}: the folder cannot be read: {error.strerror}") from error
+    for entry in entries:
+        if entry.is_symlink() and not entry.exists():
+            raise DataError(f"{entry}: a link to nothing")
+    return entries
+
+
+def check_inside(path: Path, root: Path) -> Path:
+    """Raise `DataError` where a link leads out of the root: a dataset is what lies in its folder."""
+    if path.is_symlink() and not path.resolve().is_relative_to(root.resolve()):
+        raise DataError(f"{path}: links to {path.resolve()}, outside the dataset folder {root}")
+    return path
+
+
+def list_files(folder: Path, root: Path, suffix: str) -> list[Path]:
+    """Files of one kind in a folder, sorted by name; others are left alone.
+
+    Raises:
+        DataError: there are none, or one is a link out of the root.
+    """
+    files = [entry for entry in list_folder(folder) if entry.suffix.lower() == suffix and not entry.is_dir()]
+    if not files:
+        raise DataError(f"{folder}: expected *{suffix} files, found none")
+    return [check_inside(file, root) for file in files]
+
+
+def check_name(path: Path) -> str:
+    """The name of a file without suffix, or of a folder, as part of a recording id.
+
+    Raises:
+        DataError: it has other characters than letters, digits, `.`, `_` and `-`.
+    """
+    name = path.stem if path.is_file() else path.name
+    if _NOT_IN_IDS.search(name):
+        raise DataError(f"{path}: expected a name of letters, digits, '.', '_' and '-', got {name!r}")
+    return name
+
+
+def recording_ids(paths: Iterable[Path], root: Path) -> list[str]:
+    """Recording ids of files with free names: the paths within the root without suffix, other characters as `_`.
+
+    Raises:
+        DataError: two files get the same id.
+    """
+    owners: dict[str, Path] = {}
+    for path in paths:
+        parts = path.relative_to(root).with_suffix("").parts
+        name = "/".join(_NOT_IN_IDS.sub("_", part) for part in parts)
+        if name in owners:
+            raise DataError(f"{path}: would get the recording id {name!r} of {owners[name]}; rename one of them")
+        owners[name] = path
+    return list(owners)
+
+
+def shuffled(items: Sequence[T], seed: int, *salt: str) -> list[T]:
+    """The items in a random order that depends on their number, the seed and the salt alone.
+
+    Taking the first n of it is a choice that grows with n: the choice of 50 is part of the choice of 100.
+    """
+    digest = hashlib.sha256("\0".join(salt).encode()).digest()
+    random = np.random.default_rng([seed, *np.frombuffer(digest, "<u4").tolist()])
+    return [items[index] for index in random.permutation(len(items))]
+
+
+def first_of(items: Sequence[T], count: int | None) -> list[T]:
+    """The first `count` items, all of them where `count` is None."""
+    return list(items) if count is None else list(items[:count])

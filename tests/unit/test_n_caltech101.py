@@ -1,0 +1,219 @@
+"""N-Caltech101: trees in the published layout become split recordings; every bad tree one error that says where."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from ctlev_core import plugins
+from ctlev_core.datasets import n_caltech101
+from data_contracts.config import DatasetChoice
+from data_contracts.errors import DataError
+from data_contracts.labels import Part, check_labels
+
+# Table 5 of the paper, as printed.
+TABLE_5 = ["bonsai", "ceiling fan", "ferry", "joshua tree", "minaret", "pagoda", "sunflower", "water lilly",
+           "windsor chair", "chandelier"]  # fmt: skip
+
+
+def write_atis(path: Path, t: list[int], x: list[int], y: list[int], p: list[int]) -> Path:
+    """40 bits an event, as the dataset's paper describes them: x, y, polarity and 23 bits of time, high byte first."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    words = [struct.pack(">BBBH", a, b, d << 7 | c >> 16, c & 0xFFFF) for a, b, c, d in zip(x, y, t, p, strict=True)]
+    path.write_bytes(b"".join(words))
+    return path
+
+
+def write_some(path: Path, seed: int = 0, num_events: int = 200) -> Path:
+    random = np.random.default_rng(seed)
+    t = np.sort(random.integers(0, 300_000, num_events)).tolist()
+    x, y, p = (random.integers(0, limit, num_events).tolist() for limit in (200, 150, 2))
+    return write_atis(path, t, x, y, p)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Four classes of eight, the background, and what else lies in a download."""
+    root = tmp_path / "Caltech101"
+    for name in ("accordion", "crocodile_head", "bonsai", "ferry", "BACKGROUND_Google"):
+        for number in range(1, 9):
+            write_some(root / name / f"image_{number:04d}.bin", number)
+    (root / "Annotations" / "accordion").mkdir(parents=True)
+    (root / "ReadMe(Caltech101)-SINAPSE-G.txt").write_text("about")
+    (root / "accordion" / "Thumbs.db").write_text("x")
+    return root
+
+
+def listed(root: Path, **options) -> list:
+    return n_caltech101.list_recordings(n_caltech101.Options(root=root, **options))
+
+
+def ids(recordings: list, split: str) -> list[str]:
+    return [r.recording_id for r in recordings if r.parts == (Part(split),)]
+
+
+def test_each_class_is_split_and_no_recording_is_in_two_splits(root):
+    recordings = listed(root, test_fraction=0.25, validation_fraction=0.25)
+    assert len(recordings) == len({r.recording_id for r in recordings}) == 32
+    for split, number in (("train", 4), ("validation", 2), ("test", 2)):
+        classes = [name.split("/")[0] for name in ids(recordings, split)]
+        assert classes == sorted(["accordion", "crocodile_head", "bonsai", "ferry"] * number)
+    assert all(r.subject == r.recording_id and r.sensor_size == (240, 180) for r in recordings)
+    first = recordings[0]
+    assert first.files[0].parent == root / "accordion" and first.recording_id.startswith("accordion/image_000")
+    assert {r.class_name for r in recordings} == {"accordion", "crocodile head", "bonsai", "ferry"}
+
+
+def test_the_split_follows_the_seed_and_a_class_knows_nothing_of_the_others(root):
+    before, other = ids(listed(root), "test"), ids(listed(root, seed=1), "test")
+    assert before == ids(listed(root), "test") != other
+    shutil.rmtree(root / "bonsai")
+    assert ids(listed(root), "test") == [name for name in before if not name.startswith("bonsai")]
+
+
+def test_smaller_choices_are_part_of_larger_ones_and_tests_stay(root):
+    two, four = (listed(root, images_per_class=number) for number in (2, 4))
+    assert len(ids(two, "train")) == 8 and set(ids(two, "train")) < set(ids(four, "train"))
+    assert ids(two, "test") == ids(four, "test") and len(ids(two, "test")) == 8
+    assert len(ids(listed(root, test_images_per_class=1), "test")) == 4
+
+
+def test_the_background_is_there_only_when_asked_for(root):
+    assert "background" not in {r.class_name for r in listed(root)}
+    assert "background" in {r.class_name for r in listed(root, background=True)}
+
+
+def test_zero_shot_classes_are_those_of_table_5_and_are_only_tested_and_sampled(root):
+    assert [n_caltech101.class_name_of(name) for name in n_caltech101.ZERO_SHOT] == TABLE_5
+    recordings, ordinary = listed(root, zero_shot=True), listed(root)
+    assert {r.class_name for r in recordings if r.parts == (Part("train"),)} == {"accordion", "crocodile head"}
+    assert ids(recordings, "test") == [n for n in ids(ordinary, "test") if n.split("/")[0] in ("bonsai", "ferry")]
+    labels_only = [r for r in recordings if not r.has_events]
+    assert ids(recordings, "condition") == ["condition/bonsai", "condition/ferry"]
+    assert [r.class_name for r in labels_only] == ["bonsai", "ferry"] and labels_only[0].files == ()
+    with pytest.raises(DataError, match=r"zero_shot needs classes to learn from and some of bonsai, .*are: accordion"):
+        listed(root, zero_shot=True, classes=("accordion",))
+
+
+def test_classes_can_be_chosen_by_folder_or_name(root):
+    chosen = listed(root, classes=("crocodile head", "bonsai"))
+    assert {r.class_name for r in chosen} == {"crocodile head", "bonsai"}
+    assert listed(root, classes=("crocodile_head", "bonsai")) == chosen
+    with pytest.raises(DataError, match=r"no class 'gorilla'; there are: BACKGROUND_Google, accordion"):
+        listed(root, classes=("gorilla",))
+
+
+def test_all_101_folders_have_readable_names_of_their_own():
+    names = [n_caltech101.class_name_of(name) for name in n_caltech101.CLASSES]
+    assert len(set(names)) == 101 and not any("_" in name for name in names)
+    assert {"airplane", "face", "sea horse", "water lilly"} <= set(names)
+    synonyms = n_caltech101.read_synonyms(n_caltech101.Options(root=Path()))
+    assert synonyms["sea horse"] == ["sea horse"] and set(synonyms) == set(names)
+
+
+def test_the_split_of_est_is_used_as_it_is(tmp_path):
+    root = tmp_path / "N-Caltech101"
+    for split, count in (("training", 3), ("validation", 1), ("testing", 2)):
+        for name in ("accordion", "bonsai", "BACKGROUND_Google"):
+            for number in range(count):
+                path = root / split / name / f"{name}_{split[:2]}{number}.npy"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                np.save(path, np.zeros((3, 4), np.float32))
+    recordings = listed(root, test_fraction=0.9)
+    assert ids(recordings, "train") == [f"{c}/{c}_tr{n}" for c in ("accordion", "bonsai") for n in range(3)]
+    assert len(ids(recordings, "validation")) == 2 and len(ids(recordings, "test")) == 4
+    for folder in ("training", "testing"):
+        with pytest.raises(DataError, match=f"{folder}: lies inside the dataset; the root is .*N-Caltech101;"):
+            listed(root / folder)
+    np.save(root / "testing" / "bonsai" / "bonsai_tr0.npy", np.zeros((3, 4), np.float32))
+    with pytest.raises(DataError, match=r"bonsai_tr0\.npy: the same recording is in .*training"):
+        listed(root)
+
+
+def test_events_and_label_of_a_recording(root):
+    x, y = [0, 239, 17, 3], [0, 179, 5, 3]
+    file = write_atis(root / "bonsai" / "image_0001.bin", [0, 5, 70_000, 8_388_607], x, y, [0, 1, 1, 0])
+    options = n_caltech101.Options(root=root)
+    recording = next(r for r in listed(root) if r.files == (file,))
+    events = n_caltech101.read_events(recording, options)
+    assert events.sensor_size == (240, 180)
+    assert (events.x.tolist(), events.y.tolist(), events.p.tolist()) == (x, y, [0, 1, 1, 0])
+    assert events.t.tolist() == [0, 5, 70_000, 8_388_607]
+    assert check_labels(n_caltech101.read_labels(recording, options), "labels").class_names == ("bonsai",)
+
+
+def test_a_few_events_outside_the_field_are_dropped_and_many_are_an_error(root):
+    options = n_caltech101.Options(root=root)
+    x, y = [240] + [10] * 199, [0] * 199 + [179]
+    write_atis(root / "bonsai" / "image_0001.bin", list(range(200)), x, y, [1] * 200)
+    recording = next(r for r in listed(root) if r.recording_id == "bonsai/image_0001")
+    events = n_caltech101.read_events(recording, options)
+    assert len(events) == 199 and events.t[0] == 1 and events.sensor_size == (240, 180)
+    write_atis(root / "bonsai" / "image_0001.bin", list(range(200)), x, [180] * 3 + [9] * 197, [1] * 200)
+    with pytest.raises(DataError, match=r"image_0001\.bin: expected events within 240 x 180 px, got 3 of 200 outside"):
+        n_caltech101.read_events(recording, options)
+
+
+def test_extent_is_the_box_of_the_events(root):
+    write_atis(root / "bonsai" / "image_0001.bin", [0, 1, 2], [30, 45, 31], [100, 100, 119], [1, 1, 0])
+    options = n_caltech101.Options(root=root, sensor="extent")
+    recording = next(r for r in n_caltech101.list_recordings(options) if r.recording_id == "bonsai/image_0001")
+    events = n_caltech101.read_events(recording, options)
+    assert events.sensor_size == (16, 20) and recording.sensor_size is None
+    assert (events.x.tolist(), events.y.tolist()) == ([0, 15, 1], [0, 0, 19])
+
+
+@pytest.mark.parametrize("content", [b"", b"12345678901"], ids=["empty", "cut"])
+def test_files_that_are_no_recording(content, root):
+    (root / "bonsai" / "image_0001.bin").write_bytes(content)
+    recording = next(r for r in listed(root) if r.recording_id == "bonsai/image_0001")
+    with pytest.raises(DataError, match=r"image_0001\.bin"):
+        n_caltech101.read_events(recording, n_caltech101.Options(root=root))
+
+
+def assert_refused(root: Path, message: str, shows_tree: bool = True) -> None:
+    with pytest.raises(DataError, match=message) as error:
+        listed(root)
+    assert ("ROOT/\n    accordion/\n      image_0001.bin" in str(error.value)) == shows_tree
+
+
+def test_a_root_that_is_not_there_or_a_file(root):
+    assert_refused(root / "absent", "absent: no such folder")
+    assert_refused(root / "ReadMe(Caltech101)-SINAPSE-G.txt", "a file, not a folder")
+
+
+def test_a_root_one_level_too_high_or_too_low(root):
+    assert_refused(root.parent, "not the dataset itself; the root is .*/Caltech101;")
+    assert_refused(root.parent.parent, "not the dataset itself; the root is .*/Caltech101;")
+    assert_refused(root / "bonsai", "bonsai: lies inside the dataset; the root is .*/Caltech101;")
+
+
+def test_a_download_that_is_not_unpacked(tmp_path):
+    (tmp_path / "deep" / "deeper").mkdir(parents=True)
+    (tmp_path / "deep" / "deeper" / "Caltech101.zip").write_bytes(b"PK")
+    assert_refused(tmp_path / "deep" / "deeper", r"archives that are not unpacked \(Caltech101\.zip\)")
+
+
+def test_folders_that_are_wrong(root, tmp_path):
+    (root / "gorilla").mkdir()
+    assert_refused(root, "'gorilla' is no class of N-Caltech101")
+    (root / "gorilla").rmdir()
+    (root / "lamp").mkdir()
+    assert_refused(root, r"lamp: expected \*\.bin files, found none", shows_tree=False)
+    write_some(root / "lamp" / "image_0001.bin")
+    assert_refused(root, "lamp: 1 recordings are too few to split; 2 are needed", shows_tree=False)
+    outside = write_some(tmp_path / "outside.bin")
+    (root / "lamp" / "image_0002.bin").symlink_to(outside)
+    assert_refused(root, r"image_0002\.bin: links to .*outside\.bin, outside the dataset folder", shows_tree=False)
+
+
+def test_fractions_that_leave_nothing(root):
+    with pytest.raises(ValidationError, match="leave nothing to learn from"):
+        n_caltech101.Options(root=root, test_fraction=0.5, validation_fraction=0.5)
+    with pytest.raises(plugins.PluginError, match="option 'root': field required"):
+        plugins.load_options(DatasetChoice(name="n_caltech101"))
