@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
 from ctlev_core.diffusion.options import FineTuningOptions
 from ctlev_core.diffusion.prior import (
     Prior,
@@ -26,16 +27,7 @@ from ctlev_core.diffusion.prior import (
     save_prior,
 )
 from ctlev_core.diffusion.small_prior import break_zeros
-from ctlev_core.diffusion.training import (
-    Batch,
-    Denoiser,
-    NoiseSchedule,
-    Trainer,
-    generator_for,
-    run_training,
-    sample_rows,
-    validation_losses,
-)
+from ctlev_core.diffusion.training import Trainer, run_training, sample_rows
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History

@@ -17,6 +17,7 @@ import torch
 from pydantic import Field
 
 from ctlev_core.diffusion import procedural_images
+from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
 from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.prior import (
@@ -28,15 +29,7 @@ from ctlev_core.diffusion.prior import (
     save_prior,
 )
 from ctlev_core.diffusion.small_prior import IMAGE_SIZE, SCHEDULER_CONFIG, WIDTHS, build_prior
-from ctlev_core.diffusion.training import (
-    Batch,
-    Denoiser,
-    NoiseSchedule,
-    Trainer,
-    run_training,
-    sample_rows,
-    validation_losses,
-)
+from ctlev_core.diffusion.training import Trainer, run_training, sample_rows
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
 from data_contracts.labels import History

@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.options import SamplingOptions
 from ctlev_core.diffusion.prior import Prior, choose_device, conditions_to_tensor, encode_prompts, load_prior
-from ctlev_core.diffusion.training import Denoiser
 from data_contracts.config import cache_material
 from data_contracts.labels import Conditions
 

@@ -11,76 +11,20 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.options import TrainingOptions
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
 MAX_NON_FINITE = 10
-MAX_SAMPLE_WEIGHT = 20.0
 BETAS = (0.9, 0.999)
-
-
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """What one denoising step sees.
-
-    Attributes:
-        latents: [B, C, h, w] clean latents, already multiplied by the scaling factor.
-        embeddings: [B, L, D] prompt embeddings.
-        conditions: [K, 3, H, W] condition images in [0, 1] of the first K <= B rows, or None; the other rows go through
-            the U-Net alone.
-    """
-
-    latents: Tensor
-    embeddings: Tensor
-    conditions: Tensor | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Denoiser:
-    """U-Net and ControlNet as one function of (noisy latents, time step, prompt, condition)."""
-
-    unet: Any
-    controlnet: Any | None = None
-
-    def predict(self, noisy: Tensor, timesteps: Tensor, embeddings: Tensor, conditions: Tensor | None) -> Tensor:
-        """The U-Net's output [B, C, h, w]; rows beyond those of `conditions` get no residuals."""
-        if self.controlnet is None or conditions is None or len(conditions) == 0:
-            return self.unet(noisy, timesteps, encoder_hidden_states=embeddings).sample
-        steered, total = len(conditions), len(noisy)
-        down, middle = self.controlnet(
-            noisy[:steered],
-            timesteps[:steered],
-            encoder_hidden_states=embeddings[:steered],
-            controlnet_cond=conditions,
-            return_dict=False,
-        )
-
-        def padded(residual: Tensor) -> Tensor:
-            return torch.nn.functional.pad(residual, (0, 0) * 3 + (0, total - steered))
-
-        return self.unet(
-            noisy,
-            timesteps,
-            encoder_hidden_states=embeddings,
-            down_block_additional_residuals=[padded(residual) for residual in down],
-            mid_block_additional_residual=padded(middle),
-        ).sample
-
-
-def generator_for(*entropy: int) -> torch.Generator:
-    """A CPU random stream of its own for each tuple of non-negative integers."""
-    state = int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
-    return torch.Generator().manual_seed(state & (2**63 - 1))
 
 
 def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray:
@@ -89,91 +33,6 @@ def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray
     epochs = positions // count
     orders = {epoch: np.random.default_rng([seed, int(epoch)]).permutation(count) for epoch in np.unique(epochs)}
     return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
-
-
-class NoiseSchedule:
-    """alpha_bar(t) of a scheduler config, and what the network must predict.
-
-    Source: Ho et al., DDPM, 2020 (eq. 4); Salimans and Ho, 2022 (v-prediction); Hang et al., 2023 (min-SNR weights).
-    """
-
-    def __init__(self, scheduler_config: dict[str, Any]) -> None:
-        from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
-
-        self._scheduler: Any = DDPMScheduler.from_config(scheduler_config)
-        self.prediction_type = str(self._scheduler.config["prediction_type"])
-        if self.prediction_type not in ("epsilon", "v_prediction", "sample"):
-            raise ValueError(f"prediction_type must be epsilon, v_prediction or sample, got {self.prediction_type!r}")
-        self.alphas_cumprod = self._scheduler.alphas_cumprod
-        self.num_timesteps = len(self.alphas_cumprod)
-
-    def noised(self, latents: Tensor, noise: Tensor, timesteps: Tensor) -> tuple[Tensor, Tensor]:
-        """Noisy latents, and the target: the noise, the latents, or v = sqrt(a) noise - sqrt(1 - a) latents."""
-        noisy = self._scheduler.add_noise(latents, noise, timesteps)
-        if self.prediction_type != "v_prediction":
-            return noisy, noise if self.prediction_type == "epsilon" else latents
-        return noisy, self._scheduler.get_velocity(latents, noise, timesteps)
-
-    def loss_weights(self, timesteps: Tensor, snr_gamma: float | None) -> Tensor:
-        """Weights [B] of the squared errors.
-
-        With `snr_gamma` min-SNR weights: min(snr, gamma) of the error in the latents, which over snr is of that in the
-        noise and over snr + 1 of that in v. Without: 1; for networks that predict the latents what makes the loss equal
-        to that of v, snr + 1, up to `MAX_SAMPLE_WEIGHT` and with mean 1 over the schedule.
-        """
-        alpha_bar = self.alphas_cumprod[timesteps]
-        if snr_gamma is None and self.prediction_type == "sample":
-            weights = (1 / (1 - self.alphas_cumprod)).clamp(max=MAX_SAMPLE_WEIGHT)
-            return weights[timesteps] / weights.mean()
-        if snr_gamma is None:
-            return torch.ones(len(timesteps))
-        if self.prediction_type == "sample":
-            return (alpha_bar / (1 - alpha_bar)).clamp(max=snr_gamma)
-        # min(snr, g) / (snr + 1) and min(snr, g) / snr, multiplied out: no end of the schedule divides 0 by 0.
-        signal, noise = alpha_bar, 1 - alpha_bar
-        clipped = torch.minimum(signal, snr_gamma * noise)
-        return clipped if self.prediction_type == "v_prediction" else clipped / signal.clamp(min=1e-8)
-
-
-def denoising_loss(
-    denoiser: Denoiser, schedule: NoiseSchedule, batch: Batch, generator: torch.Generator, snr_gamma: float | None
-) -> Tensor:
-    """Weighted mean squared error of the prediction at random time steps; noise comes from the CPU stream."""
-    timesteps = torch.randint(0, schedule.num_timesteps, (len(batch.latents),), generator=generator)
-    noise = torch.randn(batch.latents.shape, generator=generator)
-    device = batch.latents.device
-    noisy, target = schedule.noised(batch.latents, noise.to(device), timesteps.to(device))
-    predicted = denoiser.predict(noisy, timesteps.to(device), batch.embeddings, batch.conditions)
-    error = (predicted.float() - target.float()).square().mean(dim=(1, 2, 3))
-    return (schedule.loss_weights(timesteps, snr_gamma).to(device) * error).mean()
-
-
-def validation_losses(
-    denoiser: Denoiser, schedule: NoiseSchedule, batch: Batch, *, seed: int, batch_size: int
-) -> tuple[float, float]:
-    """Unweighted loss with the true and with shuffled conditions, over the same noise.
-
-    The difference says how much the network uses its condition; the loss alone does not. Prompts are shuffled where
-    there are no condition images.
-    """
-    count = len(batch.latents)
-    order = torch.arange(count).roll(max(1, count // 2))
-    losses = []
-    for shuffled in (False, True):
-        conditions, embeddings = batch.conditions, batch.embeddings
-        if shuffled and conditions is not None:
-            conditions = conditions[order]
-        elif shuffled:
-            embeddings = embeddings[order]
-        total = 0.0
-        for start in range(0, count, batch_size):
-            rows = slice(start, start + batch_size)
-            part = Batch(batch.latents[rows], embeddings[rows], None if conditions is None else conditions[rows])
-            with torch.no_grad():
-                loss = denoising_loss(denoiser, schedule, part, generator_for(seed, start), None)
-            total += float(loss) * len(part.latents)
-        losses.append(total / count)
-    return losses[0], losses[1]
 
 
 class Trainer:

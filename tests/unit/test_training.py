@@ -10,15 +10,10 @@ from hypothesis import strategies as st
 from tiny_prior import make_data, make_prior, shared_prior
 
 from ctlev_core.diffusion import training
+from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for
 from ctlev_core.diffusion.finetuning import fine_tune, forget_weights
 from ctlev_core.diffusion.options import FineTuningOptions
-from ctlev_core.diffusion.training import (
-    Batch,
-    Denoiser,
-    NoiseSchedule,
-    generator_for,
-    sample_rows,
-)
+from ctlev_core.diffusion.training import sample_rows
 from data_contracts.errors import TrainingError
 from data_contracts.labels import Conditions
 
@@ -181,9 +176,22 @@ def test_min_snr_weights_follow_the_definition():
     assert torch.equal(schedule.loss_weights(timesteps, None), torch.ones(5))
 
 
+def test_a_network_that_predicts_the_latents_is_weighted_like_one_that_predicts_v():
+    """|v - v'|^2 = (snr + 1) |x - x'|^2 at the same noisy latents, so equal networks have equal losses up to the cap."""
+    schedule = NoiseSchedule({**shared_prior().scheduler_config, "prediction_type": "sample"})
+    latents, noise = torch.randn(2, 3, 4, 4), torch.randn(2, 3, 4, 4)
+    assert torch.equal(schedule.noised(latents, noise, torch.tensor([10, 800]))[1], latents)
+    weights = schedule.loss_weights(torch.arange(1000), None)
+    assert weights.mean().item() == pytest.approx(1.0)
+    expected = torch.clamp(1 / (1 - schedule.alphas_cumprod), max=20.0)
+    torch.testing.assert_close(weights / weights[-1], expected / expected[-1])
+    snr = schedule.alphas_cumprod / (1 - schedule.alphas_cumprod)
+    torch.testing.assert_close(schedule.loss_weights(torch.arange(1000), 5.0), snr.clamp(max=5.0))
+
+
 def test_min_snr_weights_are_finite_at_zero_terminal_snr():
     config = {**shared_prior().scheduler_config, "rescale_betas_zero_snr": True}
-    for prediction in ("v_prediction", "epsilon"):
+    for prediction in ("v_prediction", "epsilon", "sample"):
         schedule = NoiseSchedule({**config, "prediction_type": prediction})
         assert bool(torch.isfinite(schedule.loss_weights(torch.arange(1000), 5.0)).all())
 
