@@ -132,26 +132,6 @@ def colour_times_us(numbers: np.ndarray, pairs: Sequence[tuple[int, int]], where
     return frames * WINDOW_US + WINDOW_US // 2
 
 
-def read_pictures(paths: Sequence[Path], size: tuple[int, int]) -> np.ndarray:
-    """Pictures [N, H, W] uint8, grey, of `size` (width, height) px.
-
-    Raises:
-        DataError: a file is no picture, or of another size.
-    """
-    import cv2
-
-    width, height = size
-    images = np.empty((len(paths), height, width), np.uint8)
-    for image, path in zip(images, paths, strict=True):
-        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if picture is None:
-            raise DataError(f"{path}: expected a picture, got {path.stat().st_size} bytes that are none")
-        if picture.shape != (height, width):
-            raise DataError(f"{path}: expected {width} x {height} px, got {picture.shape[1]} x {picture.shape[0]}")
-        image[:] = picture
-    return images
-
-
 def read_points(paths: Sequence[Path], coordinates: str) -> Events:
     """Raw events of one .csv or of consecutive .npy: two coordinates, the time in us, and perhaps the polarity.
 

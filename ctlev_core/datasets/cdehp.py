@@ -27,6 +27,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ctlev_core import cdehp_files as files
+from ctlev_core.picture_files import read_grey_pictures
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
@@ -178,7 +179,7 @@ def read_event_images(recording: Recording, options: Options) -> ImageTrack:
     of_events = [path for path in recording.files if path.parent.name == "event_image"]
     paths = [path for path in of_events if not options.labelled_only or path.stem in labelled]
     numbers = np.array([int(path.stem) for path in paths], np.int64)
-    return ImageTrack(files.read_pictures(paths, files.SENSOR_SIZE), files.frame_end_us(numbers))
+    return ImageTrack(read_grey_pictures(paths, files.SENSOR_SIZE), files.frame_end_us(numbers))
 
 
 def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:
@@ -196,7 +197,7 @@ def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:
         np.array([int(path.stem) for path in paths], np.int64), pairs, f"CDEHP {recording.recording_id}"
     )
     kept = np.flatnonzero(t_us >= 0)
-    return ImageTrack(files.read_pictures([paths[i] for i in kept], files.COLOUR_SIZE), t_us[kept])
+    return ImageTrack(read_grey_pictures([paths[i] for i in kept], files.COLOUR_SIZE), t_us[kept])
 
 
 def _shots(root: Path, options: Options) -> Iterator[tuple[str, Path]]:
