@@ -237,11 +237,11 @@ def camera_of(matrix: np.ndarray, where: str) -> Camera:
     return Camera(K / K[2, 2], R, translation_mm / 1000.0, SENSOR_SIZE)
 
 
-def read_frame_labels(path: Path, frames_path: Path) -> np.ndarray:
+def read_frame_labels(path: Path, frames_path: Path | None = None) -> np.ndarray:
     """Joint positions [N, 13, 3] float64, mm, one row a frame, of `/XYZ` in a `_label.h5` file; NaN = not seen.
 
     The authors' loop leaves a last frame black and without label where the motion capture ends before the events;
-    that one is not counted.
+    that one is not counted. With `frames_path`, the frames must be as many.
 
     Raises:
         DataError: not such a file, or it has not one label a frame.
@@ -249,12 +249,11 @@ def read_frame_labels(path: Path, frames_path: Path) -> np.ndarray:
     positions = _read_dataset(path, "XYZ", lambda data: data[:] if data.ndim == 3 else data[()])
     if positions.ndim != 3 or positions.shape[1:] != (3, len(VICON_JOINTS)):
         raise DataError(f"{path}: /XYZ must be [N, 3, {len(VICON_JOINTS)}], got {positions.shape}")
-    shape = _read_dataset(frames_path, "DVS", lambda data: data.shape)
-    if shape[:1] != positions.shape[:1]:
-        raise DataError(
-            f"{path}: expected one label for each frame of {frames_path.name}, got {positions.shape[0]} "
-            f"for {shape[0] if shape else 0} frames"
-        )
+    num_frames = (
+        len(positions) if frames_path is None else _read_dataset(frames_path, "DVS", lambda data: data.shape[0])
+    )
+    if num_frames != len(positions):
+        raise DataError(f"{path}: expected one label for each of {num_frames} frames, got {len(positions)}")
     if len(positions) and np.isnan(positions[-1]).all():
         positions = positions[:-1]
     if len(positions) == 0:

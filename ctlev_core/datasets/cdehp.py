@@ -28,7 +28,8 @@ from pydantic import Field, model_validator
 
 from ctlev_core import cdehp_files as files
 from ctlev_core.picture_files import read_grey_pictures
-from data_contracts.config import RUN_SETTING, Frozen
+from ctlev_core.subject_splits import SubjectSplit
+from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
@@ -66,7 +67,7 @@ EXPECTED_TREE = """expected the unpacked download of CDEHP, at least one of indo
       .."""
 
 
-class Options(Frozen):
+class Options(SubjectSplit):
     """Options of CDEHP."""
 
     root: Path = Field(json_schema_extra=RUN_SETTING, description="the folder that holds indoor and outdoor")
@@ -75,9 +76,10 @@ class Options(Frozen):
         default="auto", description="released event images, raw events, or images where there are any"
     )
     split: Literal["official", "subject"] = Field(
-        default="official", description="by the folders train and valid, or by test_subjects"
+        default="official",
+        description="by the folders train and valid, or by test_subjects; the numbers of people that "
+        "the options name hold in both places",
     )
-    test_subjects: tuple[int, ...] = Field(default=(), description="numbers of people to test on (split `subject`)")
     labelled_only: bool = Field(default=True, description="leave out event images and windows without a label file")
     intensity: bool = Field(default=True, description="offer the colour pictures, in grey, as intensity frames")
     coordinates: Literal["auto", "row_first", "x_first"] = Field(
@@ -94,6 +96,8 @@ class Options(Frozen):
 
 def list_recordings(options: Options) -> list[Recording]:
     """One recording a shot, by place, action, person and shot; the id is `outdoor/A0001P0002S00`.
+
+    Shots of `condition_subjects` in the folder train carry labels only.
 
     Raises:
         DataError: the tree is not as expected, or frames and labels do not belong together.
@@ -231,10 +235,10 @@ def _recording(place: str, folder: Path, options: Options) -> Recording:
         )
     colour = files.numbered(folder / "color_image", ".png") if options.intensity else []
     colour_labels = files.numbered(folder / "color_label", ".txt") if colour else []
-    if options.split == "official":
-        split = "train" if folder.parent.name == "train" else "test"
-    else:
-        split = "test" if person in options.test_subjects else "train"
+    split = options.split_of(person)
+    if options.split == "official" and folder.parent.name == "valid":
+        split = "test"
+    has_data = split != "condition"
     names = ACTIONS[place]
     return Recording(
         recording_id=f"{place}/{folder.name}",
@@ -242,10 +246,10 @@ def _recording(place: str, folder: Path, options: Options) -> Recording:
         parts=(Part(split),),
         class_name=names[action - 1] if 1 <= action <= len(names) else f"A{action:04d}",
         sensor_size=files.SENSOR_SIZE,
-        has_events=not use_images,
-        has_event_images=use_images,
-        has_intensity=bool(colour),
-        files=(*data, *labels, *colour, *colour_labels),
+        has_events=has_data and not use_images,
+        has_event_images=has_data and use_images,
+        has_intensity=has_data and bool(colour),
+        files=(*data, *labels, *colour, *colour_labels) if has_data else tuple(labels),
     )
 
 

@@ -26,7 +26,8 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from ctlev_core import dhp19_files as files
-from data_contracts.config import RUN_SETTING, Frozen
+from ctlev_core.subject_splits import SubjectSplit
+from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
@@ -54,7 +55,7 @@ or the frames its MATLAB code writes (layout `frames`), with the matrices beside
     P_matrices/P1.npy .. P4.npy"""
 
 
-class Options(Frozen):
+class Options(SubjectSplit):
     """Options of DHP19."""
 
     root: Path = Field(json_schema_extra=RUN_SETTING, description="the folder of the download")
@@ -74,7 +75,6 @@ class Options(Frozen):
         description="events of all four cameras that close a window (raw, window method `dataset`)",
     )
     test_subjects: tuple[int, ...] = Field(default=(13, 14, 15, 16, 17), description="subjects to test on")
-    validation_subjects: tuple[int, ...] = Field(default=(), description="subjects held back from training")
     subjects: tuple[int, ...] | None = Field(default=None, description="only these of the subjects 1 to 17")
     sessions: tuple[int, ...] | None = Field(default=None, description="only these of the sessions 1 to 5")
     movements: tuple[int, ...] | None = Field(default=None, description="only these movements of each session")
@@ -90,8 +90,9 @@ class Options(Frozen):
 def list_recordings(options: Options) -> list[Recording]:
     """One recording for each movement and camera, by subject, session, movement and camera.
 
-    The id is `S1/session1/mov1/cam2`, the class `session1_mov1`. A movement without events is left out, as in the
-    download some are missing; so are the two recordings whose clock is damaged.
+    Those of `condition_subjects` carry labels only. The id is `S1/session1/mov1/cam2`, the class `session1_mov1`. A
+    movement without events is left out, as in the download some are missing; so are the two recordings whose clock is
+    damaged.
 
     Raises:
         DataError: the tree is not as expected, a movement has no labels, or the options leave no recording.
@@ -117,16 +118,18 @@ def list_recordings(options: Options) -> list[Recording]:
             raise DataError(
                 f"{labels}: no such file, but {data.name} is there: its labels are missing; {EXPECTED_TREE}"
             )
+        split = options.split_of(subject)
+        has_data = split != "condition"
         recordings += [
             Recording(
                 recording_id=f"S{subject}/session{session}/mov{movement}/cam{camera}",
                 subject=f"S{subject}",
-                parts=(Part(_split_of(subject, options)),),
+                parts=(Part(split),),
                 class_name=f"session{session}_mov{movement}",
                 sensor_size=files.SENSOR_SIZE if layout == "raw" else None,
-                has_events=layout == "raw",
-                has_event_images=layout == "frames",
-                files=(data, labels, matrices[camera]),
+                has_events=has_data and layout == "raw",
+                has_event_images=has_data and layout == "frames",
+                files=(*([data] if has_data else []), labels, matrices[camera]),
             )
             for camera in options.cameras
         ]
@@ -176,7 +179,7 @@ def read_window_labels(recording: Recording, options: Options) -> Labels:
     Source: ExtractEventsToFramesAndMeanLabels.m (last_k .. k).
     """
     _, end_us, rows = _windows(recording, options)
-    vicon = files.read_vicon(recording.files[1])
+    vicon = files.read_vicon(_label_file(recording))
     means = np.empty((len(rows), *vicon.shape[1:]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a joint never seen in the window has the mean NaN
@@ -193,10 +196,11 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     Raises:
         DataError: a file is damaged, or the numbers of frames and of labels differ.
     """
-    if recording.has_events:
-        vicon = files.read_vicon(recording.files[1])
+    path = _label_file(recording)
+    if path.suffix == ".mat":
+        vicon = files.read_vicon(path)
         return _labels(recording, vicon, np.arange(len(vicon), dtype=np.int64) * files.VICON_PERIOD_US, options)
-    positions = files.read_frame_labels(recording.files[1], recording.files[0])
+    positions = files.read_frame_labels(path, recording.files[0] if recording.has_event_images else None)
     return _labels(recording, positions, _frame_times(len(positions)), options)
 
 
@@ -206,7 +210,7 @@ def read_event_images(recording: Recording, options: Options) -> ImageTrack:
     Raises:
         DataError: a file is damaged, or the numbers of frames and of labels differ.
     """
-    count = len(files.read_frame_labels(recording.files[1], recording.files[0]))
+    count = len(files.read_frame_labels(_label_file(recording), recording.files[0]))
     images = files.read_frames(recording.files[0], _channel(recording), count)
     return ImageTrack(images, _frame_times(count))
 
@@ -217,7 +221,7 @@ def read_camera(recording: Recording, options: Options) -> Camera:
     Raises:
         DataError: no projection matrix can be read.
     """
-    path = recording.files[2]
+    path = recording.files[-1]
     return files.camera_of(files.read_projection(path), str(path))
 
 
@@ -277,10 +281,8 @@ def _is_chosen(number: tuple[int, int, int], options: Options) -> bool:
     return number not in DAMAGED and all(w is None or n in w for n, w in zip(number, wanted, strict=True))
 
 
-def _split_of(subject: int, options: Options) -> str:
-    if subject in options.test_subjects:
-        return "test"
-    return "validation" if subject in options.validation_subjects else "train"
+def _label_file(recording: Recording) -> Path:
+    return recording.files[-2]
 
 
 def _channel(recording: Recording) -> int:
@@ -288,13 +290,13 @@ def _channel(recording: Recording) -> int:
 
 
 def _read_stream(recording: Recording, options: Options) -> files.Stream:
-    num_rows = len(files.read_vicon(recording.files[1]))
+    num_rows = len(files.read_vicon(_label_file(recording)))
     return files.read_stream(recording.files[0], num_rows, options.filters)
 
 
 def _windows(recording: Recording, options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ranges [W, 2] of the authors' windows, their ends [W] us, and the first and last row [W, 2] of their labels."""
-    num_rows = len(files.read_vicon(recording.files[1]))
+    num_rows = len(files.read_vicon(_label_file(recording)))
     stream = files.read_stream(recording.files[0], num_rows, options.filters)
     ends = np.arange(options.events_per_window, len(stream.t) + 1, options.events_per_window, dtype=np.int64)
     end_us = stream.t[ends - 1]

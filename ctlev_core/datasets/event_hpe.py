@@ -26,7 +26,8 @@ from pydantic import Field
 
 from ctlev_core import event_hpe_files as files
 from ctlev_core.picture_files import read_grey_pictures
-from data_contracts.config import RUN_SETTING, Frozen
+from ctlev_core.subject_splits import SubjectSplit
+from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
@@ -49,7 +50,7 @@ or raw recordings with the poses of that download (layout `raw`):
     pose_events/subject01_group1_time1/pose0000.pkl .."""
 
 
-class Options(Frozen):
+class Options(SubjectSplit):
     """Options of Event-HPE."""
 
     root: Path = Field(json_schema_extra=RUN_SETTING, description="the folder of the download")
@@ -63,7 +64,6 @@ class Options(Frozen):
         default=15_000, gt=0, description="nominal time from one event image to the next (preprocessed)"
     )
     test_subjects: tuple[int, ...] = Field(default=(1, 2, 7), description="subjects to test on")
-    validation_subjects: tuple[int, ...] = Field(default=(), description="subjects held back from training")
     subjects: tuple[int, ...] | None = Field(default=None, description="only these subjects")
     intensity: bool = Field(default=True, description="offer the grey pictures as intensity frames")
 
@@ -71,7 +71,7 @@ class Options(Frozen):
 def list_recordings(options: Options) -> list[Recording]:
     """One recording an action that has poses; the id is `subject01/group1_time1`, the class `group1`.
 
-    Group 4 is left out, as the authors do.
+    Group 4 is left out, as the authors do; actions of `condition_subjects` carry labels only.
 
     Raises:
         DataError: the tree is not as expected, or an action has poses and no events.
@@ -135,12 +135,12 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     ]
     joints2d = np.stack([pose.joints2d for pose in poses])
     joints3d = np.stack([pose.joints3d for pose in poses])
-    if recording.has_events:
+    if recording.sensor_size == files.RAW_SIZE:
         joints2d = joints2d * (files.PADDED_SIZE / files.POSE_IMAGE_SIZE) - [files.PADDING, 0]
     else:
         joints2d = joints2d * (options.image_size / files.POSE_IMAGE_SIZE)
     with np.errstate(invalid="ignore"):
-        visible = is_inside(joints2d, _picture_size(recording, options)) & (joints3d[..., 2] > 0)
+        visible = is_inside(joints2d, _picture_size(recording)) & (joints3d[..., 2] > 0)
     labels = Labels(
         class_names=(recording.class_name,) * len(poses),
         t_us=t_us[known],
@@ -178,7 +178,7 @@ def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:
     pictures = _of(recording, "fullpic", ".jpg")
     t_us, known = _times_us(recording, np.array(list(pictures), np.int64), options)
     paths = [path for path, is_known in zip(pictures.values(), known, strict=True) if is_known]
-    return ImageTrack(read_grey_pictures(paths, _picture_size(recording, options)), t_us[known])
+    return ImageTrack(read_grey_pictures(paths, _picture_size(recording)), t_us[known])
 
 
 def read_camera(recording: Recording, options: Options) -> Camera:
@@ -187,11 +187,11 @@ def read_camera(recording: Recording, options: Options) -> Camera:
 
     f, c = files.FOCAL_LENGTH, files.CENTRE
     K = np.array([[f, 0, c], [0, f, c], [0, 0, 1]])
-    if recording.has_events:
+    if recording.sensor_size == files.RAW_SIZE:
         K[0, 2] -= files.PADDING
     else:
         K[:2] *= options.image_size / files.PADDED_SIZE
-    return Camera(K, np.eye(3), np.zeros(3), _picture_size(recording, options))
+    return Camera(K, np.eye(3), np.zeros(3), _picture_size(recording))
 
 
 def _find_layout(root: Path, options: Options) -> str:
@@ -224,18 +224,19 @@ def _recording(poses: Path, layout: str, subject: int, name: str, options: Optio
     if not labels:
         raise DataError(f"{poses}: no files pose0000.pkl; {EXPECTED_TREE}")
     grey = files.numbered(pictures, "fullpic", ".jpg") if options.intensity else {}
-    split = "validation" if subject in options.validation_subjects else "train"
+    split = options.split_of(subject)
+    has_data = split != "condition"
     size = files.RAW_SIZE if layout == "raw" else (options.image_size, options.image_size)
     return Recording(
         recording_id=name,
         subject=name.partition("/")[0],
-        parts=(Part("test" if subject in options.test_subjects else split),),
+        parts=(Part(split),),
         class_name=name.partition("/")[2].partition("_")[0],
         sensor_size=size,
-        has_events=layout == "raw",
-        has_event_images=layout != "raw",
-        has_intensity=bool(grey),
-        files=(*data.values(), *labels.values(), *grey.values()),
+        has_events=has_data and layout == "raw",
+        has_event_images=has_data and layout != "raw",
+        has_intensity=has_data and bool(grey),
+        files=(*data.values(), *labels.values(), *grey.values()) if has_data else tuple(labels.values()),
     )
 
 
@@ -266,5 +267,5 @@ def _times_us(recording: Recording, numbers: np.ndarray, options: Options) -> tu
     return t_us, known
 
 
-def _picture_size(recording: Recording, options: Options) -> tuple[int, int]:
-    return files.RAW_SIZE if recording.has_events else (options.image_size, options.image_size)
+def _picture_size(recording: Recording) -> tuple[int, int]:
+    return recording.sensor_size or files.RAW_SIZE

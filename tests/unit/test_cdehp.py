@@ -80,6 +80,14 @@ def test_split_by_subject_takes_the_same_numbers_everywhere(root):
     assert [r.parts[0].split for r in cdehp.list_recordings(options)] == ["test", "test", "train"]
 
 
+def test_condition_subjects_of_the_training_folder_give_labels_only(root):
+    options = cdehp.Options(root=root, condition_subjects=(1, 2))
+    recordings = cdehp.list_recordings(options)
+    assert [r.parts[0].split for r in recordings] == ["condition", "condition", "test"]
+    assert not recordings[1].has_event_images and len(recordings[1].files) == 2
+    assert len(cdehp.read_labels(recordings[1], options)) == 2
+
+
 @pytest.mark.parametrize("options", [{"split": "subject"}, {"test_subjects": [1]}, {"places": ["attic"]}])
 def test_options_that_contradict_are_refused(root, options):
     with pytest.raises(PluginError):

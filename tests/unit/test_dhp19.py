@@ -60,6 +60,16 @@ def test_movements_are_in_the_order_of_their_numbers_and_can_be_chosen(root):
     assert [r.parts[0].split for r in validation] == ["validation"] * 2 + ["test"] * 2
 
 
+def test_condition_subjects_give_labels_only(root):
+    recordings = dhp19.list_recordings(options(root, condition_subjects=(1,)))
+    assert [r.parts[0].split for r in recordings] == ["condition"] * 2 + ["test"] * 2
+    labels_only = recordings[0]
+    assert not labels_only.has_events and [path.name for path in labels_only.files] == ["S1_1_2.mat", "P2.npy"]
+    assert len(dhp19.read_labels(labels_only, options(root))) == 100
+    with pytest.raises(ValueError, match=r"subjects \[13\] are named more than once"):
+        options(root, condition_subjects=(13,))
+
+
 def test_the_recordings_the_authors_removed_are_left_out(root):
     for movement in (3, 4):
         write_aedat(root / f"DVS_movies/S4/session3/mov{movement}.aedat", busy(1))

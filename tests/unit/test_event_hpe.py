@@ -108,6 +108,17 @@ def test_actions_become_recordings_split_by_subject(root):
     assert [r.parts[0].split for r in only] == ["validation"]
 
 
+@pytest.mark.parametrize("layout", ["preprocessed", "raw"])
+def test_condition_subjects_give_labels_only(layout, tmp_path, request):
+    root = request.getfixturevalue("root" if layout == "preprocessed" else "raw")
+    recording, options = first(root, condition_subjects=(3,))
+    assert not (recording.has_events or recording.has_event_images or recording.has_intensity)
+    labels = event_hpe.read_labels(recording, options)
+    number = int(labels.t_us[1]) // 15_000
+    pixels = project(event_hpe.read_camera(recording, options), pose_values(number)[3])
+    np.testing.assert_allclose(labels.joints2d[1], pixels, rtol=1e-4, atol=1e-2)
+
+
 def test_an_event_image_is_labelled_with_the_pose_at_its_end(root):
     recording, options = first(root)
     track, labels = event_hpe.read_event_images(recording, options), event_hpe.read_labels(recording, options)
