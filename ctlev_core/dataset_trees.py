@@ -15,6 +15,8 @@ from data_contracts.errors import DataError
 T = TypeVar("T")
 
 ARCHIVES = (".zip", ".7z", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".rar")
+MAX_SEARCHED = 50
+"""Folders in which the root is looked for: an error message must not search a home folder."""
 _NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -34,14 +36,14 @@ def check_root(root: Path, tree: str, is_root: Callable[[Path], bool]) -> Path:
         raise DataError(f"{root}: {problem}; {tree}")
     if is_root(root):
         return root
-    for parent in list(root.resolve().parents)[:3]:
-        if is_root(parent):
-            raise DataError(f"{root}: lies inside the dataset; the root is {parent}; {tree}")
     folders = [entry for entry in list_folder(root) if entry.is_dir()]
-    below = [entry for folder in folders for entry in list_folder(folder) if entry.is_dir()]
-    for candidate in folders + below:
+    below = [entry for folder in folders[:MAX_SEARCHED] for entry in list_folder(folder) if entry.is_dir()]
+    for candidate in [*folders, *below][:MAX_SEARCHED]:
         if is_root(candidate):
             raise DataError(f"{root}: not the dataset itself; the root is {candidate}; {tree}")
+    for parent in list(root.resolve().parents)[:2]:
+        if is_root(parent):
+            raise DataError(f"{root}: lies inside the dataset; the root is {parent}; {tree}")
     packed = [entry.name for entry in list_folder(root) if entry.suffix.lower() in ARCHIVES]
     if packed:
         raise DataError(f"{root}: holds archives that are not unpacked ({', '.join(packed[:3])}); {tree}")

@@ -202,12 +202,6 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     return Labels(class_names=(recording.class_name,), t_us=np.zeros(1, np.int64))
 
 
-def read_synonyms(options: Options) -> dict[str, list[str]]:
-    """Names to draw from, by class name; every class of this dataset has one."""
-    folders = (*CLASSES, BACKGROUND) if options.background else CLASSES
-    return {class_name_of(folder): [class_name_of(folder)] for folder in folders}
-
-
 def _is_est(root: Path) -> bool:
     return (root / _SPLIT_FOLDERS["train"]).is_dir() and (root / _SPLIT_FOLDERS["test"]).is_dir()
 

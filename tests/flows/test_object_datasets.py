@@ -44,23 +44,28 @@ def n_imagenet(root):
     (root / "LOC_synset_mapping.txt").write_text(names)
 
 
+def only(home, stage):
+    (folder,) = (home / "artefacts" / stage).iterdir()
+    return read_manifest(ManifestRef(key=folder.name, path=folder))
+
+
 @pytest.mark.parametrize(
-    ("write", "classes", "splits"),
+    ("write", "classes", "names"),
     [
-        (n_caltech101, {"bonsai", "crocodile head"}, {"train": 6, "test": 2}),
-        (n_imagenet, {"tench", "crane"}, {"train": 6, "test": 2}),
+        (n_caltech101, {"bonsai", "crocodile head"}, {"bonsai", "crocodile head"}),
+        (n_imagenet, {"tench", "crane"}, {"tench", "Tinca tinca", "crane"}),
     ],
 )
-def test_prepare_dataset(write, classes, splits, tmp_path):
+def test_prepare_dataset(write, classes, names, tmp_path):
     root, home = tmp_path / "data", tmp_path / "home"
     root.mkdir()
     write(root)
     arguments = ("--preset", write.__name__, "--set", f"dataset.options.root={root}", *SMALL)
     finished = run_script("prepare_dataset", *arguments, home=home)
     assert finished.status == 0, finished.errors
-    (folder,) = (home / "artefacts" / "encode").iterdir()
-    frames = read_manifest(ManifestRef(key=folder.name, path=folder))
+    frames = only(home, "encode")
     assert frames.array("frames").shape == (8, 64, 64, 3)
     assert set(frames.column("class_name")) == classes
-    counted = {split: len(frames.rows_where(split=split)) for split in splits}
-    assert counted == splits
+    assert {split: len(frames.rows_where(split=split)) for split in ("train", "test")} == {"train": 6, "test": 2}
+    prompts = only(home, "condition_frames").column("prompt") + only(home, "condition_samples").column("prompt")
+    assert set(prompts) == {f"A photo of {name}" for name in names}
