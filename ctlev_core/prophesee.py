@@ -1,6 +1,7 @@
 """Raw files of Prophesee cameras: the text header, the sensor size, and the way from words to events and back.
 
 A RAW file is a header of ASCII lines that start with `% `, then little-endian words: 32 bits in EVT 2.0, 16 in 3.0.
+DAT files start with the same kind of header.
 
 Source: Prophesee, "RAW file format", "EVT 2.0 format" and "EVT 3.0 format" (docs.prophesee.ai, Data encoding formats).
 """
@@ -8,13 +9,16 @@ Source: Prophesee, "RAW file format", "EVT 2.0 format" and "EVT 3.0 format" (doc
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from ctlev_core import record_files
+from ctlev_core.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
-from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
+from data_contracts.events import Events, SensorSize, check_events
 
 WORD_DTYPES = {"EVT2": np.dtype("<u4"), "EVT3": np.dtype("<u2")}
 MAX_SENSOR_SIZE = 2048
@@ -85,69 +89,77 @@ def read(path: Path, encoding: str) -> Events:
     Raises:
         DataError: another encoding, no words, a cut word, an unknown sensor, or events that break `check_events`.
     """
-    from ctlev_core import prophesee_decoding
+    return record_files.read(_open(path, encoding))
+
+
+def read_chunks(path: Path, num_events: int, encoding: str) -> Iterator[Events]:
+    """The events of `read` in pieces of `num_events`; where the header tells no sensor size, the file is read twice.
+
+    Raises:
+        DataError: as `read`.
+    """
+    return record_files.read_pieces(_open(path, encoding), num_events)
+
+
+def _open(path: Path, encoding: str) -> record_files.RecordFile:
+    from ctlev_core import prophesee_decoding as decoding
 
     header = read_header(path)
     if header.encoding != encoding:
         raise DataError(f"{path}: expected an {encoding} header, got {header.encoding or 'none'}")
-    words = _open_words(path, header)
-    if encoding == "EVT2":
-        capacity, decode = prophesee_decoding.count_evt2(words), prophesee_decoding.decode_evt2
-    else:
-        capacity, decode = prophesee_decoding.count_evt3(words), prophesee_decoding.decode_evt3
-    t, x, y, p = (np.empty(capacity, dtype) for dtype in EVENT_DTYPES.values())
-    count = decode(words, t, x, y, p)
-    t, x, y, p = t[:count], x[:count], y[:count], p[:count]
-    return check_events(Events(t, x, y, p, _sensor_size(header, x, y, str(path))), str(path))
-
-
-def _open_words(path: Path, header: Header) -> np.ndarray:
-    """The words as a view of the mapped file, so that a recording larger than memory needs room for its events only."""
-    dtype = WORD_DTYPES[header.encoding]
     if header.fields.get("endianness", "little") != "little":
         raise DataError(f"{path}: expected little-endian words, the header says {header.fields['endianness']!r}")
-    num_bytes = path.stat().st_size - header.size
-    if num_bytes == 0:
-        raise DataError(f"{path}: the file ends after its {header.size}-byte header, expected {header.encoding} words")
-    if num_bytes % dtype.itemsize:
-        raise DataError(
-            f"{path}: cut inside a word: {num_bytes} bytes after the header, "
-            f"expected a multiple of {dtype.itemsize} for {header.encoding}"
-        )
-    return np.asarray(np.memmap(path, dtype, mode="c", offset=header.size))
-
-
-def _sensor_size(header: Header, x: np.ndarray, y: np.ndarray, where: str) -> SensorSize:
-    """Geometry from the header, else the named camera, else the smallest known sensor that holds all coordinates."""
-    fields = header.fields
-    stated = re.fullmatch(r"(\d+)x(\d+)", fields.get("geometry", ""))
-    if stated:
-        return int(stated[1]), int(stated[2])
-    width, height = (re.search(rf";{name}=(\d+)", fields.get("format", "")) for name in ("width", "height"))
-    if width and height:
-        return int(width[1]), int(height[1])
-    generation = re.search(r"gen(\d)", fields.get("plugin_name", "")) or re.match(r"(\d)", fields.get("generation", ""))
-    if generation and generation[1] in _SENSOR_BY_GENERATION:
-        return _SENSOR_BY_GENERATION[generation[1]]
-    if len(x) == 0:
-        raise DataError(f"{where}: neither the header nor any event tells the sensor size, expected '% geometry WxH'")
-    largest_x, largest_y = int(x.max()), int(y.max())
-    for width, height in _KNOWN_SENSORS:
-        if largest_x < width and largest_y < height:
-            return width, height
-    raise DataError(
-        f"{where}: the header has no geometry, and events up to x = {largest_x}, y = {largest_y} px fit none of the "
-        f"known sensors {', '.join(f'{width} x {height}' for width, height in _KNOWN_SENSORS)}"
+    is_evt2 = encoding == "EVT2"
+    return record_files.RecordFile(
+        path,
+        header.size,
+        WORD_DTYPES[encoding],
+        items=1,
+        unit=f"{encoding} word",
+        decode=decoding.decode_evt2 if is_evt2 else decoding.decode_evt3,
+        own_state=decoding.EVT2_STATE if is_evt2 else decoding.EVT3_STATE,
+        sensor_size=stated_sensor_size(header) or guess_sensor_size(path),
+        count_events=None if is_evt2 else decoding.count_evt3,
     )
 
 
+def stated_sensor_size(header: Header) -> SensorSize | None:
+    """Geometry from the header, else of the camera named there; None without either."""
+    fields = header.fields
+    stated = re.fullmatch(r"(\d{1,5})x(\d{1,5})", fields.get("geometry", ""))
+    if stated:
+        return int(stated[1]), int(stated[2])
+    width, height = (re.search(rf";{name}=(\d{{1,5}})\b", fields.get("format", "")) for name in ("width", "height"))
+    if width and height:
+        return int(width[1]), int(height[1])
+    width, height = (re.fullmatch(r"\d{1,5}", fields.get(name, "")) for name in ("Width", "Height"))
+    if width and height:
+        return int(width[0]), int(height[0])
+    generation = re.search(r"gen(\d)", fields.get("plugin_name", "")) or re.match(r"(\d)", fields.get("generation", ""))
+    return _SENSOR_BY_GENERATION.get(generation[1]) if generation else None
+
+
+def guess_sensor_size(path: Path) -> Callable[[np.ndarray, int], SensorSize]:
+    """For a header that tells no size: the smallest known sensor that holds all coordinates."""
+
+    def sensor_size(state: np.ndarray, num_events: int) -> SensorSize:
+        if num_events == 0:
+            raise DataError(
+                f"{path}: neither the header nor any event tells the sensor size, expected '% geometry WxH'"
+            )
+        largest_x, largest_y = int(state[record_files.LARGEST_X]), int(state[record_files.LARGEST_Y])
+        return smallest_sensor(largest_x, largest_y, str(path), _KNOWN_SENSORS)
+
+    return sensor_size
+
+
 def write(path: Path, events: Events, encoding: str) -> None:
-    """Write events as EVT2 or EVT3, one word an event and no vectors; `read` returns them unchanged.
+    """Write events as EVT2 or EVT3, EVT3 with vectors where they take fewer words; `read` returns them unchanged.
 
     Raises:
         DataError: events break `check_events`, the sensor is wider than 11 bits, or the time stamps start too late.
     """
-    from ctlev_core import prophesee_decoding
+    from ctlev_core import prophesee_encoding
 
     check_events(events, f"events to be written to {path}")
     width, height = events.sensor_size
@@ -160,7 +172,7 @@ def write(path: Path, events: Events, encoding: str) -> None:
             f"{path}: t = {events.t[-1]} us is {loops} overflows of the {time_bits}-bit clock of {encoding}, expected "
             f"at most {MAX_LOOPS}; subtract the first time stamp before writing"
         )
-    encode = prophesee_decoding.encode_evt2 if encoding == "EVT2" else prophesee_decoding.encode_evt3
+    encode = prophesee_encoding.encode_evt2 if encoding == "EVT2" else prophesee_encoding.encode_evt3
     # One TIME_HIGH at the start, two an overflow, and at most a TIME_HIGH, TIME_LOW, Y and X word an event.
     words = np.empty(1 + 2 * loops + 4 * len(events), WORD_DTYPES[encoding])
     count = encode(events.t, events.x, events.y, events.p, words)

@@ -156,6 +156,6 @@ def _decode(file: RecordFile, items: np.ndarray, state: np.ndarray) -> list[np.n
 
 def _checked(file: RecordFile, events: Events, state: np.ndarray, num_before: int, last_t: int) -> Events:
     width, height = events.sensor_size
-    if state[TIME_WENT_BACK] or state[LARGEST_X] >= width or state[LARGEST_Y] >= height:
+    if state[TIME_WENT_BACK] or state[LARGEST_X] >= width or state[LARGEST_Y] >= height or min(width, height) < 1:
         event_pieces.check_piece(events, str(file.path), num_before, last_t)
     return file.finish(events) if file.finish else events

@@ -9,6 +9,7 @@ Source: Prophesee, "EVT 2.0 format", docs.prophesee.ai.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from ctlev_core import prophesee
@@ -31,6 +32,15 @@ def read(path: Path) -> Events:
             that runs backwards (an overflow of the 34-bit clock is not).
     """
     return prophesee.read(path, "EVT2")
+
+
+def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
+    """The events of `read` in pieces; without a sensor size in the header, the file is read twice.
+
+    Raises:
+        DataError: as `read`.
+    """
+    return prophesee.read_chunks(path, num_events, "EVT2")
 
 
 def write(path: Path, events: Events) -> None:

@@ -9,6 +9,7 @@ Source: Prophesee, "EVT 3.0 format", docs.prophesee.ai.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from ctlev_core import prophesee
@@ -33,8 +34,17 @@ def read(path: Path) -> Events:
     return prophesee.read(path, "EVT3")
 
 
+def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
+    """The events of `read` in pieces; without a sensor size in the header, the file is read twice.
+
+    Raises:
+        DataError: as `read`.
+    """
+    return prophesee.read_chunks(path, num_events, "EVT3")
+
+
 def write(path: Path, events: Events) -> None:
-    """Write events, one word each, so that `read` returns them unchanged.
+    """Write events, with vectors where they take fewer words, so that `read` returns them unchanged.
 
     Raises:
         DataError: the sensor has more than 2048 px a side, or time stamps past 65,536 overflows of the clock.

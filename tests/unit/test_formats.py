@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core import event_files, plugins, prophesee, prophesee_decoding
+from ctlev_core import event_files, plugins, prophesee, prophesee_decoding, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -104,11 +104,17 @@ def slow_evt3(words: list[int]) -> list[tuple[int, int, int, int]]:  # noqa: C90
 def decode(encoding: str, words: list[int]) -> list[tuple[int, int, int, int]]:
     """The compiled decoder without the checks of `read`, for words in any order."""
     array = np.array(words, prophesee.WORD_DTYPES[encoding])
-    count = getattr(prophesee_decoding, f"count_{encoding.lower()}")(array)
+    own_state = getattr(prophesee_decoding, f"{encoding}_STATE")
+    state = np.array([0] * record_files.NUM_SHARED + list(own_state), np.int64)
+    count = prophesee_decoding.count_evt3(array) if encoding == "EVT3" else len(array)
     t, x, y, p = (np.empty(count, dtype) for dtype in (np.int64, np.uint16, np.uint16, np.uint8))
-    written = getattr(prophesee_decoding, f"decode_{encoding.lower()}")(array, t, x, y, p)
+    written = getattr(prophesee_decoding, f"decode_{encoding.lower()}")(array, state, t, x, y, p)
     assert written <= count
-    return to_rows(Events(t[:written], x[:written], y[:written], p[:written], SIZE))
+    events = Events(t[:written], x[:written], y[:written], p[:written], SIZE)
+    if written:  # what the decoder says of its events is what spares a check of each
+        went_back = bool((events.t[1:] < events.t[:-1]).any() or events.t[0] < 0)
+        assert state[: record_files.NUM_SHARED].tolist() == [t[written - 1], went_back, x[:written].max(), y[:written].max()]
+    return to_rows(events)
 
 
 # Real recordings ---------------------------------------------------------------------------------------------------
