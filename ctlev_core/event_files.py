@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 
-from ctlev_core import plugins
+from ctlev_core import event_pieces, plugins
 from data_contracts.errors import DataError
 from data_contracts.events import Events
+
+CHUNK_EVENTS = 1 << 20
+"""Events a piece where nothing else is asked for: 13 MiB."""
 
 
 def find_format(path: Path) -> ModuleType:
@@ -46,11 +50,90 @@ def read_events_file(path: Path) -> Events:
     return find_format(path).read(path)
 
 
+def read_event_chunks(path: Path, num_events: int = CHUNK_EVENTS) -> Iterator[Events]:
+    """The events of a file of any known format in pieces of `num_events`, in memory that does not grow with the file.
+
+    Together the pieces keep the promises of `Events`: times do not descend from one to the next, and all have the same
+    sensor size. A recording without events is one empty piece.
+
+    Raises:
+        DataError: see `find_format` and the format's own `read_chunks`; part of the pieces may have been given by then.
+    """
+    return event_pieces.check_joints(find_format(path).read_chunks(path, num_events), str(path))
+
+
+def read_events_range(path: Path, start: int, stop: int) -> Events:
+    """Events start .. stop - 1 of a file in the project's own format, without reading the rest.
+
+    Raises:
+        DataError: no such file or another format, or a range that does not lie in the recording.
+    """
+    module = find_format(path)
+    if not hasattr(module, "read_range"):
+        raise DataError(f"{path}: only parts of Parquet files can be read, got {module.__name__.rsplit('.', 1)[-1]}")
+    return module.read_range(path, start, stop)
+
+
 def write_events_parquet(path: Path, events: Events) -> None:
     """Write events in the project's own format; the file appears under its name only when it is complete."""
+    write_event_chunks_parquet(path, [events])
+
+
+def write_event_chunks_parquet(path: Path, chunks: Iterable[Events]) -> dict[str, int]:
+    """Write a recording that comes in pieces in the project's own format, in memory that does not grow with it.
+
+    The file appears under its name only when it is complete; where a piece is wrong, nothing is left.
+
+    Args:
+        path: the file.
+        chunks: at least one piece, all of one sensor size, each starting where the last one ended or later.
+    Returns:
+        What `summarise` says of the whole recording.
+    Raises:
+        DataError: the pieces break `check_events` or do not join.
+    """
     partial = path.with_name(path.name + ".partial")
-    plugins.load("formats", "parquet").write(partial, events)
-    os.replace(partial, path)
+    summary = Summary()
+    try:
+        plugins.load("formats", "parquet").write_chunks(partial, summary.watch(chunks))
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return summary.result()
+
+
+class Summary:
+    """What a manifest says of a recording, gathered piece by piece."""
+
+    def __init__(self) -> None:
+        self.num_events = self.num_positive = self.t_first_us = self.t_last_us = 0
+
+    def add(self, events: Events) -> None:
+        """Count the next piece."""
+        if len(events) == 0:
+            return
+        if self.num_events == 0:
+            self.t_first_us = int(events.t[0])
+        self.t_last_us = int(events.t[-1])
+        self.num_events += len(events)
+        self.num_positive += int(events.p.sum(dtype="int64"))
+
+    def watch(self, chunks: Iterable[Events]) -> Iterator[Events]:
+        """Hand the pieces on, counted."""
+        for chunk in chunks:
+            self.add(chunk)
+            yield chunk
+
+    def result(self) -> dict[str, int]:
+        """As `summarise`."""
+        return {
+            "num_events": self.num_events,
+            "duration_us": self.t_last_us - self.t_first_us,
+            "t_first_us": self.t_first_us,
+            "t_last_us": self.t_last_us,
+            "num_positive": self.num_positive,
+            "num_negative": self.num_events - self.num_positive,
+        }
 
 
 def summarise(events: Events) -> dict[str, int]:
@@ -59,13 +142,6 @@ def summarise(events: Events) -> dict[str, int]:
     Returns:
         num_events, duration_us, t_first_us, t_last_us, num_positive, num_negative; times are 0 without events.
     """
-    num_events = len(events)
-    num_positive = int(events.p.sum(dtype="int64"))
-    return {
-        "num_events": num_events,
-        "duration_us": events.duration_us,
-        "t_first_us": int(events.t[0]) if num_events else 0,
-        "t_last_us": int(events.t[-1]) if num_events else 0,
-        "num_positive": num_positive,
-        "num_negative": num_events - num_positive,
-    }
+    summary = Summary()
+    summary.add(events)
+    return summary.result()

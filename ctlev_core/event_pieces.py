@@ -60,6 +60,18 @@ def check_pieces(pieces: Iterable[Events], where: str) -> Iterator[Events]:
     Raises:
         DataError: a piece breaks `check_events`, starts before the last one ended, or has another sensor size.
     """
+    num_before = 0
+    for piece in check_joints(pieces, where):
+        yield check_events(piece, _name_piece(where, num_before))
+        num_before += len(piece)
+
+
+def check_joints(pieces: Iterable[Events], where: str) -> Iterator[Events]:
+    """Hand on pieces that were checked one by one, with the promises of `Events` kept across their joints too.
+
+    Raises:
+        DataError: a piece starts before the last one ended, or has another sensor size.
+    """
     num_before = last_t = 0
     sensor_size: SensorSize | None = None
     for piece in pieces:
@@ -69,7 +81,7 @@ def check_pieces(pieces: Iterable[Events], where: str) -> Iterator[Events]:
                 f"{num_before} on"
             )
         sensor_size = piece.sensor_size
-        check_piece(piece, where, num_before, last_t)
+        _check_joint(piece, where, num_before, last_t)
         if len(piece):
             last_t = int(piece.t[-1])
             num_before += len(piece)
@@ -78,6 +90,14 @@ def check_pieces(pieces: Iterable[Events], where: str) -> Iterator[Events]:
 
 def check_piece(piece: Events, where: str, num_before: int, last_t: int) -> Events:
     """`check_events` for a piece that follows `num_before` events, the last of them at `last_t` (0 where none is)."""
+    _check_joint(piece, where, num_before, last_t)
+    return check_events(piece, _name_piece(where, num_before))
+
+
+def _check_joint(piece: Events, where: str, num_before: int, last_t: int) -> None:
     if num_before and len(piece) and piece.t[0] < last_t:
         raise DataError(f"{where}: t decreases at event {num_before}: {last_t} us, then {piece.t[0]} us")
-    return check_events(piece, f"{where} (events counted from event {num_before})" if num_before else where)
+
+
+def _name_piece(where: str, num_before: int) -> str:
+    return f"{where} (events counted from event {num_before})" if num_before else where

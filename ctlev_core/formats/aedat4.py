@@ -7,12 +7,15 @@ Source: iniVation, "AEDAT 4.0 file format"; decoded by the `aedat` package.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ctlev_core import event_pieces
 from data_contracts.errors import DataError
-from data_contracts.events import Events, check_events
+from data_contracts.events import Events
 
 VERSION = 1
 SUFFIXES = (".aedat4",)
@@ -32,24 +35,49 @@ def read(path: Path) -> Events:
     Raises:
         DataError: a cut or corrupt file, no or several event streams, or events that break `check_events`.
     """
-    try:
-        streams, packets = _read_packets(path)
-    except BaseException as error:
-        # The decoder reports a cut file as RuntimeError, but panics on some corrupt ones; that is no Exception.
-        if isinstance(error, (KeyboardInterrupt, SystemExit, MemoryError)):
-            raise
-        raise DataError(f"{path}: not a complete AEDAT 4 file, the decoder says: {error}") from error
+    return event_pieces.concatenate(_read_packets(path))
+
+
+def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
+    """The events of `read` in pieces, put together from the file's packets.
+
+    Raises:
+        DataError: as `read`.
+    """
+    return event_pieces.regroup(_read_packets(path), num_events)
+
+
+def _read_packets(path: Path) -> Iterator[Events]:
+    """An empty piece, then one a packet."""
+    decoder, streams = _decode(path, lambda: _open(path))
     if len(streams) != 1:
         raise DataError(f"{path}: expected one event stream, got {len(streams)}")
-    t, x, y, p = (np.concatenate([packet[name] for packet in packets] or [[]]) for name in ("t", "x", "y", "on"))
-    # Past 2^63 the unsigned stamps of a corrupt file turn negative, which the check reports.
-    columns = (t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
-    return check_events(Events(*columns, (streams[0]["width"], streams[0]["height"])), str(path))
+    sensor_size = (int(streams[0]["width"]), int(streams[0]["height"]))
+
+    def packets() -> Iterator[Events]:
+        yield event_pieces.empty_events(sensor_size)
+        while (packet := _decode(path, lambda: next(decoder, None))) is not None:
+            if "events" in packet:
+                # Past 2^63 the unsigned stamps of a corrupt file turn negative, which the check reports.
+                t, x, y, p = (packet["events"][name] for name in ("t", "x", "y", "on"))
+                columns = (t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
+                yield Events(*columns, sensor_size)
+
+    yield from event_pieces.check_pieces(packets(), str(path))
 
 
-def _read_packets(path: Path) -> tuple[list[dict], list[np.ndarray]]:
+def _open(path: Path) -> tuple[Any, list[dict]]:
     import aedat
 
     decoder = aedat.Decoder(str(path))
-    streams = [stream for stream in decoder.id_to_stream().values() if stream["type"] == "events"]
-    return streams, [packet["events"] for packet in decoder if "events" in packet]
+    return decoder, [stream for stream in decoder.id_to_stream().values() if stream["type"] == "events"]
+
+
+def _decode(path: Path, step: Any) -> Any:
+    """Run one step of the decoder; it reports a cut file as RuntimeError but panics on some corrupt ones."""
+    try:
+        return step()
+    except BaseException as error:  # a panic is no Exception
+        if isinstance(error, (KeyboardInterrupt, SystemExit, MemoryError)):
+            raise
+        raise DataError(f"{path}: not a complete AEDAT 4 file, the decoder says: {error}") from error

@@ -1,22 +1,34 @@
 """ctlev's own event files: Parquet with the columns of `Events`, zstd compressed.
 
-Columns t int64 (microseconds), x and y uint16 (px), p uint8; the metadata `sensor_size` is `WIDTHxHEIGHT`.
+Columns t int64 (microseconds), x and y uint16 (px), p uint8; the metadata `sensor_size` is `WIDTHxHEIGHT`. Rows lie in
+groups of `ROW_GROUP`, so that a stretch of a long recording is read without the rest.
 """
 
 from __future__ import annotations
 
-import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ctlev_core import event_pieces
+from ctlev_core.event_tables import parse_sensor_size
 from data_contracts.errors import DataError
-from data_contracts.events import EVENT_DTYPES, Events, check_events
+from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 VERSION = 1
 SUFFIXES = (".parquet",)
+ROW_GROUP = 1 << 18
+"""Events a row group."""
 
 _MAGIC = b"PAR1"
+_BATCH = 1 << 19
 
 
 def sniff(path: Path) -> bool:
@@ -31,28 +43,77 @@ def read(path: Path) -> Events:
     Raises:
         DataError: a cut or corrupt file, other columns, nulls, no sensor size, or events that break `check_events`.
     """
+    with _open(path) as (file, sensor_size):
+        return check_events(_to_events(file.read(), sensor_size, path), str(path))
+
+
+def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
+    """The events of `read` in pieces.
+
+    Raises:
+        DataError: as `read`.
+    """
+    with _open(path) as (file, sensor_size):
+
+        def pieces() -> Iterator[Events]:
+            yield event_pieces.empty_events(sensor_size)
+            for batch in file.iter_batches(min(num_events, _BATCH), use_threads=False):
+                yield _to_events(batch, sensor_size, path)
+
+        yield from event_pieces.regroup(event_pieces.check_pieces(pieces(), str(path)), num_events)
+
+
+def read_range(path: Path, start: int, stop: int) -> Events:
+    """Events start .. stop - 1, from the row groups that hold them.
+
+    Raises:
+        DataError: as `read`, of those row groups; or the range does not lie in the recording.
+    """
+    with _open(path) as (file, sensor_size):
+        metadata = file.metadata
+        if not 0 <= start <= stop <= metadata.num_rows:
+            raise DataError(f"{path}: expected a range within 0 to {metadata.num_rows}, got {start} to {stop}")
+        ends = np.cumsum([metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)], dtype=int)
+        groups = range(int(np.searchsorted(ends, start, "right")), int(np.searchsorted(ends, stop, "left")) + 1)
+        if start == stop:
+            return event_pieces.empty_events(sensor_size)
+        first = int(ends[groups[0] - 1]) if groups[0] else 0
+        events = _to_events(file.read_row_groups(list(groups), use_threads=False), sensor_size, path)
+        where = f"{path} (events counted from event {first})"
+        return check_events(events, where).slice(start - first, stop - first)
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[tuple[pq.ParquetFile, SensorSize]]:
+    """The opened file, its columns checked, and its sensor size; Arrow's errors within become `DataError`."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         # Not read_table: that would take a folder named `key=value` for one more column.
         with pq.ParquetFile(path, memory_map=True) as file:
-            table = file.read()
-    except (pa.ArrowException, OSError) as error:
+            got = {field.name: str(field.type) for field in file.schema_arrow}
+            expected = {name: np.dtype(dtype).name for name, dtype in EVENT_DTYPES.items()}
+            if got != expected or len(file.schema_arrow) != len(expected):
+                raise DataError(f"{path}: expected the columns {expected}, got {got}")
+            text = (file.schema_arrow.metadata or {}).get(b"sensor_size", b"").decode("ascii", errors="replace")
+            sensor_size = parse_sensor_size(text)
+            if sensor_size is None:
+                raise DataError(f"{path}: expected the metadata sensor_size as WIDTHxHEIGHT, got {text!r}")
+            yield file, sensor_size
+    except DataError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, OverflowError) as error:
         raise DataError(f"{path}: not a complete Parquet file: {error}") from error
-    got = {field.name: str(field.type) for field in table.schema}
-    expected = {name: np.dtype(dtype).name for name, dtype in EVENT_DTYPES.items()}
-    if got != expected:
-        raise DataError(f"{path}: expected the columns {expected}, got {got}")
-    if any(column.null_count for column in table.columns):
-        raise DataError(f"{path}: expected no nulls in the columns {', '.join(expected)}")
-    size_text = (table.schema.metadata or {}).get(b"sensor_size", b"").decode("ascii", errors="replace")
-    size = re.fullmatch(r"(\d+)x(\d+)", size_text)
-    if size is None:
-        raise DataError(f"{path}: expected the metadata sensor_size as WIDTHxHEIGHT, got {size_text!r}")
+
+
+def _to_events(table: pa.Table | pa.RecordBatch, sensor_size: SensorSize, path: Path) -> Events:
+    if any(table[name].null_count for name in EVENT_DTYPES):
+        raise DataError(f"{path}: expected no nulls in the columns {', '.join(EVENT_DTYPES)}")
+    columns = (np.asarray(table[name]) for name in EVENT_DTYPES)
     # A copy where Arrow hands out its own read-only memory: Events are plain, writable arrays whatever they came from.
-    t, x, y, p = (np.require(table[name].to_numpy(), requirements="W") for name in EVENT_DTYPES)
-    return check_events(Events(t, x, y, p, (int(size[1]), int(size[2]))), str(path))
+    t, x, y, p = (np.require(column, requirements="W") for column in columns)
+    return Events(t, x, y, p, sensor_size)
 
 
 def write(path: Path, events: Events) -> None:
@@ -61,13 +122,42 @@ def write(path: Path, events: Events) -> None:
     Raises:
         DataError: events break `check_events`.
     """
+    check_events(events, f"events to be written to {path}")
+    write_chunks(path, [events])
+
+
+def write_chunks(path: Path, chunks: Iterable[Events]) -> None:
+    """Write a recording that comes in pieces, in memory that does not grow with it.
+
+    Raises:
+        DataError: no piece at all, or pieces that break `check_events` or do not join; the file is then unfinished.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    check_events(events, f"events to be written to {path}")
-    width, height = events.sensor_size
-    columns = {name: pa.array(getattr(events, name)) for name in EVENT_DTYPES}
-    table = pa.table(columns).replace_schema_metadata({"sensor_size": f"{width}x{height}"})
     # Time stamps grow slowly: their differences take a fraction of a dictionary of them.
     encodings = {"t": "DELTA_BINARY_PACKED", "x": "PLAIN", "y": "PLAIN", "p": "PLAIN"}
-    pq.write_table(table, path, compression="zstd", use_dictionary=False, column_encoding=encodings)
+    writer: pq.ParquetWriter | None = None
+    try:
+        pieces = event_pieces.check_pieces(_not_none(chunks, path), f"events to be written to {path}")
+        for piece in event_pieces.regroup(pieces, ROW_GROUP):
+            table = pa.table({name: pa.array(getattr(piece, name)) for name in EVENT_DTYPES})
+            if writer is None:
+                width, height = piece.sensor_size
+                schema = table.schema.with_metadata({"sensor_size": f"{width}x{height}"})
+                writer = pq.ParquetWriter(
+                    path, schema, compression="zstd", use_dictionary=False, column_encoding=encodings
+                )
+            writer.write_table(table.cast(writer.schema), row_group_size=ROW_GROUP)
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def _not_none(chunks: Iterable[Events], path: Path) -> Iterator[Events]:
+    any_given = False
+    for chunk in chunks:
+        any_given = True
+        yield chunk
+    if not any_given:
+        raise DataError(f"events to be written to {path}: expected at least one piece, got none")
