@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from data_contracts.config import Windows
+from data_contracts.errors import DataError
 from data_contracts.events import Events
+
+_NONE = np.zeros((0, 2), np.int64)
 
 
 def cut(events: Events, windows: Windows) -> np.ndarray:
@@ -19,29 +24,118 @@ def cut(events: Events, windows: Windows) -> np.ndarray:
         windows: how to cut.
     Returns:
         [W, 2] int64, start and stop of each window in events, in order; W may be 0.
+    Raises:
+        DataError: the method is `dataset`, whose ranges come from the dataset and not from the events.
     """
-    if windows.method == "count":
-        starts = np.arange(len(events) // windows.num_events, dtype=np.int64) * windows.num_events
-        ranges = np.stack([starts, starts + windows.num_events], axis=1)
-    elif windows.method == "duration":
-        ranges = _cut_by_duration(events.t, windows.duration_us)
-    else:
-        ranges = np.array([[0, len(events)]], np.int64)
-    if windows.method != "count":
-        ranges = ranges[ranges[:, 1] - ranges[:, 0] >= windows.min_events]
-    if windows.max_windows is None or len(ranges) <= windows.max_windows:
-        return ranges
-    # The middle of each of max_windows equal stretches, in integers so that it is the same on every machine.
-    middles = (2 * np.arange(windows.max_windows, dtype=np.int64) + 1) * len(ranges) // (2 * windows.max_windows)
-    return ranges[middles]
+    return cut_chunks([events.t], windows)
 
 
-def _cut_by_duration(t: np.ndarray, duration_us: int) -> np.ndarray:
-    """Ranges of the windows that have events: listing only those, a jump of the clock by years costs nothing."""
-    if len(t) == 0:
-        return np.zeros((0, 2), np.int64)
-    window = (t - t[0]) // duration_us
-    bounds = np.concatenate([[0], np.flatnonzero(window[1:] != window[:-1]) + 1, [len(t)]]).astype(np.int64)
-    ranges = np.stack([bounds[:-1], bounds[1:]], axis=1)
-    is_complete = (int(window[-1]) + 1) * duration_us <= int(t[-1] - t[0]) + 1
-    return ranges if is_complete else ranges[:-1]
+def cut_chunks(chunks: Iterable[np.ndarray], windows: Windows) -> np.ndarray:
+    """What `cut` returns, for a recording whose time stamps come in pieces because they do not fit into memory.
+
+    Only the ranges are kept, 16 bytes a window; how the stamps are divided into pieces changes nothing.
+
+    Args:
+        chunks: [N_i] int64, us, non-decreasing from piece to piece; pieces may be empty.
+        windows: how to cut.
+    Returns:
+        [W, 2] int64, start and stop of each window in events of the whole recording.
+    Raises:
+        DataError: the method is `dataset`.
+    """
+    cutter = Cutter(windows)
+    found = [cutter.add(t) for t in chunks]
+    ranges = np.concatenate([*found, cutter.finish()])
+    return ranges[spread(len(ranges), windows.max_windows)]
+
+
+class Cutter:
+    """Windows of a recording that is read piece by piece: those that `add` completes, then those that `finish` does.
+
+    `max_windows` is not heeded, because which windows it keeps is only known at the end: see `spread`.
+    """
+
+    def __init__(self, windows: Windows) -> None:
+        if windows.method == "dataset":
+            raise DataError(
+                "windows.method 'dataset': the ranges come from the dataset; cut by count, duration or whole instead"
+            )
+        self.windows = windows
+        self.num_events = 0
+        """Time stamps seen so far."""
+        self._first_us = self._last_us = 0
+        self._start = 0
+        """First event of the window that is open."""
+        self._open_window = 0
+        """Its number, counted from the first event; duration only."""
+
+    def add(self, t: np.ndarray) -> np.ndarray:
+        """Take the next time stamps.
+
+        Args:
+            t: [N] int64, us, non-decreasing, none before those of earlier pieces.
+        Returns:
+            [W, 2] int64, the windows that are complete now and were not before.
+        """
+        if len(t) == 0:
+            return _NONE
+        if self.num_events == 0:
+            self._first_us = int(t[0])
+        before, self.num_events, self._last_us = self.num_events, self.num_events + len(t), int(t[-1])
+        if self.windows.method == "count":
+            return self._full_counts()
+        if self.windows.method == "whole":
+            return _NONE
+        # Only windows that have events are listed: a jump of the clock by years costs nothing.
+        number = (t - self._first_us) // self.windows.duration_us
+        bounds = np.flatnonzero(number[1:] != number[:-1]) + before + 1
+        if number[0] != self._open_window:
+            bounds = np.concatenate([[before], bounds])
+        if len(bounds) == 0:
+            return _NONE
+        starts = np.concatenate([[self._start], bounds[:-1]])
+        self._start, self._open_window = int(bounds[-1]), int(number[-1])
+        return self._with_enough_events(np.stack([starts, bounds], axis=1).astype(np.int64))
+
+    def finish(self) -> np.ndarray:
+        """The window that only the end of the recording completes, [0 or 1, 2] int64."""
+        last = np.array([[self._start, self.num_events]], np.int64)
+        if self.windows.method == "whole":
+            return self._with_enough_events(last)
+        if self.windows.method == "count" or self.num_events == 0:
+            return _NONE
+        is_complete = (self._open_window + 1) * self.windows.duration_us <= self._last_us - self._first_us + 1
+        return self._with_enough_events(last) if is_complete else _NONE
+
+    def _full_counts(self) -> np.ndarray:
+        size = self.windows.num_events
+        starts = np.arange(self._start, self.num_events - size + 1, size, dtype=np.int64)
+        self._start += len(starts) * size
+        return np.stack([starts, starts + size], axis=1)
+
+    def _with_enough_events(self, ranges: np.ndarray) -> np.ndarray:
+        return ranges[ranges[:, 1] - ranges[:, 0] >= self.windows.min_events]
+
+
+def spread(count: int, wanted: int | None) -> np.ndarray:
+    """Indices of at most `wanted` of `count`: the middle of each of as many equal stretches."""
+    if wanted is None or count <= wanted:
+        return np.arange(count)
+    # In integers, so that it is the same on every machine.
+    return (2 * np.arange(wanted, dtype=np.int64) + 1) * count // (2 * wanted)
+
+
+def check_ranges(windows: np.ndarray, num_events: int) -> np.ndarray:
+    """The windows as contiguous [N, 2] int64.
+
+    Raises:
+        ValueError: another shape, or a window is not a range within `num_events` events.
+    """
+    windows = np.ascontiguousarray(windows, np.int64)
+    if windows.ndim != 2 or windows.shape[1] != 2:
+        raise ValueError(f"windows must be [N, 2], got {windows.shape}")
+    wrong = (windows[:, 0] < 0) | (windows[:, 1] < windows[:, 0]) | (windows[:, 1] > num_events)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise ValueError(f"window {row} must be a range within {num_events} events, got {windows[row].tolist()}")
+    return windows

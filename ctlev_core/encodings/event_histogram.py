@@ -9,32 +9,25 @@ normalisation and the numbers of events.
 
 from __future__ import annotations
 
-from fractions import Fraction
+import math
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, PositiveInt
+from pydantic import Field
 
-from data_contracts.config import Frozen
-from data_contracts.errors import DataError
-from data_contracts.events import Events, SensorSize
+from ctlev_core import image_geometry
+from ctlev_core.windows import check_ranges
+from data_contracts.events import Events
 
 VERSION = 1
 
 
-class Options(Frozen):
+class Options(image_geometry.ImageFit):
     """Options of the event histogram."""
 
     polarity: bool = Field(
         default=True, description="count positive and negative events apart; DHP19 discards polarity"
-    )
-    image_size: tuple[PositiveInt, PositiveInt] | None = Field(
-        default=None, description="(width, height) px of the image; the sensor's own where not given"
-    )
-    fit: Literal["pad", "crop", "stretch"] = Field(
-        default="pad",
-        description="how the sensor meets another image size: whole sensor with black bars, image filled and the rest "
-        "of the sensor dropped, or both axes scaled on their own; pad and crop keep the aspect and the centre",
     )
     normalisation: Literal["three_sigma", "max", "count"] = Field(
         default="three_sigma",
@@ -48,6 +41,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
     """Count the events of each window.
 
     Each sensor pixel belongs to the image pixel its centre falls into; scaling up thus leaves pixels without events.
+    With short windows most of the time goes into new memory: `encode_each` needs none.
 
     Args:
         events: E events.
@@ -56,35 +50,72 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
     Returns:
         [N, C, H, W] uint16; channels (positive, negative), or one channel without polarity. Counts stop at 65,535.
     Raises:
-        ValueError: a window is not a range of the events.
+        ValueError: a window is not a range of the events, or the image is too large.
+        DataError: an event lies outside the sensor.
+    """
+    windows = check_ranges(windows, len(events))
+    counts = np.empty((len(windows), *_shape(events, options)), np.uint16)
+    count = _counter(events, windows, options)
+    image_geometry.check_inside(events, count(windows, counts.reshape(len(windows), math.prod(counts.shape[1:]))))
+    return counts
+
+
+def encode_each(events: Events, windows: np.ndarray, options: Options) -> Iterator[np.ndarray]:
+    """What `encode` returns, window after window in one array that is used again: copy what is to be kept.
+
+    Args:
+        events: E events.
+        windows: [N, 2] int64, start and stop of each window in events.
+        options: options of this encoding.
+    Yields:
+        [C, H, W] uint16, valid until the next is asked for; changes made to it show in later windows.
+    Raises:
+        ValueError: a window is not a range of the events, or the image is too large.
         DataError: an event lies outside the sensor.
     """
     from ctlev_core import histogram as kernels
 
-    windows = np.ascontiguousarray(windows, np.int64)
-    if windows.ndim != 2 or windows.shape[1] != 2:
-        raise ValueError(f"windows must be [N, 2], got {windows.shape}")
-    wrong = (windows[:, 0] < 0) | (windows[:, 1] < windows[:, 0]) | (windows[:, 1] > len(events))
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise ValueError(f"window {row} must be a range within {len(events)} events, got {windows[row].tolist()}")
-    width, height = _image_size(events.sensor_size, options)
+    windows = check_ranges(windows, len(events))
+    counts = np.zeros(_shape(events, options), np.uint16)
+    flat = counts.reshape(1, counts.size)
+    count = _counter(events, windows, options)
+    is_sensor = counts.shape[:0:-1] == events.sensor_size
+    is_clear = True
+    for row, (start, stop) in enumerate(windows.tolist()):
+        image_geometry.check_inside(events, count(windows[row : row + 1], flat, is_clear))
+        yield counts
+        is_clear = is_sensor and stop - start < kernels.SPARSE * counts.size
+        if is_clear:
+            columns = events.x, events.y, events.p, start, stop
+            kernels.clear_pixels(*columns, events.sensor_size, options.polarity, flat[0])
+
+
+def _shape(events: Events, options: Options) -> tuple[int, int, int]:
+    """(C, H, W) of one window."""
+    width, height = image_geometry.image_size(events.sensor_size, options)
     num_channels = 2 if options.polarity else 1
-    (scale_x, offset_x), (scale_y, offset_y) = _scale_and_offset(events.sensor_size, options)
-    column_of = _bins(events.sensor_size[0], width, scale_x, offset_x)
-    row_start_of = _bins(events.sensor_size[1], height, scale_y, offset_y) * width
-    negative_start = (num_channels - 1) * height * width
-    scratch = np.empty(num_channels * height * width, np.uint16)
-    counts = np.empty((len(windows), scratch.size), np.uint16)
-    outside = kernels.count_events(
-        events.x, events.y, events.p, windows, column_of, row_start_of, negative_start, scratch, counts
-    )
-    if outside >= 0:
-        raise DataError(
-            f"event {outside} at x = {events.x[outside]}, y = {events.y[outside]} px lies outside the sensor of "
-            f"{events.sensor_size[0]} x {events.sensor_size[1]} px"
+    if num_channels * height * width >= 2**32:
+        raise ValueError(f"an image must have fewer than 2^32 cells, got {num_channels} x {height} x {width}")
+    return num_channels, height, width
+
+
+def _counter(events: Events, windows: np.ndarray, options: Options) -> Callable[..., int]:
+    """The kernel for these options, of (windows, histogram [N, cells], is_clear): fast where nothing is scaled."""
+    from ctlev_core import histogram as kernels
+
+    num_channels, height, width = _shape(events, options)
+    num_cells = num_channels * height * width
+    if (width, height) == events.sensor_size:
+        has_dense = (windows[:, 1] - windows[:, 0]).max(initial=0) > kernels.DENSE * num_cells
+        narrow = np.zeros(num_cells if has_dense else 0, np.uint8)
+        return lambda windows, histogram, is_clear=False: kernels.count_pixels(
+            events.x, events.y, events.p, windows, (width, height), options.polarity, narrow, is_clear, histogram
         )
-    return counts.reshape(len(windows), num_channels, height, width)
+    column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
+    negative_start = (num_channels - 1) * height * width
+    return lambda windows, histogram, is_clear=False: kernels.count_events(
+        events.x, events.y, events.p, windows, column_of, row_of * width, negative_start, histogram
+    )
 
 
 def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
@@ -118,47 +149,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     return images
 
 
-def map_points(points: np.ndarray, sensor_size: SensorSize, options: Options) -> np.ndarray:
-    """Sensor pixels to image pixels, the same map that bins the events.
-
-    Args:
-        points: [..., 2] float (x, y), sensor px, pixel centres at integer + 0.5; NaN stays NaN.
-        sensor_size: (width, height) px.
-        options: options of this encoding.
-    Returns:
-        [..., 2], image px, pixel centres at integer + 0.5; points outside the image are kept. A float dtype is kept.
-    """
-    (scale_x, offset_x), (scale_y, offset_y) = _scale_and_offset(sensor_size, options)
-    scale, offset = np.array([scale_x, scale_y], float), np.array([offset_x, offset_y], float)
-    points = np.asarray(points)
-    dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.float64
-    return (points * scale + offset).astype(dtype)
-
-
-def _image_size(sensor_size: SensorSize, options: Options) -> tuple[int, int]:
-    return options.image_size or sensor_size
-
-
-def _scale_and_offset(sensor_size: SensorSize, options: Options) -> tuple[tuple[Fraction, Fraction], ...]:
-    """Of x and of y: image px = scale * sensor px + offset. Exact, or rounding would decide about a pixel."""
-    image_size = _image_size(sensor_size, options)
-    scales = [Fraction(image, sensor) for image, sensor in zip(image_size, sensor_size, strict=True)]
-    if options.fit == "pad":
-        scales = [min(scales)] * 2
-    elif options.fit == "crop":
-        scales = [max(scales)] * 2
-    axes = zip(scales, image_size, sensor_size, strict=True)
-    return tuple((scale, (image - scale * sensor) / 2) for scale, image, sensor in axes)
-
-
-def _bins(num_sensor: int, num_image: int, scale: Fraction, offset: Fraction) -> np.ndarray:
-    """Image pixel that holds the centre of each sensor pixel, [num_sensor] int64; -1 outside the image."""
-    # floor(scale * (pixel + 1/2) + offset) over one common denominator, in integers.
-    doubled_centres = 2 * np.arange(num_sensor, dtype=np.int64) + 1
-    numerators = doubled_centres * (scale.numerator * offset.denominator) + 2 * offset.numerator * scale.denominator
-    bins = numerators // (2 * scale.denominator * offset.denominator)
-    bins[(bins < 0) | (bins >= num_image)] = -1
-    return bins
+map_points = image_geometry.map_points
 
 
 def _full_scales(histogram: np.ndarray, options: Options) -> np.ndarray:

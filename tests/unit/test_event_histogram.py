@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ctlev_core.encodings.event_histogram import Options, encode, map_points, render_image
+from ctlev_core.encodings.event_histogram import Options, encode, encode_each, map_points, render_image
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -257,3 +257,75 @@ def test_brightness_grows_with_the_count_and_zero_stays_black(counts, normalisat
 def test_images_of_other_arrays_are_refused(counts):
     with pytest.raises(ValueError, match=r"histogram must be \[N, 2, H, W\] uint16, got"):
         render_image(counts, Options())
+
+
+# One array for all windows -----------------------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(ROWS, st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), max_size=6), SIZES, st.booleans())
+def test_windows_one_by_one_equal_windows_together(rows, bounds, image_size, as_sensor):
+    events = make_events(rows, (7, 5))
+    windows = np.array([sorted(min(b, len(rows)) for b in bound) for bound in bounds], np.int64).reshape(-1, 2)
+    for polarity in (True, False):
+        options = Options(image_size=None if as_sensor else image_size, polarity=polarity)
+        one_by_one = [counts.copy() for counts in encode_each(events, windows, options)]
+        assert len(one_by_one) == len(windows)
+        assert all((a == b).all() for a, b in zip(one_by_one, encode(events, windows, options), strict=True))
+
+
+def test_windows_one_by_one_are_cleared_in_between_on_a_large_sensor():
+    # 100 x 100 cells: a window of 200 events is cleared event by event, one of 300 as a whole.
+    rng = np.random.default_rng(1)
+    events = make_events(rng.integers(0, (100, 100, 2), (1500, 3)).tolist(), (100, 100))
+    windows = np.array([[0, 200], [200, 500], [500, 700], [700, 700], [700, 1500]])
+    together = encode(events, windows, Options())
+    seen = set()
+    for counts, expected in zip(encode_each(events, windows, Options()), together, strict=True):
+        assert (counts == expected).all()
+        seen.add(id(counts))
+    assert len(seen) == 1
+
+
+def test_windows_one_by_one_refuse_what_encode_refuses():
+    with pytest.raises(DataError, match="event 1 at x = 4"):
+        list(encode_each(make_events([(0, 0, 1), (4, 0, 1)]), np.array([[0, 2]]), Options()))
+    with pytest.raises(ValueError, match="window 0 must be a range within 1 events"):
+        list(encode_each(make_events([(0, 0, 1)]), np.array([[0, 2]]), Options()))
+
+
+# Many events a cell: counted in bytes first ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num_events", [254, 255, 256, 257, 511, 512, 513, 65534, 65535, 65536, 65537, 2**17 + 3])
+def test_counts_around_a_full_byte_and_a_full_cell(num_events):
+    events = make_events([(0, 1, 0)] * num_events + [(1, 1, 1)], (2, 2))
+    expected = np.zeros((1, 2, 2, 2), int)
+    expected[0, 1, 1, 0], expected[0, 0, 1, 1] = min(num_events, 65535), 1
+    assert (encode(events, whole(events), Options()) == expected).all()
+    windows = np.array([[0, num_events], [0, num_events + 1], [num_events, num_events + 1]])
+    assert (encode(events, windows, Options())[1] == expected[0]).all()
+    assert (encode(events, windows, Options())[2] == [[[0, 0], [0, 1]], [[0, 0], [0, 0]]]).all()
+
+
+@pytest.mark.parametrize("position", [(0, 3), (4, 0)])
+@pytest.mark.parametrize("row", [0, 255, 256, 700, 999])
+@pytest.mark.parametrize("image_size", [None, (3, 3)])
+def test_the_first_event_outside_is_named_wherever_it_is(position, row, image_size):
+    rows = [(0, 0, 1)] * 1000
+    rows[row] = (*position, 1)
+    events = make_events(rows)
+    windows = np.array([[row + 1, 1000], [0, 1000]])
+    with pytest.raises(DataError, match=rf"event {row} at x = {position[0]}, y = {position[1]} px"):
+        encode(events, windows, Options(image_size=image_size, fit="stretch"))
+
+
+def test_events_on_the_last_row_and_column_count():
+    events = make_events([(3, 2, 1), (3, 0, 0), (0, 2, 0)])
+    counts = encode(events, whole(events), Options())
+    assert (counts[0, 0, 2, 3], counts[0, 1, 0, 3], counts[0, 1, 2, 0]) == (1, 1, 1)
+
+
+def test_an_image_too_large_for_its_cell_numbers_is_refused():
+    with pytest.raises(ValueError, match="fewer than 2\\^32 cells"):
+        encode(make_events([]), np.zeros((0, 2), np.int64), Options(image_size=(65536, 65536)))

@@ -1,0 +1,94 @@
+"""How the sensor meets the image: which image pixel each sensor pixel belongs to, and where points go."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, PositiveInt
+
+from data_contracts.config import Frozen
+from data_contracts.errors import DataError
+from data_contracts.events import Events, SensorSize
+
+
+class ImageFit(Frozen):
+    """Options every encoding has: the size of the image and how the sensor is fitted to it."""
+
+    image_size: tuple[PositiveInt, PositiveInt] | None = Field(
+        default=None, description="(width, height) px of the image; the sensor's own where not given"
+    )
+    fit: Literal["pad", "crop", "stretch"] = Field(
+        default="pad",
+        description="how the sensor meets another image size: whole sensor with black bars, image filled and the rest "
+        "of the sensor dropped, or both axes scaled on their own; pad and crop keep the aspect and the centre",
+    )
+
+
+def image_size(sensor_size: SensorSize, options: ImageFit) -> tuple[int, int]:
+    """(width, height) px of the image."""
+    return options.image_size or sensor_size
+
+
+def pixel_bins(sensor_size: SensorSize, options: ImageFit) -> tuple[np.ndarray, np.ndarray]:
+    """Image column of each sensor column and image row of each sensor row.
+
+    Each sensor pixel belongs to the image pixel its centre falls into; scaling up thus leaves pixels without events.
+
+    Returns:
+        [sensor width] and [sensor height] int64; -1 outside the image.
+    """
+    sizes = image_size(sensor_size, options)
+    axes = zip(sensor_size, sizes, _scale_and_offset(sensor_size, options), strict=True)
+    columns, rows = (_bins(num_sensor, num_image, *axis) for num_sensor, num_image, axis in axes)
+    return columns, rows
+
+
+def map_points(points: np.ndarray, sensor_size: SensorSize, options: ImageFit) -> np.ndarray:
+    """Sensor pixels to image pixels, the same map that bins the events.
+
+    Args:
+        points: [..., 2] float (x, y), sensor px, pixel centres at integer + 0.5; NaN stays NaN.
+        sensor_size: (width, height) px.
+        options: options of the encoding.
+    Returns:
+        [..., 2], image px, pixel centres at integer + 0.5; points outside the image are kept. A float dtype is kept.
+    """
+    (scale_x, offset_x), (scale_y, offset_y) = _scale_and_offset(sensor_size, options)
+    scale, offset = np.array([scale_x, scale_y], float), np.array([offset_x, offset_y], float)
+    points = np.asarray(points)
+    dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.float64
+    return (points * scale + offset).astype(dtype)
+
+
+def check_inside(events: Events, outside: int) -> None:
+    """Raise `DataError` for the event with the number `outside`, which a kernel found; -1 means none."""
+    if outside >= 0:
+        width, height = events.sensor_size
+        raise DataError(
+            f"event {outside} at x = {events.x[outside]}, y = {events.y[outside]} px lies outside the sensor of "
+            f"{width} x {height} px"
+        )
+
+
+def _scale_and_offset(sensor_size: SensorSize, options: ImageFit) -> tuple[tuple[Fraction, Fraction], ...]:
+    """Of x and of y: image px = scale * sensor px + offset. Exact, or rounding would decide about a pixel."""
+    sizes = image_size(sensor_size, options)
+    scales = [Fraction(image, sensor) for image, sensor in zip(sizes, sensor_size, strict=True)]
+    if options.fit == "pad":
+        scales = [min(scales)] * 2
+    elif options.fit == "crop":
+        scales = [max(scales)] * 2
+    axes = zip(scales, sizes, sensor_size, strict=True)
+    return tuple((scale, (image - scale * sensor) / 2) for scale, image, sensor in axes)
+
+
+def _bins(num_sensor: int, num_image: int, scale: Fraction, offset: Fraction) -> np.ndarray:
+    """Image pixel that holds the centre of each sensor pixel, [num_sensor] int64; -1 outside the image."""
+    # floor(scale * (pixel + 1/2) + offset) over one common denominator, in integers.
+    doubled_centres = 2 * np.arange(num_sensor, dtype=np.int64) + 1
+    numerators = doubled_centres * (scale.numerator * offset.denominator) + 2 * offset.numerator * scale.denominator
+    bins = numerators // (2 * scale.denominator * offset.denominator)
+    bins[(bins < 0) | (bins >= num_image)] = -1
+    return bins
