@@ -1,0 +1,201 @@
+"""HDF5 files of events, in the layouts of DSEC, of MVSEC, and plain ones.
+
+- DSEC: datasets x, y, t, p in the group `events` (or `CD/events`, or at the root), t in microseconds from `t_offset`,
+  which is added; `ms_to_idx` is not needed. Other names of `event_tables.COLUMN_NAMES` will do, such as xs and ts.
+- MVSEC: a dataset `davis/left/events` [N, 4] with columns x, y, t, p, t in seconds and p in {-1, 1}. `read` takes the
+  left camera, on which MVSEC's ground truth is given, or with `camera="right"` the other.
+
+Integer times are microseconds, float times seconds, rounded to the nearest microsecond. An attribute `sensor_size`
+(width, height) of the group or dataset states the sensor, else it is the smallest common one that holds all events.
+
+DSEC compresses with blosc: install hdf5plugin to read it.
+
+Source: uzh-rpg/DSEC, scripts/utils/eventslicer.py (t_offset); MVSEC, mvsec_to_hdf5 layout as its users read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctlev_core import event_pieces, event_tables
+from data_contracts.errors import DataError
+from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
+
+VERSION = 1
+SUFFIXES = (".h5", ".hdf5")
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_GROUPS = ("events", "CD/events", "/")
+_MATRIX_COLUMNS = ("x", "y", "t", "p")
+_BLOCK = 1 << 18
+
+
+def sniff(path: Path) -> bool:
+    """Does the file start like HDF5? Whether it holds events is for `read` to say."""
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+def read(path: Path, camera: str = "left") -> Events:
+    """The whole file.
+
+    Raises:
+        DataError: a cut or corrupt file, no events, a missing column (named), a compression filter that is not
+            installed, or events that break `check_events`.
+    """
+    return event_pieces.concatenate(_pieces(path, 1 << 62, camera))
+
+
+def read_chunks(path: Path, num_events: int, camera: str = "left") -> Iterator[Events]:
+    """The events of `read` in pieces; without a sensor size in the file, it is read twice.
+
+    Raises:
+        DataError: as `read`.
+    """
+    return event_pieces.regroup(_pieces(path, min(num_events, _BLOCK), camera), num_events)
+
+
+def write(path: Path, events: Events) -> None:
+    """Write the layout of DSEC, compressed with gzip, with `sensor_size`, so that `read` returns the events unchanged.
+
+    Raises:
+        DataError: events break `check_events`.
+    """
+    import h5py
+
+    check_events(events, f"events to be written to {path}")
+    offset = int(events.t[0]) if len(events) else 0
+    t = events.t - offset
+    # Index of the first event of each millisecond, as DSEC has it for reading a stretch of time.
+    num_ms = int(t[-1]) // 1000 + 1 if len(t) else 0
+    with h5py.File(path, "w") as file:
+        group = file.create_group("events")
+        group.attrs["sensor_size"] = events.sensor_size
+        for name in EVENT_DTYPES:
+            values = t if name == "t" else getattr(events, name)
+            group.create_dataset(name, data=values, compression="gzip", shuffle=True, chunks=True)
+        if num_ms <= 10 * len(t) + 1000:  # an index of a recording with huge gaps would outgrow it
+            file.create_dataset("ms_to_idx", data=np.searchsorted(t, 1000 * np.arange(num_ms)).astype(np.uint64))
+        file.create_dataset("t_offset", data=np.int64(offset))
+
+
+def _pieces(path: Path, num_events: int, camera: str) -> Iterator[Events]:
+    with _open(path) as file:
+        source = _find_matrix(file, path, camera) or _find_columns(file, path)
+        length, read_block, sensor_size = source
+
+        def pieces() -> Iterator[event_tables.Columns]:
+            for start in range(0, max(length, 1), num_events):
+                yield read_block(slice(start, min(start + num_events, length)))
+
+        yield from event_tables.to_events(pieces, str(path), sensor_size)
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Any]:
+    import h5py
+
+    with suppress(ImportError):
+        import hdf5plugin  # noqa: F401  # pyright: ignore[reportMissingImports]
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (DataError, MemoryError):
+        raise
+    except Exception as error:  # h5py passes HDF5's errors on as half a dozen types
+        text = str(error)
+        if "filter" in text.lower() or "can't open directory" in text.lower():
+            raise DataError(
+                f"{path}: compressed with a filter that is not installed; pip install hdf5plugin ({text})"
+            ) from error
+        raise DataError(f"{path}: not a complete HDF5 file: {text}") from error
+
+
+Source = tuple[int, Callable[[slice], event_tables.Columns], SensorSize | None]
+
+
+def _find_matrix(file: Any, path: Path, camera: str) -> Source | None:
+    """MVSEC's table of one camera; None where the file has no cameras."""
+    cameras = file.get("davis")
+    if cameras is None:
+        return None
+    dataset = cameras.get(f"{camera}/events")
+    if not hasattr(dataset, "shape"):
+        raise DataError(f"{path}: no dataset davis/{camera}/events; davis has {', '.join(cameras) or 'nothing'}")
+    where = f"{path}: davis/{camera}/events"
+    if len(dataset.shape) != 2 or dataset.shape[1] != len(_MATRIX_COLUMNS):
+        raise DataError(f"{where}: expected [N, 4] of {', '.join(_MATRIX_COLUMNS)}, got {dataset.shape}")
+    _check_stored(dataset, where)
+
+    def read_block(rows: slice) -> event_tables.Columns:
+        return dict(zip(_MATRIX_COLUMNS, dataset[rows].T, strict=True))
+
+    return dataset.shape[0], read_block, _sensor_size(dataset, where)
+
+
+def _find_columns(file: Any, path: Path) -> Source:
+    """One dataset a column."""
+    groups = [(name, file.get(name)) for name in _GROUPS]
+    for name, group in groups:
+        if group is None or not hasattr(group, "keys") or not event_tables.find_columns(_datasets(group)):
+            continue
+        where = f"{path}: group {name}"
+        columns = {column: group[key] for column, key in event_tables.require_columns(_datasets(group), where).items()}
+        lengths = {column: dataset.shape for column, dataset in columns.items()}
+        if len(set(lengths.values())) != 1 or len(lengths["t"]) != 1:
+            raise DataError(f"{where}: columns must be [N] and of one length, got {lengths}")
+        for column, dataset in columns.items():
+            _check_stored(dataset, f"{where}, column {column}")
+        offset = _time_offset(file, path)
+
+        def read_block(rows: slice, columns: dict[str, Any] = columns, offset: int = offset) -> event_tables.Columns:
+            values = {column: dataset[rows] for column, dataset in columns.items()}
+            if offset:
+                if values["t"].dtype.kind not in "ui" or (len(values["t"]) and int(values["t"].max()) >= 1 << 62):
+                    raise DataError(f"{path}: t_offset needs t as whole microseconds, got {values['t'].dtype}")
+                values["t"] = values["t"].astype(np.int64) + offset
+            return values
+
+        return lengths["t"][0], read_block, _sensor_size(group, where)
+    raise DataError(
+        f"{path}: no events: expected the datasets x, y, t, p in one of the groups {', '.join(_GROUPS)}, or "
+        f"davis/left/events; the root has {', '.join(file) or 'nothing'}"
+    )
+
+
+def _datasets(group: Any) -> list[str]:
+    return [key for key in group if hasattr(group.get(key), "shape")]
+
+
+def _check_stored(dataset: Any, where: str) -> None:
+    """A shape alone may promise more than any disk holds."""
+    if dataset.dtype.kind not in "buif":
+        raise DataError(f"{where}: expected numbers, got {dataset.dtype}")
+    if dataset.size and not dataset.id.get_storage_size():
+        raise DataError(f"{where}: {dataset.shape} values declared, none stored")
+
+
+def _time_offset(file: Any, path: Path) -> int:
+    dataset = file.get("t_offset", file.get("events/t_offset"))
+    if dataset is None:
+        return 0
+    if not hasattr(dataset, "shape") or dataset.size != 1 or dataset.dtype.kind not in "ui":
+        raise DataError(f"{path}: expected t_offset as one whole number of microseconds")
+    offset = int(np.asarray(dataset[()]).reshape(-1)[0])
+    if abs(offset) >= 1 << 62:
+        raise DataError(f"{path}: expected t_offset below 2^62 us, got {offset}")
+    return offset
+
+
+def _sensor_size(holder: Any, where: str) -> SensorSize | None:
+    if "sensor_size" not in holder.attrs:
+        return None
+    size = np.asarray(holder.attrs["sensor_size"])
+    if size.shape != (2,) or size.dtype.kind not in "ui":
+        raise DataError(f"{where}: expected the attribute sensor_size as (width, height), got {size!r}")
+    return int(size[0]), int(size[1])
