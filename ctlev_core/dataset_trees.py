@@ -85,6 +85,19 @@ def list_files(folder: Path, root: Path, suffix: str) -> list[Path]:
     return [check_inside(file, root) for file in files]
 
 
+def read_lines(file: Path) -> list[tuple[int, str]]:
+    """Numbers, from 1 on, and contents of the lines of a text file that are not blank, without spaces around them.
+
+    Raises:
+        DataError: the file cannot be read, or is no UTF-8 text.
+    """
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{file}: cannot be read as text: {error}") from error
+    return [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+
+
 def check_name(path: Path) -> str:
     """The name of a file without suffix, or of a folder, as part of a recording id.
 

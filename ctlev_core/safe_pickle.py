@@ -67,7 +67,10 @@ def _open(path: Path, max_bytes: int) -> BinaryIO:
         raise DataError(f"{path}: the file is empty")
     if path.stat().st_size > max_bytes:
         raise DataError(f"{path}: {path.stat().st_size} bytes, more than the limit of {max_bytes}")
-    return path.open("rb")
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be opened: {error.strerror}") from error
 
 
 def _load(path: Path, read: Callable[[], Any]) -> Any:

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.dataset_trees import check_root, list_files
+from ctlev_core.dataset_trees import check_root, list_files, read_lines
 from ctlev_core.pose_sources import PoseSourceOptions, SmplSequence, check_sequence
 from ctlev_core.pose_sources import labels_before_camera as _labels_before_camera
 from data_contracts.config import RUN_SETTING
@@ -149,4 +149,4 @@ def _read_ignored(root: Path) -> set[str]:
         raise DataError(
             f"{file}: no such file; without it bad motions would be taken (or set with_ignored); {EXPECTED_TREE}"
         )
-    return set(file.read_text(encoding="utf-8").split())
+    return {name for _, name in read_lines(file)}

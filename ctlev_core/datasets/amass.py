@@ -25,13 +25,14 @@ poses from AMASS to sample from.
 
 from __future__ import annotations
 
+import math
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 from pydantic import Field
 
+from ctlev_core import array_files
 from ctlev_core.dataset_trees import check_inside, check_root, list_folder, recording_ids
 from ctlev_core.pose_sources import Z_UP_TO_Y_UP, PoseSourceOptions, SmplSequence, check_sequence, move_world
 from ctlev_core.pose_sources import labels_before_camera as _labels_before_camera
@@ -46,6 +47,8 @@ MOTION_ENDINGS = ("_poses.npz", "_stageii.npz")
 POSE_COLUMNS = {156: "SMPL-H", 165: "SMPL-X"}
 NUM_BODY = 66
 """Columns of the root and the 21 body joints."""
+MAX_BYTES = 2 * 2**30
+"""Of one array; the longest motion takes a hundredth of it."""
 RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")
 
 EXPECTED_TREE = """expected unpacked sub-datasets of AMASS (SMPL+H G or SMPL-X):
@@ -139,28 +142,32 @@ def read_sequence(file: Path) -> SmplSequence:
 def _read_arrays(file: Path) -> dict[str, np.ndarray]:
     """`poses`, `trans`, `betas` and `rate` as float64; the other arrays, some of them pickled, stay unread."""
     try:
-        with np.load(file, allow_pickle=False) as arrays:
-            rate_key = next((key for key in RATE_KEYS if key in arrays.files), RATE_KEYS[0])
-            missing = [key for key in ("poses", "trans", "betas", rate_key) if key not in arrays.files]
+        with zipfile.ZipFile(file) as archive:
+            members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+            rate_key = next((key for key in RATE_KEYS if key in members), RATE_KEYS[0])
+            missing = [key for key in ("poses", "trans", "betas", rate_key) if key not in members]
             if missing:
-                raise DataError(f"{file}: lacks {', '.join(missing)}; found {', '.join(arrays.files)}")
+                raise DataError(f"{file}: lacks {', '.join(missing)}; found {', '.join(members)}")
             wanted = {"poses": "poses", "trans": "trans", "betas": "betas", "rate": rate_key}
-            return {name: np.asarray(arrays[key], dtype=np.float64) for name, key in wanted.items()}
+            return {name: _read_array(archive, members[key], f"{file}: {key}") for name, key in wanted.items()}
     except DataError:
         raise
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        EOFError,
-        KeyError,
-        AttributeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except Exception as error:  # a damaged archive can raise nearly any error
         raise DataError(
-            f"{file}: cannot be read as a motion of AMASS (.npz without pickled objects): {error}"
+            f"{file}: cannot be read as a motion of AMASS (.npz): {type(error).__name__}: {error}"
         ) from error
+
+
+def _read_array(archive: zipfile.ZipFile, member: str, where: str) -> np.ndarray:
+    size = archive.getinfo(member).file_size
+    if size > MAX_BYTES:
+        raise DataError(f"{where} has {size} bytes, more than the limit of {MAX_BYTES}")
+    with archive.open(member) as file:
+        header = array_files.read_array_header(file, where, size)
+        if header.dtype.kind not in "fiu":
+            raise DataError(f"{where} must be numbers, got {header.dtype}")
+        items = array_files.read_items(file, header.dtype, math.prod(header.shape), where)
+    return items.reshape(header.shape, order="F" if header.fortran_order else "C").astype(np.float64)
 
 
 def _is_root(folder: Path) -> bool:

@@ -36,7 +36,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core import event_files
-from ctlev_core.dataset_trees import check_inside, check_root, first_of, list_files, list_folder, shuffled
+from ctlev_core.dataset_trees import check_inside, check_root, first_of, list_files, list_folder, read_lines, shuffled
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events
@@ -86,22 +86,23 @@ def list_recordings(options: Options) -> list[Recording]:
     """
     root = check_root(options.root, EXPECTED_TREE, _is_root)
     names_file, names = _read_names(options)
-    files = {split: _files_by_class(root, split) for split in FOLDERS}
-    class_names = _class_names(files, names, names_file)
+    names_of_files = {split: _files_by_class(root, split) for split in FOLDERS}
+    class_names = _class_names(names_of_files, names, names_file)
     wanted = _wanted_classes(class_names, options)
     recordings = []
     for split, limit in (("train", options.images_per_class), ("test", options.test_images_per_class)):
-        missing = [wordnet_id for wordnet_id in wanted if wordnet_id not in files[split]]
+        missing = [wordnet_id for wordnet_id in wanted if wordnet_id not in names_of_files[split]]
         if missing:
             raise DataError(f"{root / FOLDERS[split]}: lacks class {missing[0]}, which the other split has")
         for wordnet_id in wanted:
-            candidates = shuffled(files[split][wordnet_id], options.seed, "n_imagenet", split, wordnet_id)
-            for file in sorted(first_of(candidates, limit)):
+            candidates = shuffled(names_of_files[split][wordnet_id], options.seed, "n_imagenet", split, wordnet_id)
+            for name in sorted(first_of(candidates, limit)):
+                file = _check_there(root / FOLDERS[split] / wordnet_id / name, root, split)
                 recording_id = f"{split}/{wordnet_id}/{file.stem}"
-                parts, name = (Part(split),), class_names[wordnet_id]
+                parts, class_name = (Part(split),), class_names[wordnet_id]
                 # The names are part of what the recordings are made of, so their file is as well.
-                sources = (_check_there(file, root, split), names_file)
-                recordings.append(Recording(recording_id, recording_id, parts, name, SENSOR_SIZE, files=sources))
+                sources = (file, names_file)
+                recordings.append(Recording(recording_id, recording_id, parts, class_name, SENSOR_SIZE, files=sources))
     return recordings
 
 
@@ -139,17 +140,17 @@ def _is_root(folder: Path) -> bool:
     return any((folder / name).is_dir() for name in FOLDERS.values())
 
 
-def _files_by_class(root: Path, split: str) -> dict[str, list[Path]]:
-    """WordNet id -> files of a split, sorted; from its list where there is one."""
+def _files_by_class(root: Path, split: str) -> dict[str, list[str]]:
+    """WordNet id -> names of the files of a split, sorted; from its list where there is one."""
     folder, list_file = root / FOLDERS[split], root / LISTS[split]
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; {EXPECTED_TREE}")
     if list_file.is_file():
-        return _listed_files(list_file, folder)
+        return _listed_files(list_file, FOLDERS[split])
     by_class = {}
     for entry in list_folder(folder):
         if entry.is_dir() and _WORDNET_ID.fullmatch(entry.name):
-            by_class[entry.name] = list_files(check_inside(entry, root), root, ".npz")
+            by_class[entry.name] = [file.name for file in list_files(check_inside(entry, root), root, ".npz")]
         elif entry.is_dir() or entry.suffix == ".npz":
             raise DataError(f"{entry}: expected folders named by WordNet ids, n and eight digits; {EXPECTED_TREE}")
     if not by_class:
@@ -157,26 +158,23 @@ def _files_by_class(root: Path, split: str) -> dict[str, list[Path]]:
     return by_class
 
 
-def _listed_files(list_file: Path, folder: Path) -> dict[str, list[Path]]:
-    by_class: dict[str, set[Path]] = {}
-    for number, line in enumerate(list_file.read_text(encoding="utf-8").splitlines(), start=1):
-        if not line.strip():
-            continue
-        parts = line.strip().replace("\\", "/").split("/")
-        as_expected = len(parts) >= 3 and parts[-3] == folder.name and _WORDNET_ID.fullmatch(parts[-2])
+def _listed_files(list_file: Path, folder: str) -> dict[str, list[str]]:
+    # Names, not paths: there are 1.3 million of them.
+    by_class: dict[str, set[str]] = {}
+    for number, line in read_lines(list_file):
+        parts = line.replace("\\", "/").rsplit("/", 3)
+        as_expected = len(parts) >= 3 and parts[-3] == folder and _WORDNET_ID.fullmatch(parts[-2])
         if not as_expected or not _FILE_NAME.fullmatch(parts[-1]):
             raise DataError(
-                f"{list_file}: line {number}: expected a path that ends in {folder.name}/nXXXXXXXX/*.npz, "
-                f"got {line.strip()!r}"
+                f"{list_file}: line {number}: expected a path that ends in {folder}/nXXXXXXXX/*.npz, got {line!r}"
             )
-        files = by_class.setdefault(parts[-2], set())
-        file = folder / parts[-2] / parts[-1]
-        if file in files:
+        names = by_class.setdefault(parts[-2], set())
+        if parts[-1] in names:
             raise DataError(f"{list_file}: line {number}: {parts[-2]}/{parts[-1]} is listed twice")
-        files.add(file)
+        names.add(parts[-1])
     if not by_class:
         raise DataError(f"{list_file}: the list is empty")
-    return {wordnet_id: sorted(files) for wordnet_id, files in sorted(by_class.items())}
+    return {wordnet_id: sorted(names) for wordnet_id, names in sorted(by_class.items())}
 
 
 def _check_there(file: Path, root: Path, split: str) -> Path:
@@ -199,10 +197,8 @@ def _read_names(options: Options) -> tuple[Path, dict[str, list[str]]]:
             "or name a file of that form (`n01440764 tench, Tinca tinca` a line) in dataset.options.names_file"
         )
     names: dict[str, list[str]] = {}
-    for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), start=1):
-        if not line.strip():
-            continue
-        wordnet_id, _, rest = line.strip().replace("\t", " ", 1).partition(" ")
+    for number, line in read_lines(file):
+        wordnet_id, _, rest = line.replace("\t", " ", 1).partition(" ")
         lemmas = [name.strip() for name in rest.split(",") if name.strip()]
         if not _WORDNET_ID.fullmatch(wordnet_id) or not lemmas:
             raise DataError(f"{file}: line {number}: expected `n01440764 tench, Tinca tinca`, got {line!r}")
@@ -213,7 +209,7 @@ def _read_names(options: Options) -> tuple[Path, dict[str, list[str]]]:
 
 
 def _class_names(
-    files: dict[str, dict[str, list[Path]]], names: dict[str, list[str]], names_file: Path
+    files: dict[str, dict[str, list[str]]], names: dict[str, list[str]], names_file: Path
 ) -> dict[str, str]:
     """WordNet id -> class name, of every class on disk: unique, also where lower and upper case are not told apart."""
     present = sorted({wordnet_id for by_class in files.values() for wordnet_id in by_class})

@@ -11,9 +11,13 @@ from scipy.spatial.transform import Rotation
 from ctlev_core import plugins
 from ctlev_core.datasets import amass
 from ctlev_core.pose_sources import REST_PELVIS
+from data_contracts import tables
 from data_contracts.config import DatasetChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels
+from data_contracts.manifest import labels_of, read_manifest
+from tasks.ingest import ingest
+from tasks.store import Store
 
 HALF_PI = np.pi / 2
 
@@ -147,8 +151,11 @@ def test_points_move_as_smpl_says(root):
         ({"betas": np.zeros((24, 10))}, r"betas must be at least 10 numbers, got \[24, 10\]"),
         ({"mocap_framerate": np.array(0)}, "frame rate must be positive, got 0.0"),
         ({"mocap_framerate": np.array([60, 120])}, r"frame rate must be one number, got \[2\]"),
-        ({"mocap_framerate": np.array("fast")}, "cannot be read as a motion of AMASS"),
-        ({"poses": np.array([{}, {}], dtype=object)}, "cannot be read as a motion of AMASS"),
+        ({"mocap_framerate": np.array("fast")}, "mocap_framerate must be numbers, got <U4"),
+        (
+            {"poses": np.array([{}, {}], dtype=object)},
+            "poses: an array of Python objects, which only a pickle can hold",
+        ),
     ],
 )
 def test_files_that_are_wrong(changes, message, tmp_path):
@@ -170,9 +177,35 @@ def test_files_that_lack_a_key_or_are_no_npz(tmp_path):
             amass.read_sequence(file)
 
 
+def test_arrays_in_fortran_order_and_other_precisions(tmp_path):
+    keys = smplh()
+    other = {"poses": np.asfortranarray(keys["poses"].astype(">f4")), "trans": keys["trans"].astype(np.float32)}
+    expected = amass.read_sequence(write(tmp_path / "a_poses.npz", keys))
+    got = amass.read_sequence(write(tmp_path / "a_poses.npz", smplh(**other)))
+    np.testing.assert_allclose(got.pose, expected.pose, atol=1e-6)
+    np.testing.assert_allclose(got.transl, expected.transl, atol=1e-6)
+
+
+def test_an_array_that_lies_about_its_size_is_not_allocated(tmp_path):
+    file = write(tmp_path / "a_poses.npz", smplh())
+    content = file.read_bytes()
+    assert content.count(b"(24, 156)") == 1
+    file.write_bytes(content.replace(b"(24, 156), }    ", b"(24000, 156), } "))
+    with pytest.raises(DataError, match=r"a_poses\.npz: poses: .* takes 29952000 bytes, got 29952"):
+        amass.read_sequence(file)
+
+
 def test_both_names_of_the_frame_rate_count(tmp_path):
     for keys in (smplh(mocap_framerate=np.array(100)), smplx(mocap_frame_rate=np.array(100.0))):
         assert amass.read_sequence(write(tmp_path / "a_poses.npz", keys)).rate_hz == 100.0
+
+
+def test_ingest_keeps_the_labels_and_expects_no_events(root, home):
+    arguments = {"dataset": DatasetChoice(name="amass", options={"root": str(root), "rate_hz": 60.0})}
+    recordings = read_manifest(ingest.run(ingest.key(arguments, Store()), arguments)[0])
+    labels = labels_of(recordings.attached(tables.LABELS))
+    assert len(recordings) == 3 and set(recordings.column("splits")) == {"condition"}
+    assert len(labels) == 36 and labels.smpl_transl is not None and labels.smpl_transl.shape == (36, 3)
 
 
 def assert_refused(root: Path, message: str, shows_tree: bool = True, **options) -> None:

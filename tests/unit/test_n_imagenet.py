@@ -191,6 +191,12 @@ def test_lists_that_are_wrong(lines, message, root):
         listed(root, classes=(TENCH,))
 
 
+def test_a_list_that_is_no_text(root):
+    (root / "val_list.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DataError, match=r"val_list\.txt: cannot be read as text"):
+        listed(root)
+
+
 def assert_refused(root: Path, message: str, shows_tree: bool = True, **options) -> None:
     with pytest.raises(DataError, match=message) as error:
         listed(root, **options)

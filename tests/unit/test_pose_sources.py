@@ -11,6 +11,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+from ctlev_core.body.layer import joint_transforms, load_body
+from ctlev_core.body.rotations import matrix_from_axis_angle
+from ctlev_core.camera import Camera, is_inside, project
 from ctlev_core.pose_sources import (
     REST_PELVIS,
     Z_UP_TO_Y_UP,
@@ -21,6 +24,7 @@ from ctlev_core.pose_sources import (
     labels_before_camera,
     move_world,
 )
+from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 FRONT = {"yaw_range_deg": (0.0, 0.0), "pitch_range_deg": (0.0, 0.0), "rate_hz": None}
@@ -89,6 +93,20 @@ def test_the_camera_sees_a_standing_body_upright_from_the_front():
     np.testing.assert_allclose(in_camera(labels, [0, 0.6, 0]) - pelvis, [0, -0.6, 0], atol=1e-6)  # head: image up
     np.testing.assert_allclose(in_camera(labels, [0.2, 0, 0]) - pelvis, [0.2, 0, 0], atol=1e-6)  # left: image right
     np.testing.assert_allclose(in_camera(labels, [0, 0, 0.1]) - pelvis, [0, 0, -0.1], atol=1e-6)  # front: nearer
+
+
+def test_the_project_s_own_body_stands_in_the_middle_of_the_picture():
+    """Through the body layer and the pinhole camera, which know nothing of pose sources."""
+    labels = labels_before_camera(standing(), "", "a", PoseSourceOptions(**FRONT, distance_m=3.0))
+    assert labels.smpl_pose is not None and labels.smpl_transl is not None
+    rotations = matrix_from_axis_angle(labels.smpl_pose.reshape(1, 24, 3))
+    _, joints = joint_transforms(load_body(), rotations, np.zeros(10), labels.smpl_transl)
+    camera = Camera(np.array([[300.0, 0, 128], [0, 300, 128], [0, 0, 1]]), np.eye(3), np.zeros(3), (256, 256))
+    pixels = dict(zip(SMPL_JOINTS, project(camera, joints)[0], strict=True))
+    np.testing.assert_allclose(pixels["pelvis"], [128, 128], atol=0.5)
+    assert pixels["head"][1] < pixels["pelvis"][1] < pixels["left_knee"][1] < pixels["left_foot"][1]
+    assert pixels["left_wrist"][0] > 128 > pixels["right_wrist"][0]
+    assert is_inside(project(camera, joints), (256, 256)).all()
 
 
 def test_yaw_turns_about_the_vertical_and_pitch_looks_down():
