@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from data_contracts.errors import DataError
 
 T = TypeVar("T")
@@ -126,14 +124,20 @@ def recording_ids(paths: Iterable[Path], root: Path) -> list[str]:
     return list(owners)
 
 
-def shuffled(items: Sequence[T], seed: int, *salt: str) -> list[T]:
-    """The items in a random order that depends on their number, the seed and the salt alone.
+def shuffled(names: Iterable[str], seed: int, *salt: str) -> list[str]:
+    """The names in a random order that depends on each name, the seed and the salt alone: the order of their hashes.
 
-    Taking the first n of it is a choice that grows with n: the choice of 50 is part of the choice of 100.
+    Taking the first n of it is a choice that grows with n: the choice of 50 is part of the choice of 100. A file more
+    or less, another listing order or another version of NumPy changes the place of no other name.
     """
-    digest = hashlib.sha256("\0".join(salt).encode()).digest()
-    random = np.random.default_rng([seed, *np.frombuffer(digest, "<u4").tolist()])
-    return [items[index] for index in random.permutation(len(items))]
+    start = hashlib.sha256("\0".join([str(seed), *salt, ""]).encode())
+
+    def order(name: str) -> bytes:
+        digest = start.copy()
+        digest.update(name.encode())
+        return digest.digest()
+
+    return sorted(names, key=order)
 
 
 def first_of(items: Sequence[T], count: int | None) -> list[T]:

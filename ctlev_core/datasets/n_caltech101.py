@@ -131,7 +131,7 @@ def class_name_of(folder: str) -> str:
 
 
 def list_recordings(options: Options) -> list[Recording]:
-    """Every chosen recording, sorted by class and name; its id and subject are `<class folder>/<file name>`.
+    """Every chosen recording, sorted by class and name; its id and subject are the path in the root.
 
     With `zero_shot`, a last label-only recording `condition/<class folder>` for each of the ten classes.
 
@@ -165,8 +165,7 @@ def list_recordings(options: Options) -> list[Recording]:
 
 
 def _recording(folder: str, split: str, file: Path, options: Options) -> Recording:
-    # EST has each name once, in one of its split folders.
-    recording_id = f"{folder}/{check_name(file)}"
+    recording_id = "/".join([*file.parent.relative_to(options.root).parts, check_name(file)])
     size = FIELD if options.sensor == "field" else None
     return Recording(recording_id, recording_id, (Part(split),), class_name_of(folder), size, files=(file,))
 
@@ -227,7 +226,7 @@ def _files_of_published(root: Path, options: Options) -> dict[str, dict[str, lis
     """Split -> class folder -> files, in the random order of the split."""
     by_split: dict[str, dict[str, list[Path]]] = {split: {} for split in _SPLIT_FOLDERS}
     for name, folder in _class_folders(root, root).items():
-        files = shuffled(list_files(folder, root, ".bin"), options.seed, "n_caltech101", name)
+        files = _shuffled_files(folder, root, ".bin", options)
         num_test, num_validation = _split_sizes(folder, len(files), options)
         by_split["test"][name] = files[:num_test]
         by_split["validation"][name] = files[num_test : num_test + num_validation]
@@ -248,20 +247,18 @@ def _split_sizes(folder: Path, count: int, options: Options) -> tuple[int, int]:
 
 def _files_of_est(root: Path, options: Options) -> dict[str, dict[str, list[Path]]]:
     """Split -> class folder -> files, as EST split them, in random order."""
-    by_split: dict[str, dict[str, list[Path]]] = {}
-    owners: dict[str, Path] = {}
-    for split, folder in _SPLIT_FOLDERS.items():
-        classes = _class_folders(root / folder, root) if (root / folder).is_dir() else {}
-        by_split[split] = {
-            name: shuffled(list_files(path, root, ".npy"), options.seed, "n_caltech101", split, name)
-            for name, path in classes.items()
+    return {
+        split: {
+            name: _shuffled_files(path, root, ".npy", options) for name, path in _class_folders(parent, root).items()
         }
-        for file in (file for files in by_split[split].values() for file in files):
-            name = f"{file.parent.name}/{file.stem}"
-            if name in owners:
-                raise DataError(f"{file}: the same recording is in {owners[name]}")
-            owners[name] = file
-    return by_split
+        for split, parent in ((split, root / folder) for split, folder in _SPLIT_FOLDERS.items())
+        if parent.is_dir()
+    }
+
+
+def _shuffled_files(folder: Path, root: Path, suffix: str, options: Options) -> list[Path]:
+    names = [file.name for file in list_files(folder, root, suffix)]
+    return [folder / name for name in shuffled(names, options.seed, "n_caltech101", folder.name)]
 
 
 def _wanted_classes(present: set[str], options: Options) -> list[str]:
