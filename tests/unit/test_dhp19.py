@@ -225,6 +225,21 @@ def test_windows_close_when_the_four_cameras_together_have_enough_events(root, s
     np.testing.assert_allclose(labels.joints2d, project(camera, means / 1000), atol=1e-4)
 
 
+@pytest.mark.parametrize(("end_us", "count"), [(594_999, 2), (595_000, 1), (600_000, 1)])
+def test_the_last_window_is_that_whose_end_is_nearest_a_row(root, end_us, count):
+    """60 rows: 594,999 us is nearest the last one, row 59; from 595,000 us on it would be row 60."""
+    times = [START + t for t in (5, 100_000, 200_000, end_us)]
+    records = [(SPECIAL, START), (SPECIAL, START), *[(address(3, 9, 9), t) for t in times], (SPECIAL, START + 900_000)]
+    write_aedat(root / "DVS_movies/S1/session1/mov2.aedat", records)
+    vicon = write_vicon(root / "Vicon_data/S1_1_2.mat", rows=60)
+    recording, chosen = first(root, events_per_window=2)
+    assert len(dhp19.read_windows(recording, chosen)) == count
+    labels = dhp19.read_window_labels(recording, chosen)
+    camera = dhp19.read_camera(recording, chosen)
+    expected = project(camera, np.stack([vicon[:11].mean(axis=0), vicon[10:].mean(axis=0)])[:count] / 1000)
+    np.testing.assert_allclose(labels.joints2d, expected, atol=1e-4)
+
+
 def test_a_window_ends_with_the_thirty_thousandth_event_after_filtering(root):
     records = busy(120_001, step=7)
     records = [(SPECIAL, START), (SPECIAL, START), *records, (SPECIAL, START + 10_000_000)]

@@ -32,7 +32,7 @@ def write_frames(root: Path, name="S1_session1_mov2", count=5, width=346, dtype=
     """MATLAB's h5create gives double and the axes reversed: (N, y, x, channel) and (N, axis, joint) in Python."""
     random = np.random.default_rng(0)
     images = random.integers(0, 256, (count, 260, width, 4), np.uint8)
-    positions = random.normal(0, 300, (count if rows is None else rows, 3, 13)) + np.array([[0], [0], [1000]])
+    positions = random.normal(0, 700, (count if rows is None else rows, 3, 13)) + np.array([[0], [0], [1000]])
     (root / folder).mkdir(parents=True, exist_ok=True)
     with h5py.File(root / folder / f"{name}_7500events.h5", "w") as file:
         file.create_dataset("DVS", data=images.astype(dtype))
@@ -74,6 +74,7 @@ def test_frames_are_pictures_of_one_channel_with_a_label_each(root, width, dtype
     homogeneous = matrix(2) @ np.concatenate([positions, np.ones((20, 1, 13))], axis=1)
     u, v = homogeneous[:, 0] / homogeneous[:, 2], 260 - homogeneous[:, 1] / homogeneous[:, 2]
     np.testing.assert_allclose(labels.joints2d, np.stack([u, v], axis=-1), rtol=1e-4, atol=1e-3)
+    assert ((v > 260) & (v < 346) & (u > 0) & (u < 346)).any(), "a joint below the picture should be among them"
     np.testing.assert_array_equal(labels.visible, (u > 0) & (u <= 346) & (v > 0) & (v <= 260))
 
 
