@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.windows import cut
+from ctlev_core.windows import Cutter, check_ranges, cut, cut_chunks, spread
 from data_contracts.config import Windows
+from data_contracts.errors import DataError
 from data_contracts.events import Events
 
 
@@ -104,3 +105,81 @@ def test_max_windows_keeps_a_subset_in_order(times, method, size, limit):
     everything, kept = ranges(times, **options), ranges(times, **options, max_windows=limit)
     assert len(kept) == min(limit, len(everything))
     assert kept == [window for window in everything if window in kept]
+
+
+# Recordings in pieces ----------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    TIMES,
+    st.lists(st.integers(0, 60), max_size=6),
+    st.sampled_from(["count", "duration", "whole"]),
+    st.integers(1, 12),
+    st.integers(1, 4),
+    st.none() | st.integers(1, 5),
+)
+def test_pieces_give_the_same_windows_however_they_are_cut(times, bounds, method, size, min_events, limit):
+    options = {
+        "method": method, "num_events": size, "duration_us": size, "min_events": min_events, "max_windows": limit
+    }  # fmt: skip
+    edges = [0, *sorted(min(bound, len(times)) for bound in bounds), len(times)]
+    pieces = [np.array(times[a:b], np.int64) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    result = cut_chunks(iter(pieces), Windows(**options))
+    assert result.tolist() == ranges(times, **options)
+    assert result.dtype == np.int64 and result.shape[1:] == (2,)
+
+
+def test_a_window_is_given_out_as_soon_as_it_is_complete():
+    cutter = Cutter(Windows(method="duration", duration_us=10))
+    assert cutter.add(np.array([0, 3])).tolist() == []
+    assert cutter.add(np.array([9, 10])).tolist() == [[0, 3]]
+    assert cutter.add(np.array([], np.int64)).tolist() == []
+    assert cutter.add(np.array([25, 39])).tolist() == [[3, 4], [4, 5]]
+    assert cutter.finish().tolist() == [[5, 6]]
+    assert cutter.num_events == 6
+
+
+@pytest.mark.parametrize("method", ["count", "duration", "whole"])
+def test_a_recording_without_pieces_or_events_has_no_windows(method):
+    assert cut_chunks([], Windows(method=method)).shape == (0, 2)
+    assert cut_chunks([np.zeros(0, np.int64)] * 2, Windows(method=method)).shape == (0, 2)
+
+
+def test_one_event():
+    assert ranges([7], method="whole") == [[0, 1]]
+    assert ranges([7], num_events=1) == [[0, 1]]
+    assert ranges([7], method="duration", duration_us=2) == []
+
+
+def test_equal_time_stamps_across_two_pieces_stay_in_one_window():
+    pieces = [np.array([5, 10]), np.array([10, 10]), np.array([14, 15])]
+    assert cut_chunks(pieces, Windows(method="duration", duration_us=5)).tolist() == [[0, 1], [1, 5]]
+
+
+def test_a_jump_of_the_clock_between_two_pieces():
+    pieces = [np.array([0, 1]), np.array([2**62, 2**62 + 9])]
+    assert cut_chunks(pieces, Windows(method="duration", duration_us=2)).tolist() == [[0, 2], [2, 3], [3, 4]]
+
+
+def test_windows_of_the_dataset_are_not_cut_here():
+    with pytest.raises(DataError, match=r"'dataset': the ranges come from the dataset; cut by count"):
+        cut(events_at([1, 2]), Windows(method="dataset"))
+
+
+@pytest.mark.parametrize(("count", "wanted"), [(0, 3), (5, None), (5, 9), (10, 3), (10, 1)])
+def test_spread_takes_the_middles_of_equal_stretches(count, wanted):
+    expected = [
+        n for n in range(count)
+        if wanted is None or count <= wanted or any((2 * k + 1) * count // (2 * wanted) == n for k in range(wanted))
+    ]  # fmt: skip
+    assert spread(count, wanted).tolist() == expected
+
+
+def test_ranges_are_checked_against_the_events():
+    assert check_ranges(np.array([[0, 3], [2, 2]], np.int32), 3).dtype == np.int64
+    for wrong in ([[0, 4]], [[-1, 0]], [[2, 1]]):
+        with pytest.raises(ValueError, match=r"window 0 must be a range within 3 events, got \["):
+            check_ranges(np.array(wrong), 3)
+    with pytest.raises(ValueError, match=r"must be \[N, 2\]"):
+        check_ranges(np.zeros((2, 3)), 3)
