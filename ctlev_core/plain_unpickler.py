@@ -14,66 +14,19 @@ from __future__ import annotations
 import math
 import pickle
 import re
-from collections.abc import Callable
-from typing import Any, ClassVar, Protocol, cast
+import reprlib
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
+from ctlev_core.bounded_reader import BoundedReader
 from data_contracts.errors import DataError
 
-_PIECE = 2**20
 _PLAIN_DTYPE = re.compile(r"[<>=|]?(\?|[biufc]\d{1,2}|[SU]\d{1,9})")
 _PLAIN_TYPES = (dict, list, tuple, set, frozenset, str, bytes, bytearray, int, float, complex, type(None))
+_KEY_TYPES = (str, bytes, int, float, complex, type(None), np.generic)
 _MAX_DIMENSIONS = 32
-
-
-class _Readable(Protocol):
-    def read(self, size: int, /) -> bytes: ...
-
-
-class BoundedReader:
-    """Reads exactly what is asked for, in pieces, so that memory grows only with bytes that are there.
-
-    Args:
-        stream: a file, or what decompresses one.
-        limit: bytes; asking for more in all is refused.
-    """
-
-    def __init__(self, stream: _Readable, limit: int) -> None:
-        self._stream = stream
-        self._left = self._limit = limit
-
-    def read(self, size: int) -> bytes:
-        """The next `size` bytes.
-
-        Raises:
-            DataError: the stream ends before, or the limit is passed.
-        """
-        if size > self._left:
-            raise DataError(f"it claims {size} more bytes where at most {self._left} of {self._limit} are left")
-        pieces, missing = [], size
-        while missing:
-            piece = self._stream.read(min(missing, _PIECE))
-            if not piece:
-                raise DataError(f"it ends {missing} bytes early")
-            pieces.append(piece)
-            missing -= len(piece)
-        self._left -= size
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
-
-    def readline(self) -> bytes:
-        """The bytes up to and with the next line feed."""
-        line = bytearray()
-        while not line.endswith(b"\n"):
-            line += self.read(1)
-        return bytes(line)
-
-    def read_to_end(self) -> None:
-        """Read and forget the rest: a decompressor compares the checksum only there."""
-        while piece := self._stream.read(_PIECE):
-            self._left -= len(piece)
-            if self._left < 0:
-                raise DataError(f"it holds more than {self._limit} bytes")
 
 
 class Marker:
@@ -89,16 +42,20 @@ class _Dtype:
     def __init__(self, spec: object, *_: object) -> None:
         text = spec.decode("ascii", "replace") if isinstance(spec, bytes) else spec
         if not isinstance(text, str) or not _PLAIN_DTYPE.fullmatch(text):
-            raise DataError(f"it holds an array of type {spec!r}; read are bool, int, float, complex, bytes and str")
+            raise DataError(
+                f"it holds an array of type {reprlib.repr(spec)}; read are bool, int, float, complex, bytes and str"
+            )
         self.dtype = np.dtype(text)
 
     def set_state(self, state: Any) -> None:
         """State as NumPy writes it: (version, byte order, subarray, names, fields, size, alignment, flags, ...)."""
         if not isinstance(state, tuple) or len(state) < 5 or any(part is not None for part in state[2:5]):
-            raise DataError(f"it holds an array type with the state {state!r}; structured types are not read")
+            raise DataError(
+                f"it holds an array type with the state {reprlib.repr(state)}; structured types are not read"
+            )
         order = state[1].decode("ascii", "replace") if isinstance(state[1], bytes) else state[1]
         if order not in ("<", ">", "|", "="):
-            raise DataError(f"it holds an array type with the byte order {order!r}")
+            raise DataError(f"it holds an array type with the byte order {reprlib.repr(order)}")
         if order in "<>":
             self.dtype = self.dtype.newbyteorder(order)
 
@@ -114,7 +71,7 @@ def count_bytes(shape: object, dtype: np.dtype) -> int:
     """Bytes of an array, after checking its shape."""
     plain = isinstance(shape, tuple) and all(type(n) is int and n >= 0 for n in shape)
     if not plain or len(cast(tuple, shape)) > _MAX_DIMENSIONS:
-        raise DataError(f"it holds an array of the shape {shape!r}")
+        raise DataError(f"it holds an array of the shape {reprlib.repr(shape)}")
     return math.prod(cast(tuple, shape)) * dtype.itemsize
 
 
@@ -135,7 +92,7 @@ def _bytes_of(value: object) -> bytes | bytearray:
 def _encode(text: object, encoding: object) -> bytes:
     """How Python 3 writes bytes in protocols 0 to 2."""
     if not isinstance(text, str) or encoding != "latin1":
-        raise DataError(f"it encodes {type(text).__name__} as {encoding!r}")
+        raise DataError(f"it encodes {type(text).__name__} as {reprlib.repr(encoding)}")
     return text.encode("latin1")
 
 
@@ -148,7 +105,15 @@ def _set(items: object) -> set:
     """How protocols 0 to 3 write a set."""
     if not isinstance(items, list):
         raise DataError("it makes a set of something else than a list")
+    _check_keys(items)
     return set(items)
+
+
+def _check_keys(keys: Iterable[object]) -> None:
+    """A short pickle can build nested tuples whose hash takes for ever."""
+    for key in keys:
+        if not all(isinstance(part, _KEY_TYPES) for part in (key if isinstance(key, tuple) else (key,))):
+            raise DataError(f"refused: a key of a dictionary or set is {reprlib.repr(key)}, no number or string")
 
 
 def _complex(real: object, imaginary: object) -> complex:
@@ -242,6 +207,31 @@ class PlainUnpickler(_BaseUnpickler):
         """A bytearray; pickle's own allocates it before it looks whether the bytes are there."""
         self.append(bytearray(self.read(int.from_bytes(self.read(8), "little"))))
 
+    def load_setitem(self) -> None:
+        """One item of a dictionary."""
+        _check_keys(self.stack[-2:-1])
+        super().load_setitem()
+
+    def load_setitems(self) -> None:
+        """Items of a dictionary, keys and values in turns."""
+        _check_keys(self.stack[::2])
+        super().load_setitems()
+
+    def load_dict(self) -> None:
+        """A dictionary of protocol 0."""
+        _check_keys(self.stack[::2])
+        super().load_dict()
+
+    def load_additems(self) -> None:
+        """Items of a set."""
+        _check_keys(self.stack)
+        super().load_additems()
+
+    def load_frozenset(self) -> None:
+        """A set that stays as it is."""
+        _check_keys(self.stack)
+        super().load_frozenset()
+
     def refuse(self) -> None:
         """In the place of every instruction that makes objects of classes, or asks for data outside the file."""
         raise DataError("refused: it uses a pickle instruction that plain data does not need")
@@ -249,6 +239,11 @@ class PlainUnpickler(_BaseUnpickler):
     dispatch[pickle.REDUCE[0]] = load_reduce
     dispatch[pickle.BUILD[0]] = load_build
     dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8
+    dispatch[pickle.SETITEM[0]] = load_setitem
+    dispatch[pickle.SETITEMS[0]] = load_setitems
+    dispatch[pickle.DICT[0]] = load_dict
+    dispatch[pickle.ADDITEMS[0]] = load_additems
+    dispatch[pickle.FROZENSET[0]] = load_frozenset
     for _opcode in ("INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4"):
         dispatch[getattr(pickle, _opcode)[0]] = refuse
     for _opcode in ("NEXT_BUFFER", "READONLY_BUFFER"):

@@ -21,7 +21,8 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from ctlev_core.plain_unpickler import NDARRAY, BoundedReader, Marker, PlainUnpickler, array_of, count_bytes, dtype_of
+from ctlev_core.bounded_reader import BoundedReader
+from ctlev_core.plain_unpickler import NDARRAY, Marker, PlainUnpickler, array_of, count_bytes, dtype_of
 from data_contracts.errors import DataError
 
 MAX_BYTES = 4 * 2**30

@@ -12,9 +12,14 @@ from pydantic import ValidationError
 
 from ctlev_core import plugins
 from ctlev_core.datasets import n_caltech101
-from data_contracts.config import DatasetChoice
+from data_contracts.config import ConditionChoice, DatasetChoice, EncodingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels
+from data_contracts.manifest import read_manifest
+from tasks.condition import condition_frames, condition_samples
+from tasks.encode import encode
+from tasks.ingest import ingest
+from tasks.store import Store
 
 # Table 5 of the paper, as printed.
 TABLE_5 = ["bonsai", "ceiling fan", "ferry", "joshua tree", "minaret", "pagoda", "sunflower", "water lilly",
@@ -51,6 +56,11 @@ def root(tmp_path: Path) -> Path:
 
 def listed(root: Path, **options) -> list:
     return n_caltech101.list_recordings(n_caltech101.Options(root=root, **options))
+
+
+def run_stage(stage, **arguments):
+    """What a Prefect task does, without Prefect."""
+    return stage.run(stage.key(arguments, Store()), arguments)[0]
 
 
 def ids(recordings: list, split: str) -> list[str]:
@@ -108,6 +118,20 @@ def test_zero_shot_classes_are_those_of_table_5_and_are_only_tested_and_sampled(
     assert [r.class_name for r in labels_only] == ["bonsai", "ferry"] and labels_only[0].files == ()
     with pytest.raises(DataError, match=r"zero_shot needs classes to learn from and some of bonsai, .*are: accordion"):
         listed(root, zero_shot=True, classes=("accordion",))
+
+
+def test_only_the_zero_shot_classes_are_sampled_and_none_of_them_is_learnt(root, home):
+    options = {"root": str(root), "zero_shot": True}
+    recordings = run_stage(ingest, dataset=DatasetChoice(name="n_caltech101", options=options))
+    encoding = EncodingChoice(name="event_histogram", options={"image_size": (16, 16)})
+    frames = run_stage(encode, recordings=recordings, encoding=encoding, windows=Windows(method="whole"))
+    text = ConditionChoice(name="text")
+    learnt = run_stage(condition_frames, recordings=recordings, frames=frames, condition=text, seed=0)
+    asked = {"encoding": encoding, "count": 6, "seed": 0}
+    sampled = run_stage(condition_samples, recordings=recordings, frames=frames, condition=text, **asked)
+    names = [set(read_manifest(manifest).column("prompt")) for manifest in (learnt, sampled)]
+    assert names[0] == {"A photo of accordion", "A photo of crocodile head"}
+    assert names[1] == {"A photo of bonsai", "A photo of ferry"}
 
 
 def test_classes_can_be_chosen_by_folder_or_name(root):

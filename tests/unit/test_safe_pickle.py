@@ -154,6 +154,29 @@ def test_everything_but_plain_data_is_refused(content, message, tmp_path):
     assert_refused(content, message, tmp_path)
 
 
+BOMB = b")" + b"q\x00h\x00\x86" * 60  # ((((), ()), ...): each tuple holds the last one twice
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\x80\x04}" + BOMB + b"K\x01s.",
+        b"\x80\x04}(" + BOMB + b"K\x01u.",
+        b"(" + BOMB + b"K\x01d.",
+        b"\x80\x04\x8f(" + BOMB + b"\x90.",
+        b"\x80\x04(" + BOMB + b"\x91.",
+        b"\x80\x02c__builtin__\nset\n](" + BOMB + b"e\x85R.",
+        b"\x80\x02cnumpy\ndtype\n" + BOMB + b"K\x00K\x01\x87R.",
+    ],
+)
+def test_tuples_that_take_for_ever_to_hash_or_print_are_refused_at_once(content, tmp_path):
+    assert_refused(content, r"key of a dictionary or set is \(\(\(|array of type \(\(\(", tmp_path)
+    assert safe_pickle.load(written(tmp_path / "ok.pkl", pickle.dumps({(1, "a"): 2, None: 3}))) == {
+        (1, "a"): 2,
+        None: 3,
+    }
+
+
 def with_dtype_state(state: bytes) -> bytes:
     """A protocol 2 array [2] of float64 whose type has the given state."""
     return (
