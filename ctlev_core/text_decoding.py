@@ -13,6 +13,7 @@ OK, NOT_A_NUMBER, NOT_WHOLE, TOO_LARGE, FEWER_COLUMNS, MORE_COLUMNS = 0, 1, 2, 3
 UNKNOWN, SECONDS, MICROSECONDS = 0, 1, 2
 
 _LARGEST_MANTISSA = ((1 << 63) - 10) // 10
+_HALF = 5 * 10**18
 _MICRO_DIGITS = 6
 
 
@@ -71,12 +72,13 @@ def _parse(  # noqa: C901 a number's grammar, in one pass
             return 0, TOO_LARGE, False, has_point
         mantissa *= 10
         exponent -= 1
-    if dropped and exponent >= 0 and sticky:
+    if sticky and exponent >= 0:  # digits are lost that the result would need
         return 0, TOO_LARGE, False, has_point
     exact = not sticky
     if exponent < 0 and mantissa > 0:
-        if exponent < -18:
-            return 0, OK, False, has_point
+        if exponent < -18:  # below one: a mantissa has 19 digits at most
+            up = exponent == -19 and (mantissa > _HALF or (mantissa == _HALF and sticky))
+            return int(-np.int64(up) if negative else np.int64(up)), OK, False, has_point
         divisor = np.int64(1)
         for _ in range(-exponent):
             divisor *= 10

@@ -83,7 +83,7 @@ def _open(path: Path) -> record_files.RecordFile:
         header.size + 2,
         np.dtype("<u4"),
         items=2,
-        unit="DAT event",
+        unit="DAT record",
         decode=decoding.decode_dat,
         own_state=decoding.DAT_STATE,
         sensor_size=prophesee.stated_sensor_size(header) or prophesee.guess_sensor_size(path),

@@ -1,0 +1,270 @@
+"""Reading and writing event files of any format: in pieces, in stretches, and one format for each file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctlev_core import event_files, event_pieces, plugins
+from data_contracts.errors import DataError
+from data_contracts.events import Events
+
+REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "events"
+SIZE = (640, 480)
+WRITABLE = {
+    "aedat2": (346, 260),
+    "atis": (240, 180),
+    "csv": SIZE,
+    "dat": SIZE,
+    "evt2": SIZE,
+    "evt3": SIZE,
+    "hdf5": SIZE,
+    "npy": SIZE,
+    "npz": SIZE,
+    "parquet": SIZE,
+}
+SUFFIXES = {"atis": ".bin"}
+
+
+def make_events(
+    num_events: int, sensor_size: tuple[int, int] = SIZE, duration_us: int = 10**6, seed: int = 0
+) -> Events:
+    random = np.random.default_rng(seed)
+    width, height = sensor_size
+    events = Events(
+        np.sort(random.integers(0, duration_us, num_events)),
+        random.integers(0, width, num_events).astype(np.uint16),
+        random.integers(0, height, num_events).astype(np.uint16),
+        random.integers(0, 2, num_events).astype(np.uint8),
+        sensor_size,
+    )
+    if num_events:  # the last column and row, so that files without a size tell it
+        events.x[0], events.y[0] = width - 1, height - 1
+    return events
+
+
+def assert_same(got: Events, expected: Events) -> None:
+    assert got.sensor_size == expected.sensor_size
+    for name in "txyp":
+        column = getattr(got, name)
+        assert column.dtype == getattr(expected, name).dtype
+        np.testing.assert_array_equal(column, getattr(expected, name))
+
+
+# Formats -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_format_that_writes_is_tested_here():
+    assert set(WRITABLE) == {
+        name for name in plugins.names("formats") if hasattr(plugins.load("formats", name), "write")
+    }
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+@settings(max_examples=15, deadline=None)
+@given(
+    num_events=st.integers(1, 300),
+    duration_us=st.sampled_from([1, 100, 10**6, 2**24 + 5, 2**33]),
+    piece=st.integers(1, 400),
+    seed=st.integers(0, 100),
+)
+def test_write_then_read_whole_or_in_pieces(name, num_events, duration_us, piece, seed):
+    if name == "atis":
+        duration_us = min(max(duration_us, 100), 10**6)  # times that stand still do not tell an ATIS file
+    if name == "dat":
+        duration_us = min(duration_us, 2**31)
+    events = make_events(num_events, WRITABLE[name], duration_us, seed)
+    module = plugins.load("formats", name)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"events{SUFFIXES.get(name, '')}"
+        module.write(path, events)
+        assert event_files.find_format(path) is module
+        assert_same(event_files.read_events_file(path), events)
+        pieces = list(event_files.read_event_chunks(path, piece))
+    assert [len(part) for part in pieces[:-1]] == [piece] * (len(pieces) - 1)
+    assert_same(event_pieces.concatenate(pieces), events)
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_equal_events_in_large_blocks(name, tmp_path):
+    # More events than the readers' blocks, several of the same time, row and polarity side by side.
+    events = make_events(150_000, WRITABLE[name], 20_000)
+    order = np.lexsort((events.x, events.p, events.y, events.t))
+    events = Events(*(getattr(events, column)[order] for column in "txyp"), events.sensor_size)
+    path = tmp_path / f"events{SUFFIXES.get(name, '')}"
+    plugins.load("formats", name).write(path, events)
+    assert_same(event_files.read_events_file(path), events)
+    assert_same(event_pieces.concatenate(event_files.read_event_chunks(path, 40_001)), events)
+
+
+@pytest.mark.parametrize("name", ["csv", "evt2", "evt3", "hdf5", "npz", "parquet"])
+def test_a_recording_without_events_is_one_empty_piece(name, tmp_path):
+    plugins.load("formats", name).write(tmp_path / "events", make_events(0))
+    pieces = list(event_files.read_event_chunks(tmp_path / "events"))
+    assert [(len(piece), piece.sensor_size) for piece in pieces] == [(0, SIZE)]
+    assert_same(event_files.read_events_file(tmp_path / "events"), make_events(0))
+
+
+def test_evt3_vectors_save_words_and_keep_the_order(tmp_path):
+    # 64 pixels of one row at once, then the same backwards, where no vector can keep the order.
+    x = np.concatenate([np.arange(64), np.arange(64)[::-1]]).astype(np.uint16)
+    zeros = np.zeros(128, np.int64)
+    events = Events(zeros, x, zeros.astype(np.uint16), zeros.astype(np.uint8), SIZE)
+    module = plugins.load("formats", "evt3")
+    module.write(tmp_path / "a.raw", events)
+    assert_same(module.read(tmp_path / "a.raw"), events)
+    words = np.fromfile(tmp_path / "a.raw", "<u2")[-73:] >> 12
+    assert np.count_nonzero(words == 4) == 6 and np.count_nonzero(words == 3) == 1
+    assert np.count_nonzero(words == 2) == 64
+
+
+def test_two_formats_that_claim_a_file_are_named(tmp_path, monkeypatch):
+    path = tmp_path / "events"
+    plugins.load("formats", "evt2").write(path, make_events(3))
+    monkeypatch.setattr(plugins.load("formats", "dat"), "sniff", lambda path: True)
+    with pytest.raises(DataError, match="could be any of the formats dat, evt2; expected exactly one"):
+        event_files.find_format(path)
+
+
+def test_formats_without_a_signature_are_asked_last(tmp_path, monkeypatch):
+    path = tmp_path / "events"
+    plugins.load("formats", "evt2").write(path, make_events(3))
+    monkeypatch.setattr(plugins.load("formats", "csv"), "sniff", lambda path: True)
+    assert event_files.find_format(path).__name__.endswith(".evt2")
+
+
+# Pieces ------------------------------------------------------------------------------------------------------------
+
+
+def test_pieces_that_do_not_join_are_an_error(tmp_path, monkeypatch):
+    module = plugins.load("formats", "evt2")
+    module.write(tmp_path / "a.raw", make_events(5))
+
+    def give(*pieces):
+        monkeypatch.setattr(module, "read_chunks", lambda path, num_events: iter(pieces))
+        return list(event_files.read_event_chunks(tmp_path / "a.raw"))
+
+    late, early = make_events(5), make_events(5)
+    late.t[:], early.t[:] = 7, 6
+    assert len(give(early, late, late)) == 3
+    with pytest.raises(DataError, match="t decreases at event 10: 7 us, then 6 us"):
+        give(early, late, early)
+    with pytest.raises(DataError, match=r"sensor_size must be \(640, 480\) throughout, got \(34, 34\) from event 5 on"):
+        give(early, make_events(5, (34, 34)))
+
+
+@pytest.mark.parametrize("name", ["evt2", "dat", "csv", "npy", "npz", "hdf5"])
+def test_time_that_jumps_back_at_a_joint_is_found(name, tmp_path):
+    good = make_events(8)
+    good.t[:] = [10, 20, 30, 40, 50, 60, 70, 80]
+    path = tmp_path / "events"
+    plugins.load("formats", name).write(path, good)
+    content = path.read_bytes()
+    module = plugins.load("formats", name)
+    if name == "evt2":
+        content = content[:-4] + bytes([content[-4], content[-3], 0, content[-1] & 0xF0])
+    elif name == "dat":
+        content = content[:-8] + (5).to_bytes(4, "little") + content[-4:]
+    elif name == "csv":
+        content = content.replace(b"\n80,", b"\n69,")
+    else:
+        bad = Events(np.array([10, 20, 30, 40, 50, 60, 70, 69]), good.x, good.y, good.p, good.sensor_size)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(module, "check_events", lambda events, where: events)
+            module.write(path, bad)
+        content = path.read_bytes()
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="t decreases at event 7: 70 us, then"):
+        list(event_files.read_event_chunks(path, 7))
+    with pytest.raises(DataError, match="t decreases at event 7: 70 us, then"):
+        event_files.read_events_file(path)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(0, 9), min_size=1, max_size=8), st.integers(1, 12))
+def test_regroup_keeps_events_and_order(lengths, size):
+    events = make_events(sum(lengths))
+    stops = np.cumsum(lengths).tolist()
+    pieces = [events.slice(stop - length, stop) for length, stop in zip(lengths, stops, strict=True)]
+    groups = list(event_pieces.regroup(pieces, size))
+    assert [len(group) for group in groups[:-1]] == [size] * (len(groups) - 1)
+    assert len(groups) == max(1, -(-sum(lengths) // size))
+    assert_same(event_pieces.concatenate(groups), events)
+
+
+# Our own files -----------------------------------------------------------------------------------------------------
+
+
+def test_parquet_written_in_pieces_is_the_file_written_whole(tmp_path):
+    events = make_events(600_000)
+    event_files.write_events_parquet(tmp_path / "whole.parquet", events)
+    pieces = event_pieces.regroup([events], 7_001)
+    summary = event_files.write_event_chunks_parquet(tmp_path / "pieces.parquet", pieces)
+    assert summary == event_files.summarise(events)
+    assert (tmp_path / "whole.parquet").read_bytes() == (tmp_path / "pieces.parquet").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pieces.parquet", "whole.parquet"]
+
+
+def test_a_stretch_of_a_parquet_file_is_the_slice(tmp_path):
+    events = make_events(600_000)
+    path = tmp_path / "a.parquet"
+    event_files.write_events_parquet(path, events)
+    group = pq.ParquetFile(path).metadata.row_group(0).num_rows
+    for start, stop in [(0, 0), (0, 1), (group - 1, group + 1), (group, 2 * group), (599_999, 600_000), (0, 600_000)]:
+        assert_same(event_files.read_events_range(path, start, stop), events.slice(start, stop))
+    for start, stop in [(-1, 5), (5, 4), (0, 600_001)]:
+        with pytest.raises(DataError, match="expected a range within 0 to 600000"):
+            event_files.read_events_range(path, start, stop)
+    plugins.load("formats", "evt2").write(tmp_path / "a.raw", make_events(3))
+    with pytest.raises(DataError, match="only parts of Parquet files can be read, got evt2"):
+        event_files.read_events_range(tmp_path / "a.raw", 0, 1)
+
+
+def test_wrong_pieces_leave_no_file(tmp_path):
+    good, bad = make_events(10), make_events(10)
+    bad.x[3] = 640
+    for pieces in ([good, bad], [good, good.slice(0, 1)], []):
+        with pytest.raises(DataError, match="events to be written"):
+            event_files.write_event_chunks_parquet(tmp_path / "a.parquet", pieces)
+        assert not list(tmp_path.iterdir())
+
+
+# Memory ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["evt3", "npy", "parquet"])
+def test_memory_of_a_chunked_read_does_not_grow_with_the_file(name, tmp_path):
+    # A process of its own, because the highest memory of this one is behind it. 8 million events are 104 MB as columns;
+    # what is allowed holds the pieces (14 MB) several times over but not the recording.
+    events = make_events(8_000_000, SIZE, 16_000_000)
+    plugins.load("formats", name).write(tmp_path / "events", events)
+    plugins.load("formats", name).write(tmp_path / "few", events.slice(0, 1000))
+    del events
+    code = f"""
+        import resource
+        from pathlib import Path
+        from ctlev_core import event_files
+        peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        folder = Path({str(tmp_path)!r})
+        try:
+            list(event_files.read_event_chunks(folder / "few"))  # compiles
+        except ValueError:
+            pass
+        before = peak()
+        total = sum(len(piece) for piece in event_files.read_event_chunks(folder / "events", 1 << 20))
+        print(total, peak() - before)
+    """
+    result = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
+    total, grown = result.stdout.split()
+    assert int(total) == 8_000_000
+    assert float(grown) < 80, f"{grown} MB"
