@@ -1,0 +1,204 @@
+"""Feed one reader broken files: whatever the bytes, it must return events that pass `check_events` or raise DataError.
+
+Read whole and in pieces, the file must give the same. With atheris (`pip install atheris`) the mutations follow the
+coverage of the readers' Python code, without it they are random; both start from valid files of the format.
+
+    python tests/fuzz/fuzz_reader.py evt3 --seconds 60
+    python tests/fuzz/fuzz_reader.py evt3 --file crash-0123abcd
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import random
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from ctlev_core import event_pieces, plugins
+from data_contracts.errors import DataError
+from data_contracts.events import Events, check_events
+
+REAL_AEDAT4 = Path(__file__).resolve().parents[2].parent / "shared/real/events/person/tonic_sample.aedat4"
+SENSORS = {"aedat2": (346, 260), "atis": (240, 180)}
+
+
+class Failure(Exception):
+    """A reader broke its promise."""
+
+
+def check_reader(module: ModuleType, path: Path) -> bool:
+    """Read the file in both ways; was it valid?
+
+    Raises:
+        Failure: another exception than DataError, wrong events, or pieces that differ from the whole.
+    """
+    whole = _attempt(module, lambda: [module.read(path)])
+    pieces = _attempt(module, lambda: list(module.read_chunks(path, 3)))
+    if (whole is None) != (pieces is None):
+        raise Failure(
+            f"whole {'refused' if whole is None else 'read'}, pieces {'refused' if pieces is None else 'read'}"
+        )
+    if whole is None or pieces is None:
+        return False
+    joined = event_pieces.concatenate(pieces)
+    for name in "txyp":
+        if not np.array_equal(getattr(whole[0], name), getattr(joined, name)):
+            raise Failure(f"column {name} differs between whole and pieces")
+    if any(piece.sensor_size != whole[0].sensor_size for piece in pieces):
+        raise Failure("sensor size differs between whole and pieces")
+    return True
+
+
+def _attempt(module: ModuleType, run) -> list[Events] | None:
+    try:
+        parts = run()
+    except DataError:
+        return None
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise Failure(f"{module.__name__}: {type(error).__name__}: {error}") from error
+    try:
+        return [check_events(part, "a reader's events") for part in parts]
+    except DataError as error:
+        raise Failure(f"{module.__name__} returned events that break their promises: {error}") from error
+
+
+def valid_files(name: str, folder: Path) -> Iterator[bytes]:
+    """Small files of the format."""
+    module = plugins.load("formats", name)
+    if name == "aedat4":
+        yield REAL_AEDAT4.read_bytes()[:200_000]
+        return
+    generator = np.random.default_rng(0)
+    width, height = SENSORS.get(name, (640, 480))
+    for count, duration in ((1, 1), (5, 10**5), (40, 10**6)):
+        t = np.sort(generator.integers(0, duration, count))
+        x, y = generator.integers(0, width, count), generator.integers(0, height, count) // 100 * 100
+        x[-1], y[-1] = width - 1, height - 1
+        p = generator.integers(0, 2, count)
+        events = Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8), (width, height))
+        module.write(folder / "seed", events)
+        yield (folder / "seed").read_bytes()
+    if name == "csv":
+        yield b"0.000012 3 4 1\n0.1e1 639 479 0\n"
+    if name == "npy":
+        np.save(folder / "matrix.npy", np.stack([x, y, t / 1e6, p], 1))
+        yield (folder / "matrix.npy").read_bytes()
+    if name == "npz":
+        module.write(folder / "seed", events, compressed=False)
+        yield (folder / "seed").read_bytes()
+    if name == "hdf5":
+        import h5py
+
+        with h5py.File(folder / "mvsec", "w") as file:
+            file["davis/left/events"] = np.stack([x, y, t / 1e6, p * 2 - 1], 1)
+        yield (folder / "mvsec").read_bytes()
+
+
+def mutate(content: bytes, chance: random.Random) -> bytes:
+    """A few random changes: bytes, runs, cuts, copies."""
+    data = bytearray(content)
+    for _ in range(chance.choice([1, 1, 2, 4, 16])):
+        at = chance.randrange(len(data) + 1)
+        length = chance.choice([1, 1, 2, 4, 8, 64])
+        match chance.randrange(6):
+            case 0 | 1:
+                data[at : at + length] = chance.randbytes(len(data[at : at + length]))
+            case 2:
+                data[at : at + length] = chance.choice([b"\x00", b"\xff", b"\x7f", b"9"]) * length
+            case 3:
+                del data[at : at + length]
+            case 4:
+                data[at:at] = data[at : at + length]
+            case 5:
+                del data[at:]
+    return bytes(data)
+
+
+def fuzz_with_atheris(name: str, path: Path, corpus: Path, seconds: int) -> None:
+    """Coverage-guided; does not return."""
+    import atheris
+
+    shared = ("event_tables", "array_files", "aedat2", "prophesee", "record_files")
+    packages = [f"ctlev_core.formats.{name}", *(f"ctlev_core.{module}" for module in shared)]
+    for package in packages:  # loaded before: once more, instrumented
+        sys.modules.pop(package, None)
+    with atheris.instrument_imports(include=packages):
+        import importlib
+
+        module = importlib.import_module(f"ctlev_core.formats.{name}")
+
+    def run(content: bytes) -> None:
+        path.write_bytes(content)
+        check_reader(module, path)
+
+    flags = [f"-max_total_time={seconds}", "-max_len=65536", "-rss_limit_mb=4096", "-timeout=30", "-verbosity=0",
+             f"-artifact_prefix={tempfile.gettempdir()}/{name}-"]  # fmt: skip
+    atheris.Setup([sys.argv[0], *flags, str(corpus)], run)
+    atheris.Fuzz()
+
+
+def fuzz_at_random(name: str, path: Path, seeds: Iterable[bytes], seconds: float, seed: int = 0) -> tuple[int, int]:
+    """How many files were tried, and how many of them were valid."""
+    module = plugins.load("formats", name)
+    chance = random.Random(seed)
+    pool = list(seeds)
+    tried = valid = 0
+    stop = time.monotonic() + seconds
+    while time.monotonic() < stop:
+        content = mutate(chance.choice(pool), chance)
+        path.write_bytes(content)
+        try:
+            valid += check_reader(module, path)
+        except Failure:
+            kept = Path(tempfile.gettempdir()) / f"{name}-crash-{tried}"
+            kept.write_bytes(content)
+            print(f"kept as {kept}", file=sys.stderr)
+            raise
+        tried += 1
+    return tried, valid
+
+
+def main() -> None:
+    """Fuzz one reader, or show what one file does to it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("format", choices=plugins.names("formats"))
+    parser.add_argument("--seconds", type=int, default=60)
+    parser.add_argument("--file", type=Path, help="read this file only")
+    parser.add_argument("--random", action="store_true", help="random mutations even where atheris is installed")
+    arguments = parser.parse_args()
+    if arguments.file:
+        print("valid" if check_reader(plugins.load("formats", arguments.format), arguments.file) else "refused")
+        return
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        corpus = folder / "corpus"
+        corpus.mkdir()
+        seeds = list(valid_files(arguments.format, folder))
+        for number, content in enumerate(seeds):
+            (corpus / str(number)).write_bytes(content)
+            if not check_reader(plugins.load("formats", arguments.format), corpus / str(number)) and number < 3:
+                print(f"seed {number} is not valid", file=sys.stderr)
+        path = folder / "input.bin"
+        has_atheris = False
+        with contextlib.suppress(ImportError):
+            import atheris  # noqa: F401
+
+            has_atheris = True
+        if has_atheris and not arguments.random:
+            fuzz_with_atheris(arguments.format, path, corpus, arguments.seconds)
+        else:
+            tried, valid = fuzz_at_random(arguments.format, path, seeds, arguments.seconds)
+            print(f"{tried} files, {valid} of them valid")
+
+
+if __name__ == "__main__":
+    main()
