@@ -21,15 +21,15 @@ def resample_images(images: np.ndarray, point_map: PointMap, image_size: tuple[i
         point_map: from picture to new pixels, the axes apart.
         image_size: (width, height) px of the result.
     Returns:
-        [N, height, width] uint8, rounded.
+        [N, height, width] float32, 0 .. 255.
     """
     _, height, width = images.shape
     (x0, y0), (x1, y1) = np.asarray(point_map(np.array([[0.0, 0.0], [width, height]])), np.float64)
     rows = overlap_weights(height, image_size[1], (y1 - y0) / height, y0).astype(np.float32)
     columns = overlap_weights(width, image_size[0], (x1 - x0) / width, x0).astype(np.float32)
-    out = np.empty((len(images), image_size[1], image_size[0]), np.uint8)
+    out = np.empty((len(images), image_size[1], image_size[0]), np.float32)
     for number, image in enumerate(images):
-        out[number] = np.clip(np.rint(rows @ image.astype(np.float32) @ columns.T), 0, 255)
+        out[number] = np.clip(rows @ image.astype(np.float32) @ columns.T, 0, 255)
     return out
 
 

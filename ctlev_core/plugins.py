@@ -64,6 +64,14 @@ class DatasetWithWindows(Dataset, Protocol):
         ...
 
 
+class DatasetWithWindowLabels(DatasetWithWindows, Protocol):
+    """A dataset whose authors also have a rule of their own for the label of a window."""
+
+    def read_window_labels(self, recording: Recording, options: Any) -> Labels:
+        """One row for each range of `read_windows`."""
+        ...
+
+
 class DatasetWithSynonyms(Dataset, Protocol):
     """A dataset whose classes have several names, such as the WordNet lemmas of N-ImageNet."""
 

@@ -88,6 +88,9 @@ RECORDINGS = TableSchema(
         Column("t_first_us", pa.int64(), "time stamp of the first event", minimum=0),
         Column("t_last_us", pa.int64(), "time stamp of the last event", minimum=0),
         Column("duration_us", pa.int64(), "t_last_us - t_first_us", minimum=0),
+        Column(
+            "num_windows", pa.int64(), "windows its authors cut; missing where that is left to the user", nullable=True
+        ),
         Column("events_file", pa.string(), "Parquet file of the events; empty without events"),
         Column("event_images_file", pa.string(), "array of released event images; empty without"),
         Column("intensity_file", pa.string(), "array of grey pictures; empty without. Times lie beside: NAME.t_us.npy"),
@@ -114,7 +117,7 @@ WINDOWS = TableSchema(
         Column("event_stop", pa.int64(), "one past its last event", minimum=0),
     ),
 )
-"""Windows as the dataset's authors cut them; no rows where the dataset leaves that to the user."""
+"""Windows as the dataset's authors cut them; `num_windows` of `recordings` tells which recordings have such."""
 SYNONYMS = TableSchema(
     "synonyms",
     1,
@@ -133,6 +136,8 @@ LABELS = TableSchema(
         *_LABELS,
     ),
 )
+WINDOW_LABELS = TableSchema("window_labels", 1, None, LABELS.columns)
+"""One row for each row of `windows`, where the authors also say how a window is labelled; else no rows."""
 FRAMES = TableSchema(
     "frames",
     2,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,17 +15,34 @@ from ctlev_core import event_files, plugins
 from ctlev_core.camera import is_inside
 from ctlev_core.image_resampling import resample_images
 from ctlev_core.labelling import labels_at_windows
-from ctlev_core.windows import cut
+from ctlev_core.windows import cut_chunks, spread
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
+from data_contracts.events import Events
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, concat_labels, label_columns, labels_of
 from tasks.stage import Output, stage
 
+MAX_EVENTS = 1 << 24
+"""Events held at a time: 0.2 GiB."""
+MAX_WINDOWS = 128
+GREY_SCALE = 256
+"""Counts that a grey value of 1 becomes, so that averages keep their fractions."""
+
+
+class _Source(NamedTuple):
+    """One recording and what was ingested with it; `windows` [W, 2] and their labels where the dataset's are wanted."""
+
+    recording: dict[str, Any]
+    parts: list[dict[str, Any]]
+    track: Labels
+    windows: np.ndarray | None
+    window_labels: Labels | None
+
 
 class _Samples(NamedTuple):
-    """The windows of one part of a recording, encoded."""
+    """Some windows of a recording, encoded."""
 
     rows: list[dict[str, Any]]
     histograms: np.ndarray
@@ -39,32 +57,24 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
     Event images that come finished take the place of both: every image is a window, its grey values stand for counts.
     """
     plugin = plugins.load_options(encoding)
-    parts = recordings.attached(tables.PARTS).to_pylist()
-    tracks = _label_tracks(recordings)
-    dataset_windows = _dataset_windows(recordings, windows)
+    sources = _sources(recordings, windows)
     rows: list[dict[str, Any]] = []
     labels: list[Labels] = []
     with out.open_array("histograms") as histograms, out.open_array("frames") as frames:
-        for recording in tqdm(recordings.table.to_pylist(), "encode", unit="recording", leave=False, disable=None):
-            name = recording["recording_id"]
-            own_parts = [part for part in parts if part["recording_id"] == name]
-            if recording["events_file"]:
-                ranges = dataset_windows.get(name)
-                samples = _encode_events(recordings, recording, own_parts, tracks[name], plugin, windows, ranges)
-            elif recording["event_images_file"]:
-                samples = _encode_images(recordings, recording, own_parts, tracks[name], plugin, windows)
-            else:
-                continue
-            for sample in samples:
+        for source in tqdm(sources, "encode", unit="recording", leave=False, disable=None):
+            of_events = bool(source.recording["events_file"])
+            made = _encode_events if of_events else _encode_images
+            for samples in made(recordings, source, plugin, windows):
                 try:
-                    histograms.append(sample.histograms)
+                    histograms.append(samples.histograms)
                 except DataError as error:
+                    name = source.recording["recording_id"]
                     raise DataError(
                         f"encode: sensors differ in size, {name} does; set encoding.options.image_size ({error})"
                     ) from error
-                frames.append(sample.frames)
-                rows += sample.rows
-                labels.append(sample.labels)
+                frames.append(samples.frames)
+                rows += samples.rows
+                labels.append(samples.labels)
     for split in ("train", "test"):
         if not any(row["split"] == split for row in rows):
             raise DataError(f"encode: no window in split {split!r}; the recordings are too short for {windows!r}")
@@ -75,90 +85,128 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
     return table
 
 
-def _dataset_windows(recordings: Manifest, windows: Windows) -> dict[str, np.ndarray]:
-    """Ranges [W, 2] of each recording that the dataset's authors cut, for the method `dataset`."""
-    if windows.method != "dataset":
-        return {}
-    table = recordings.attached(tables.WINDOWS)
-    ranges = np.stack([table["event_start"].to_numpy(), table["event_stop"].to_numpy()], axis=1)
-    names = np.array(table["recording_id"].to_pylist())
-    found = {name: ranges[names == name] for name in dict.fromkeys(names.tolist())}
-    for name, events_file in zip(recordings.column("recording_id"), recordings.column("events_file"), strict=True):
-        if events_file and name not in found:
-            raise DataError(
-                f"windows.method 'dataset': {name} comes without windows of its own; choose count, duration or whole"
-            )
+def _sources(recordings: Manifest, windows: Windows) -> list[_Source]:
+    """Every recording that something can be seen of, with its rows of the attached tables."""
+    parts = _by_recording(recordings.attached(tables.PARTS))
+    tracks = _by_recording(recordings.attached(tables.LABELS))
+    own = windows.method == "dataset"
+    ranges = _by_recording(recordings.attached(tables.WINDOWS)) if own else {}
+    window_labels = _by_recording(recordings.attached(tables.WINDOW_LABELS)) if own else {}
+    found = []
+    for row in recordings.table.to_pylist():
+        name = row["recording_id"]
+        if not row["events_file"] and not row["event_images_file"]:
+            continue
+        dataset_windows = None
+        if own and row["events_file"]:
+            if row["num_windows"] is None:
+                raise DataError(
+                    f"windows.method 'dataset': {name} comes without windows of its own; "
+                    "choose count, duration or whole"
+                )
+            table = ranges.get(name, tables.WINDOWS.arrow().empty_table())
+            dataset_windows = np.stack([table["event_start"].to_numpy(), table["event_stop"].to_numpy()], axis=1)
+        labels = labels_of(window_labels[name]) if name in window_labels else None
+        found.append(_Source(row, parts[name].to_pylist(), labels_of(tracks[name]), dataset_windows, labels))
     return found
 
 
+def _by_recording(table: pa.Table) -> dict[str, pa.Table]:
+    """The rows of each recording, which lie together."""
+    names = np.array(table["recording_id"].to_pylist())
+    starts = np.flatnonzero(np.concatenate([[True], names[1:] != names[:-1]])) if len(names) else np.zeros(0, int)
+    stops = [*starts[1:].tolist(), len(names)]
+    return {names[a]: table.slice(a, b - a) for a, b in zip(starts.tolist(), stops, strict=False)}
+
+
 def _encode_events(
-    recordings: Manifest,
-    recording: dict[str, Any],
-    parts: list[dict[str, Any]],
-    track: Labels,
-    plugin: plugins.Plugin,
-    windows: Windows,
-    dataset_ranges: np.ndarray | None,
+    recordings: Manifest, source: _Source, plugin: plugins.Plugin, windows: Windows
 ) -> Iterator[_Samples]:
-    events = event_files.read_events_file(recordings.path(recording["events_file"]))
-    for part in parts:
+    """The windows of each part, some at a time: neither events nor histograms of a recording need fit into memory."""
+    path = recordings.path(source.recording["events_file"])
+    for part in source.parts:
         start, stop = part["event_start"], part["event_stop"]
-        if dataset_ranges is None:
-            ranges = cut(events.slice(start, stop), windows) + start
+        held = event_files.read_events_range(path, start, stop) if stop - start <= MAX_EVENTS else None
+        if source.windows is None:
+            ranges, labels = start + cut_chunks(_time_stamps(path, start, stop, held), windows), None
         else:
-            inside = (dataset_ranges[:, 0] >= start) & (dataset_ranges[:, 1] <= stop)
-            full = dataset_ranges[:, 1] - dataset_ranges[:, 0] >= windows.min_events
-            ranges = dataset_ranges[inside & full]
-            ranges = ranges[_spread(len(ranges), windows.max_windows)]
-        if len(ranges) == 0:
-            continue
-        counts = plugin.module.encode(events, ranges, plugin.options)
-        t_start, t_end = events.t[ranges[:, 0]], events.t[ranges[:, 1] - 1]
-        labels = _to_image(labels_at_windows(track, t_start, t_end), events.sensor_size, plugin, counts.shape[:1:-1])
-        rows = _rows(recording, part["split"], t_start, t_end, ranges[:, 1] - ranges[:, 0])
-        yield _Samples(rows, counts, plugin.module.render_image(counts, plugin.options), labels)
+            inside = (source.windows[:, 0] >= start) & (source.windows[:, 1] <= stop)
+            chosen = np.flatnonzero(inside & (np.diff(source.windows)[:, 0] >= windows.min_events))
+            chosen = chosen[spread(len(chosen), windows.max_windows)]
+            ranges = source.windows[chosen]
+            labels = None if source.window_labels is None else source.window_labels.take(chosen)
+        for rows in _groups(ranges):
+            first, last = int(ranges[rows[0], 0]), int(ranges[rows[-1], 1])
+            if held is None:
+                events = event_files.read_events_range(path, first, last)
+            else:
+                events = held.slice(first - start, last - start)
+            local = ranges[rows] - first
+            counts = plugin.module.encode(events, local, plugin.options)
+            t_start, t_end = events.t[local[:, 0]], events.t[local[:, 1] - 1]
+            own = labels_at_windows(source.track, t_start, t_end) if labels is None else labels.take(rows)
+            own = _to_image(own, events.sensor_size, plugin, counts.shape[:1:-1])
+            described = _rows(source.recording, part["split"], rows, t_start, t_end, local[:, 1] - local[:, 0])
+            yield _Samples(described, counts, plugin.module.render_image(counts, plugin.options), own)
+
+
+def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iterator[np.ndarray]:
+    if held is not None:
+        yield held.t
+        return
+    for first in range(start, stop, MAX_EVENTS):
+        yield event_files.read_events_range(path, first, min(first + MAX_EVENTS, stop)).t
+
+
+def _groups(ranges: np.ndarray) -> Iterator[np.ndarray]:
+    """Consecutive windows that are encoded together: few, and spanning few events unless a window alone has more."""
+    first = 0
+    while first < len(ranges):
+        fitting = int(np.searchsorted(ranges[:, 1], ranges[first, 0] + MAX_EVENTS, side="right"))
+        last = min(max(fitting, first + 1), first + MAX_WINDOWS)
+        yield np.arange(first, last)
+        first = last
 
 
 def _encode_images(
-    recordings: Manifest,
-    recording: dict[str, Any],
-    parts: list[dict[str, Any]],
-    track: Labels,
-    plugin: plugins.Plugin,
-    windows: Windows,
+    recordings: Manifest, source: _Source, plugin: plugins.Plugin, windows: Windows
 ) -> Iterator[_Samples]:
+    """Finished event images: every one is a window; the grey values, in fixed point, stand for counts."""
+    recording, name = source.recording, source.recording["recording_id"]
     if getattr(plugin.options, "polarity", False):
         raise DataError(
-            f"{recording['recording_id']} comes as grey event images, which have no polarity; "
-            "set encoding.options.polarity=false"
+            f"{name} comes as grey event images, which have no polarity; set encoding.options.polarity=false"
         )
+    if len(source.parts) != 1:
+        raise DataError(f"{name}: finished event images cannot be split in time")
     images = recordings.array(recording["event_images_file"].removesuffix(".npy"))
     t_us = recordings.array(recording["event_images_file"].removesuffix(".npy") + ".t_us")
     sensor_size = (recording["sensor_width_px"], recording["sensor_height_px"])
     image_size = getattr(plugin.options, "image_size", None) or sensor_size
-    if len(parts) != 1:
-        raise DataError(f"{recording['recording_id']}: finished event images cannot be split in time")
-    for part in parts:
-        chosen = _spread(len(images), windows.max_windows)
+    chosen = spread(len(images), windows.max_windows)
+    for first in range(0, len(chosen), MAX_WINDOWS):
+        rows = chosen[first : first + MAX_WINDOWS]
         grey = resample_images(
-            images[chosen], lambda p: plugin.module.map_points(p, sensor_size, plugin.options), image_size
+            images[rows], lambda points: plugin.module.map_points(points, sensor_size, plugin.options), image_size
         )
-        times = np.asarray(t_us[chosen])
-        labels = _to_image(labels_at_windows(track, times, times), sensor_size, plugin, image_size)
-        rows = _rows(recording, part["split"], times, times, np.zeros(len(times), np.int64))
-        yield _Samples(rows, grey[:, None].astype(np.uint16), np.repeat(grey[..., None], 3, axis=3), labels)
-
-
-def _spread(count: int, wanted: int | None) -> np.ndarray:
-    """Indices of at most `wanted` of `count`, the middle of each of as many equal stretches."""
-    if wanted is None or count <= wanted:
-        return np.arange(count)
-    return (2 * np.arange(wanted, dtype=np.int64) + 1) * count // (2 * wanted)
+        # Averaging over pixels dims sparse images; the encoding's own normalisation brings them back to full scale.
+        values = np.rint(GREY_SCALE * grey[:, None]).astype(np.uint16)
+        times = np.asarray(t_us[rows])
+        labels = _to_image(labels_at_windows(source.track, times, times), sensor_size, plugin, image_size)
+        numbers = np.arange(first, first + len(rows))
+        described = _rows(recording, source.parts[0]["split"], numbers, times, times, np.zeros(len(times), np.int64))
+        yield _Samples(described, values, plugin.module.render_image(values, plugin.options), labels)
 
 
 def _rows(
-    recording: dict[str, Any], split: str, t_start: np.ndarray, t_end: np.ndarray, num_events: np.ndarray
+    recording: dict[str, Any],
+    split: str,
+    numbers: np.ndarray,
+    t_start: np.ndarray,
+    t_end: np.ndarray,
+    num_events: np.ndarray,
 ) -> list[dict[str, Any]]:
+    columns = zip(numbers.tolist(), t_start.tolist(), t_end.tolist(), num_events.tolist(), strict=True)
     return [
         {
             "sample_id": f"{recording['recording_id']}:{split}:{number:05d}",
@@ -169,16 +217,8 @@ def _rows(
             "t_end_us": end,
             "num_events": count,
         }
-        for number, (start, end, count) in enumerate(
-            zip(t_start.tolist(), t_end.tolist(), num_events.tolist(), strict=True)
-        )
+        for number, start, end, count in columns
     ]
-
-
-def _label_tracks(recordings: Manifest) -> dict[str, Labels]:
-    table = recordings.attached(tables.LABELS)
-    names = np.array(table["recording_id"].to_pylist())
-    return {name: labels_of(table.filter(pa.array(names == name))) for name in dict.fromkeys(names.tolist())}
 
 
 def _to_image(

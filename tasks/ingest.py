@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,19 +17,20 @@ from ctlev_core.plugins import Plugin
 from data_contracts import tables
 from data_contracts.config import DatasetChoice
 from data_contracts.errors import DataError
-from data_contracts.events import check_events
+from data_contracts.events import Events, check_events
 from data_contracts.labels import Labels, Recording, check_image_track, check_labels
 from data_contracts.manifest import concat_labels, label_columns
 from tasks.stage import Output, stage
 
 
 class _Ingested(NamedTuple):
-    """What is known of one recording after reading it."""
+    """What is known of one recording after reading it; `windows` and their labels where the dataset cuts its own."""
 
     row: dict[str, Any]
     parts: list[dict[str, Any]]
-    windows: list[dict[str, Any]]
     labels: Labels
+    windows: np.ndarray | None
+    window_labels: Labels | None
 
 
 def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
@@ -63,13 +65,15 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
         progress = tqdm(results, "ingest", len(recordings), unit="recording", leave=False, disable=None)
         ingested = list(progress)
     out.write_table(pa.Table.from_pylist([p for i in ingested for p in i.parts], tables.PARTS.arrow()), tables.PARTS)
-    out.write_table(
-        pa.Table.from_pylist([w for i in ingested for w in i.windows], tables.WINDOWS.arrow()), tables.WINDOWS
-    )
+    out.write_table(_window_table(recordings, ingested), tables.WINDOWS)
     synonyms = plugin.module.read_synonyms(plugin.options) if hasattr(plugin.module, "read_synonyms") else {}
     named = [{"class_name": name, "names": list(names)} for name, names in sorted(synonyms.items())]
     out.write_table(pa.Table.from_pylist(named, tables.SYNONYMS.arrow()), tables.SYNONYMS)
     out.write_table(_label_table(recordings, [i.labels for i in ingested]), tables.LABELS)
+    of_windows = [(r, i.window_labels) for r, i in zip(recordings, ingested, strict=True) if i.window_labels]
+    out.write_table(
+        _label_table([r for r, _ in of_windows], [labels for _, labels in of_windows]), tables.WINDOW_LABELS
+    )
     return pa.Table.from_pylist([i.row for i in ingested], schema=tables.RECORDINGS.arrow())
 
 
@@ -84,6 +88,7 @@ def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ing
         **dict.fromkeys(("events_file", "event_images_file", "intensity_file"), ""),
         **dict.fromkeys(("sensor_width_px", "sensor_height_px", "num_events", "num_positive", "num_negative"), 0),
         **dict.fromkeys(("t_first_us", "t_last_us", "duration_us"), 0),
+        "num_windows": None,
     }
     if recording.has_events:
         row |= _ingest_events(plugin, recording, out, where)
@@ -92,12 +97,11 @@ def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ing
             row |= _ingest_images(plugin, recording, out, kind, where)
     count, name = row["num_events"], recording.recording_id
     parts = [(part.split, round(part.start * count), round(part.stop * count)) for part in recording.parts]
-    return _Ingested(
-        row,
-        [{"recording_id": name, "split": split, "event_start": a, "event_stop": b} for split, a, b in parts],
-        _dataset_windows(plugin, recording, count, where),
-        labels,
-    )
+    windows, window_labels = _dataset_windows(plugin, recording, count, where)
+    if windows is not None:
+        row["num_windows"] = len(windows)
+    rows = [{"recording_id": name, "split": split, "event_start": a, "event_stop": b} for split, a, b in parts]
+    return _Ingested(row, rows, labels, windows, window_labels)
 
 
 def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str) -> dict[str, Any]:
@@ -106,17 +110,28 @@ def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str
     finished, attached = out.work / name, out.folder / name
     for path in (finished, attached):
         path.parent.mkdir(parents=True, exist_ok=True)
+    summary, sizes = event_files.Summary(), set()
+
+    def watched(pieces: Iterable[Events]) -> Iterator[Events]:
+        for piece in pieces:
+            sizes.add(piece.sensor_size)
+            yield piece
+
     if finished.exists():  # by an earlier run that was interrupted
-        events = event_files.read_events_file(finished)
+        for piece in watched(event_files.read_event_chunks(finished)):
+            summary.add(piece)
+        known = summary.result()
     else:
-        events = check_events(plugin.module.read_events(recording, plugin.options), where)
-        if len(events) == 0:
-            raise DataError(f"{where}: the recording holds no events")
-        event_files.write_events_parquet(finished, events)
+        if hasattr(plugin.module, "read_event_chunks"):
+            pieces = plugin.module.read_event_chunks(recording, plugin.options)
+        else:
+            pieces = [check_events(plugin.module.read_events(recording, plugin.options), where)]
+        known = event_files.write_event_chunks_parquet(finished, watched(pieces))
+    if known["num_events"] == 0:
+        raise DataError(f"{where}: the recording holds no events")
     os.link(finished, attached)
-    width, height = events.sensor_size
-    summary = event_files.summarise(events)
-    return {"events_file": name, "sensor_width_px": width, "sensor_height_px": height, **summary}
+    width, height = sizes.pop()
+    return {"events_file": name, "sensor_width_px": width, "sensor_height_px": height, **known}
 
 
 def _ingest_images(plugin: Plugin, recording: Recording, out: Output, kind: str, where: str) -> dict[str, Any]:
@@ -141,9 +156,12 @@ def _ingest_images(plugin: Plugin, recording: Recording, out: Output, kind: str,
     }
 
 
-def _dataset_windows(plugin: Plugin, recording: Recording, count: int, where: str) -> list[dict[str, Any]]:
+def _dataset_windows(
+    plugin: Plugin, recording: Recording, count: int, where: str
+) -> tuple[np.ndarray | None, Labels | None]:
+    """Ranges [W, 2] and, where the authors have a rule for them too, their W labels."""
     if not recording.has_events or not hasattr(plugin.module, "read_windows"):
-        return []
+        return None, None
     ranges = np.asarray(plugin.module.read_windows(recording, plugin.options))
     if ranges.ndim != 2 or ranges.shape[1] != 2 or ranges.dtype != np.int64:
         raise DataError(f"{where}: windows must be [W, 2] int64, got {ranges.shape} {ranges.dtype}")
@@ -152,8 +170,20 @@ def _dataset_windows(plugin: Plugin, recording: Recording, count: int, where: st
         raise DataError(
             f"{where}: windows must be ascending ranges within {count} events, got {ranges.tolist()[:4]} ..."
         )
-    name = recording.recording_id
-    return [{"recording_id": name, "event_start": a, "event_stop": b} for a, b in ranges.tolist()]
+    if not hasattr(plugin.module, "read_window_labels"):
+        return ranges, None
+    labels = check_labels(plugin.module.read_window_labels(recording, plugin.options), f"{where}, windows")
+    if len(labels) != len(ranges):
+        raise DataError(f"{where}: {len(ranges)} windows but {len(labels)} window labels")
+    return ranges, labels
+
+
+def _window_table(recordings: list[Recording], ingested: list[_Ingested]) -> pa.Table:
+    named = [(r.recording_id, i.windows) for r, i in zip(recordings, ingested, strict=True) if i.windows is not None]
+    ranges = np.concatenate([np.zeros((0, 2), np.int64), *(windows for _, windows in named)])
+    names = [name for name, windows in named for _ in range(len(windows))]
+    columns = [pa.array(names, pa.string()), ranges[:, 0], ranges[:, 1]]
+    return pa.table(columns, names=[column.name for column in tables.WINDOWS.columns])
 
 
 def _label_table(recordings: list[Recording], tracks: list[Labels]) -> pa.Table:

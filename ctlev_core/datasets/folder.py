@@ -88,6 +88,15 @@ def read_events(recording: Recording, options: Options) -> Events:
     return events
 
 
+def read_event_chunks(recording: Recording, options: Options) -> Iterator[Events]:
+    """The events of `read_events` piece by piece, so that a recording may be larger than memory.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    return event_files.read_event_chunks(recording.files[0])
+
+
 def read_labels(recording: Recording, options: Options) -> Labels:
     """One row: the class, which holds for the whole recording, at time 0."""
     return Labels(class_names=(recording.class_name,), t_us=np.zeros(1, np.int64))

@@ -66,7 +66,7 @@ def test_key_must_be_unique_and_split_known():
                 name: pa.array([1, 1, 1], pa.int32() if name.startswith("sensor") else pa.int64())
                 for name in (
                     "sensor_width_px", "sensor_height_px", "num_events", "num_positive", "num_negative",
-                    "t_first_us", "t_last_us", "duration_us",
+                    "t_first_us", "t_last_us", "duration_us", "num_windows",
                 )
             },
             **dict.fromkeys(("events_file", "event_images_file", "intensity_file"), ["x"] * 3),

@@ -117,9 +117,10 @@ def test_finished_event_images_become_frames_with_the_labels_of_their_moment(fra
     assert recordings.column("num_events") == [0, 0] and recordings.column("t_last_us") == [1000, 1000]
     assert len(frames) == 6 and frames.array("frames").shape == (6, 16, 16, 3)
     # 32 x 24 onto 16 x 16: half the size, 2 px of bar above and below.
-    square = frames.array("frames")[:3, 6:8, 4:6]
-    assert [int(image.min()) for image in square] == [50, 100, 200]
-    assert [int(image.max()) for image in square] == [50, 100, 200]
+    square = frames.array("histograms")[:3, 0, 6:8, 4:6]
+    assert [int(image.min()) for image in square] == [256 * 50, 256 * 100, 256 * 200]
+    assert [int(image.max()) for image in square] == [256 * 50, 256 * 100, 256 * 200]
+    assert (frames.array("frames")[:3, 6:8, 4:6] == 255).all(), "averaging must not leave sparse images dim"
     assert frames.labels.joints2d is not None
     np.testing.assert_allclose(frames.labels.joints2d[:3, 0], [[4.0, 6.0], [4.5, 6.5], [5.0, 7.0]])
 
@@ -159,3 +160,29 @@ def test_prompts_draw_from_the_names_the_dataset_knows(frames_of):
 
     assert prompts() == {"stroll", "amble"}
     assert prompts(synonyms={"walk": ["march"]}) == {"march"}, "the user's names come first"
+
+
+def test_labels_of_the_datasets_windows_are_taken_as_they_are(frames_of):
+    module = make_dataset(windows=[[0, 10], [10, 10], [10, 35]])
+
+    def read_window_labels(recording, options):
+        return module.read_labels(recording, options).take([2, 1, 0])
+
+    module.read_window_labels = read_window_labels
+    _, frames = frames_of(module, windows=Windows(method="dataset"))
+    assert frames.labels.joints2d is not None
+    assert frames.labels.joints2d[:2, 0, 0].tolist() == [10.0, 8.0], "the middle one belongs to the empty window"
+
+
+@pytest.mark.parametrize("method", ["count", "duration", "whole"])
+def test_recordings_larger_than_what_is_held_give_the_same_frames(frames_of, monkeypatch, method):
+    windows = Windows(method=method, num_events=7, duration_us=90, min_events=3, max_windows=9)
+    _, whole = frames_of(make_dataset(), windows=windows)
+    expected = [whole.array(name).copy() for name in ("histograms", "frames")], whole.table.drop_columns("joints3d_mm")
+    monkeypatch.setattr("tasks.encode.MAX_EVENTS", 10)
+    monkeypatch.setattr("tasks.encode.MAX_WINDOWS", 2)
+    monkeypatch.setattr(encode, "version", 10**6)  # not the cached artefact
+    _, pieces = frames_of(make_dataset(), windows=windows)
+    for name, array in zip(("histograms", "frames"), expected[0], strict=True):
+        np.testing.assert_array_equal(pieces.array(name), array)
+    assert pieces.table.drop_columns("joints3d_mm").equals(expected[1]), "without a column of NaN, which equals nothing"
