@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -124,7 +126,7 @@ def test_pieces_give_the_same_windows_however_they_are_cut(times, bounds, method
         "method": method, "num_events": size, "duration_us": size, "min_events": min_events, "max_windows": limit
     }  # fmt: skip
     edges = [0, *sorted(min(bound, len(times)) for bound in bounds), len(times)]
-    pieces = [np.array(times[a:b], np.int64) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    pieces = [np.array(times[a:b], np.int64) for a, b in itertools.pairwise(edges)]
     result = cut_chunks(iter(pieces), Windows(**options))
     assert result.tolist() == ranges(times, **options)
     assert result.dtype == np.int64 and result.shape[1:] == (2,)

@@ -1,0 +1,138 @@
+"""How far two sets of recordings are from one another in the numbers of `realism`, and how far a set is from itself.
+
+A number of a set is the mean over those of its recordings that have it, a distribution the mean of the recordings' own:
+each recording counts once, however many events it has. Distances:
+
+    NAME                        magnitude of the difference of a number
+    NAME_wasserstein_UNIT       Wasserstein-1 distance of a distribution: the area between the cumulative sums
+    NAME_js_bits                Jensen-Shannon divergence of a distribution: 0 = equal, 1 = nothing in common
+
+Intervals are percentiles (95 %) under resampling of whole recordings; with fewer than `MIN_RECORDINGS` there is none.
+The floor is the distance of a set from itself: over random splits of its recordings into halves. Halves hold half as
+many recordings, so that it is a little too high: a set that lies below it cannot be told from this one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctlev_core.intervals import MIN_RECORDINGS
+from ctlev_core.realism import AXES, Summary
+
+_NUM_REPLICATES = 1000
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and the ends of its 95 % interval; NaN where there are too few recordings to tell."""
+
+    value: float
+    low: float = float("nan")
+    high: float = float("nan")
+
+
+def mean_distributions(summaries: Sequence[Summary]) -> dict[str, np.ndarray]:
+    """Mean of the recordings' distributions, [num_bins] by name of the axis, adding up to 1."""
+    means = _means(summaries, np.ones((1, len(summaries))))
+    return {name: values[0] for name, values in means.items() if name in AXES}
+
+
+def estimate_numbers(summaries: Sequence[Summary], seed: int = 0) -> dict[str, Estimate]:
+    """The numbers of a set."""
+
+    def numbers(weights: np.ndarray) -> dict[str, np.ndarray]:
+        means = _means(summaries, weights)
+        return {name: values[:, 0] for name, values in means.items() if name not in AXES}
+
+    found = numbers(np.ones((1, len(summaries))))
+    replicates = numbers(_draws(len(summaries), seed)) if len(summaries) >= MIN_RECORDINGS else {}
+    return {name: _estimate(float(value[0]), replicates.get(name)) for name, value in found.items()}
+
+
+def estimate_distances(first: Sequence[Summary], second: Sequence[Summary], seed: int = 0) -> dict[str, Estimate]:
+    """Distances of two sets, for all that both have; intervals under resampling of the recordings of both."""
+    ones = np.ones((1, len(first))), np.ones((1, len(second)))
+    found = _distances(_means(first, ones[0]), _means(second, ones[1]))
+    replicates: dict[str, np.ndarray] = {}
+    if min(len(first), len(second)) >= MIN_RECORDINGS:
+        draws = _draws(len(first), seed), _draws(len(second), seed + 1)
+        replicates = _distances(_means(first, draws[0]), _means(second, draws[1]))
+    return {name: _estimate(float(value[0]), replicates.get(name)) for name, value in found.items()}
+
+
+def estimate_floor(summaries: Sequence[Summary], seed: int = 0) -> dict[str, Estimate]:
+    """Distances of random halves of one set: median and central 95 %. Empty with fewer than two recordings."""
+    count = len(summaries)
+    if count < 2:
+        return {}
+    generator = np.random.default_rng(seed)
+    ranks = generator.permuted(np.tile(np.arange(count), (_NUM_REPLICATES, 1)), axis=1)
+    in_first = (ranks < count // 2).astype(np.float64)
+    replicates = _distances(_means(summaries, in_first), _means(summaries, 1 - in_first))
+    found = {}
+    for name, values in replicates.items():
+        values = values[np.isfinite(values)]
+        if len(values):
+            found[name] = _estimate(float(np.median(values)), values if count >= MIN_RECORDINGS else None)
+    return found
+
+
+def wasserstein(first: np.ndarray, second: np.ndarray, width: float) -> np.ndarray:
+    """Wasserstein-1 distance of distributions [..., bins]: the area between cumulative sums over bins of one width."""
+    return np.abs(np.cumsum(first - second, axis=-1)).sum(axis=-1) * width
+
+
+def jensen_shannon(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Jensen-Shannon divergence of distributions [..., bins], bits, 0 .. 1."""
+    middle = (first + second) / 2
+    total = np.zeros(first.shape[:-1])
+    for part in (first, second):
+        ratio = np.divide(part, middle, out=np.ones_like(part), where=part > 0)
+        total = total + (part * np.log2(ratio)).sum(axis=-1) / 2
+    # Rounding may leave -1e-17 where both are equal.
+    return np.clip(total, 0.0, 1.0)
+
+
+def _means(summaries: Sequence[Summary], weights: np.ndarray) -> dict[str, np.ndarray]:
+    """Weighted means over recordings, one row a row of weights [R, N]; NaN where no recording with weight has it."""
+    found = {}
+    for part in ("numbers", "distributions"):
+        for name in dict.fromkeys(name for summary in summaries for name in getattr(summary, part)):
+            have = np.array([name in getattr(summary, part) for summary in summaries])
+            values = np.array([np.atleast_1d(getattr(s, part)[name]) for s in summaries if name in getattr(s, part)])
+            total = weights[:, have].sum(axis=1, keepdims=True)
+            sums = weights[:, have] @ values
+            found[name] = np.divide(sums, total, out=np.full_like(sums, np.nan), where=total > 0)
+    return found
+
+
+def _distances(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Distances [R] of means [R, numbers or bins]."""
+    found = {}
+    for name, a in first.items():
+        if name not in second:
+            continue
+        b = second[name]
+        if name not in AXES:
+            found[name] = np.abs(a - b)[:, 0]
+            continue
+        axis = AXES[name]
+        found[f"{name}_wasserstein_{axis.unit.replace(' ', '_')}"] = wasserstein(a, b, axis.width)
+        found[f"{name}_js_bits"] = jensen_shannon(a, b)
+    return found
+
+
+def _draws(count: int, seed: int) -> np.ndarray:
+    """How often each recording is drawn in each replicate, [replicates, count]."""
+    shares = np.full(count, 1 / count)
+    return np.random.default_rng(seed).multinomial(count, shares, size=_NUM_REPLICATES).astype(np.float64)
+
+
+def _estimate(value: float, replicates: np.ndarray | None) -> Estimate:
+    if replicates is None or not np.isfinite(replicates).any():
+        return Estimate(value)
+    low, high = np.quantile(replicates[np.isfinite(replicates)], [0.025, 0.975])
+    return Estimate(value, float(low), float(high))
