@@ -15,9 +15,9 @@ quarter for testing; numbers in papers stem from other random splits. The split 
 `training`, `validation`, `testing` of .npy files) is used as it is where the root has it. A picture has no subject, so
 each recording is its own.
 
-Sensor: the pictures were shown in a field of 240 x 180 px at most, in the corner of the sensor of 304 x 240 px, and a
-file does not say how large its own was. `field` has all recordings on 240 x 180 px, as EST and EventCLIP do;
-`extent` cuts each recording to the box of its events, as tonic does.
+Sensor: of the ATIS's 304 x 240 px the pictures fill 240 x 180 px at most, each as much as its shape allows, and a file
+does not say how much. `field` has all recordings on 240 x 180 px, as EST and EventCLIP do; `extent` cuts each recording
+to the box of its events, as tonic does.
 
 Source: Orchard et al., Converting Static Image Datasets to Spiking Neuromorphic Datasets Using Saccades, Frontiers in
 Neuroscience 2015; Gehrig et al., End-to-End Learning of Representations for Asynchronous Event-Based Data, ICCV 2019

@@ -164,6 +164,17 @@ def test_the_split_of_est_is_used_as_it_is(tmp_path):
             listed(root / folder)
 
 
+def test_events_of_est_are_columns_with_seconds(tmp_path):
+    rows = np.array([[0, 0, 0.000001, -1], [239, 179, 0.25, 1], [17, 5, 0.3, -1]], np.float32)
+    for split in ("training", "testing"):
+        for name in ("accordion", "bonsai"):
+            (tmp_path / split / name).mkdir(parents=True)
+            np.save(tmp_path / split / name / f"{name}_0.npy", rows)
+    events = n_caltech101.read_events(listed(tmp_path)[0], n_caltech101.Options(root=tmp_path))
+    assert (events.x.tolist(), events.y.tolist(), events.p.tolist()) == ([0, 239, 17], [0, 179, 5], [0, 1, 0])
+    assert events.t.tolist() == [1, 250_000, 300_000] and events.sensor_size == (240, 180)
+
+
 def test_events_and_label_of_a_recording(root):
     x, y = [0, 239, 17, 3], [0, 179, 5, 3]
     file = write_atis(root / "bonsai" / "image_0001.bin", [0, 5, 70_000, 8_388_607], x, y, [0, 1, 1, 0])
