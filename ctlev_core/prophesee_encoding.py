@@ -61,12 +61,13 @@ def encode_evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray, word
     """Fill `words` [M] uint16 with the events; returns how many words were written.
 
     Events of one time, row and polarity become vectors wherever that takes fewer words: three and more with a new base
-    (a base word and a vector), two and more where the last vector's end is base enough.
+    (a base word and a vector), two and more directly after another vector, whose end is base enough. After any other
+    word a base is given anew, as cameras do: decoders differ in what they keep.
     """
     last = (np.int64(1) << EVT3_TIME_BITS) - 1
     count, loops, high = 1, np.int64(0), np.int64(0)
     low, row = np.int64(0), np.int64(-1)
-    base, base_polarity = np.int64(-(1 << 20)), np.int64(-1)
+    base, base_polarity, after_vector = np.int64(0), np.int64(0), -1
     words[0] = TIME_HIGH << 12
     event = 0
     while event < len(t):
@@ -86,7 +87,7 @@ def encode_evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray, word
             words[count] = ADDR_Y << 12 | row
             count += 1
         column, polarity = np.int64(x[event]), np.int64(p[event])
-        has_base = polarity == base_polarity and base <= column < base + 12
+        has_base = after_vector == count and polarity == base_polarity and base <= column < base + 12
         mask, number = _vector_mask(t, x, y, p, event, base if has_base else column)
         if number < (2 if has_base else 3):
             words[count] = ADDR_X << 12 | polarity << 11 | column
@@ -100,4 +101,5 @@ def encode_evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray, word
         words[count] = (VECT_8 if short else VECT_12) << 12 | mask
         base += 8 if short else 12
         count, event = count + 1, event + number
+        after_vector = count
     return count

@@ -57,8 +57,15 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
 
         def pieces() -> Iterator[Events]:
             yield event_pieces.empty_events(sensor_size)
+            num_read = 0
             for batch in file.iter_batches(min(num_events, _BATCH), use_threads=False):
+                num_read += len(batch)
                 yield _to_events(batch, sensor_size, path)
+            # A column that is damaged ends the batches early and says nothing.
+            if num_read != file.metadata.num_rows:
+                raise DataError(
+                    f"{path}: not a complete Parquet file: {num_read} rows, expected {file.metadata.num_rows}"
+                )
 
         yield from event_pieces.regroup(event_pieces.check_pieces(pieces(), str(path)), num_events)
 

@@ -75,7 +75,7 @@ def valid_files(name: str, folder: Path) -> Iterator[bytes]:
     """Small files of the format."""
     module = plugins.load("formats", name)
     if name == "aedat4":
-        yield REAL_AEDAT4.read_bytes()[:200_000]
+        yield REAL_AEDAT4.read_bytes()
         return
     generator = np.random.default_rng(0)
     width, height = SENSORS.get(name, (640, 480))
@@ -123,7 +123,7 @@ def mutate(content: bytes, chance: random.Random) -> bytes:
     return bytes(data)
 
 
-def fuzz_with_atheris(name: str, path: Path, corpus: Path, seconds: int) -> None:
+def fuzz_with_atheris(name: str, path: Path, corpus: Path, seconds: int, max_length: int) -> None:
     """Coverage-guided; does not return."""
     import atheris
 
@@ -140,7 +140,7 @@ def fuzz_with_atheris(name: str, path: Path, corpus: Path, seconds: int) -> None
         path.write_bytes(content)
         check_reader(module, path)
 
-    flags = [f"-max_total_time={seconds}", "-max_len=65536", "-rss_limit_mb=4096", "-timeout=30", "-verbosity=0",
+    flags = [f"-max_total_time={seconds}", f"-max_len={max_length}", "-rss_limit_mb=4096", "-timeout=30", "-verbosity=0",
              f"-artifact_prefix={tempfile.gettempdir()}/{name}-"]  # fmt: skip
     atheris.Setup([sys.argv[0], *flags, str(corpus)], run)
     atheris.Fuzz()
@@ -194,7 +194,7 @@ def main() -> None:
 
             has_atheris = True
         if has_atheris and not arguments.random:
-            fuzz_with_atheris(arguments.format, path, corpus, arguments.seconds)
+            fuzz_with_atheris(arguments.format, path, corpus, arguments.seconds, 2 * max(map(len, seeds)))
         else:
             tried, valid = fuzz_at_random(arguments.format, path, seeds, arguments.seconds)
             print(f"{tried} files, {valid} of them valid")

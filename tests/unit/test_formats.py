@@ -113,7 +113,12 @@ def decode(encoding: str, words: list[int]) -> list[tuple[int, int, int, int]]:
     events = Events(t[:written], x[:written], y[:written], p[:written], SIZE)
     if written:  # what the decoder says of its events is what spares a check of each
         went_back = bool((events.t[1:] < events.t[:-1]).any() or events.t[0] < 0)
-        assert state[: record_files.NUM_SHARED].tolist() == [t[written - 1], went_back, x[:written].max(), y[:written].max()]
+        assert state[: record_files.NUM_SHARED].tolist() == [
+            t[written - 1],
+            went_back,
+            x[:written].max(),
+            y[:written].max(),
+        ]
     return to_rows(events)
 
 
