@@ -6,8 +6,8 @@ Numbers of a recording (`summarise_events`; T = time between its first and last 
     pixel_rate_hz           the same a pixel: event rate / (W H)
     positive_share          positive events / events
     active_pixel_share      pixels with an event / (W H)
-    hot_pixel_share         pixels with at least 20 events and more than 10 times the second largest count of their up to
-                            8 neighbours, / (W H)
+    hot_pixel_share         pixels with at least 20 events and more than 10 times the second largest count of their up
+                            to 8 neighbours, / (W H)
     hot_event_share         events of those pixels / events
     isolated_share          events that none of the 8 pixels around joins within 10 ms, before or after, / events
     noise_rate_hz           isolated events / (W H T - what events cover), where each event covers the 8 pixels around

@@ -8,6 +8,7 @@ each recording counts once, however many events it has. Distances:
     NAME_js_bits                Jensen-Shannon divergence of a distribution: 0 = equal, 1 = nothing in common
 
 Intervals are percentiles (95 %) under resampling of whole recordings; with fewer than `MIN_RECORDINGS` there is none.
+Resampling repeats recordings, which makes divergences a little larger: with few their interval may lie above the value.
 The floor is the distance of a set from itself: over random splits of its recordings into halves. Halves hold half as
 many recordings, so that it is a little too high: a set that lies below it cannot be told from this one.
 """
@@ -18,10 +19,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 
 from ctlev_core.intervals import MIN_RECORDINGS
 from ctlev_core.realism import AXES, Summary
+from data_contracts.tables import Column, TableSchema
 
+DISTRIBUTIONS = TableSchema(
+    "distributions",
+    1,
+    None,
+    (
+        Column("group", pa.string(), "events or frames"),
+        Column("setting", pa.string(), "which set of recordings or frames"),
+        Column("axis", pa.string(), "what is distributed (ctlev_core.realism.AXES)"),
+        Column("centre", pa.float64(), "middle of the bin, in the unit of the axis"),
+        Column("share", pa.float64(), "share of the bin, mean over recordings", minimum=0, maximum=1.000001),
+    ),
+)
 _NUM_REPLICATES = 1000
 
 

@@ -15,6 +15,7 @@ from flows.prepare_dataset import prepare_dataset
 from flows.settings import HOME, flow
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
+from tasks.realism import realism
 from tasks.report import publish_report, report
 from tasks.stage import call_flow
 
@@ -26,6 +27,7 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
     checkpoint = call_flow(train_generator, experiment, dataset)
     synthetic = call_flow(synthesize, experiment, dataset, checkpoint)
     evaluation = call_flow(evaluate, experiment, dataset, synthetic)
+    looks = realism(dataset.recordings, dataset.frames, synthetic, label="training frames and synthetic")
     return report(
         dataset.recordings,
         dataset.frames,
@@ -34,6 +36,7 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
         synthetic,
         evaluation.scores,
         evaluation.models,
+        looks,
         title=experiment.name,
         notice=experiment.data_notice,
         settings=experiment.settings,

@@ -13,16 +13,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.intervals import MIN_RECORDINGS, bootstrap_interval
+from ctlev_core.realism_distances import DISTRIBUTIONS
 from ctlev_core.report.html import Curves, ImageGrid, Section, Table, render_report
+from ctlev_core.report.realism import realism_sections
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest, ManifestRef
 from tasks.stage import Output, stage
 
 GRID_COLUMNS = 10
+_TABLES = ("scores", "realism", "recordings")
 
 
-@stage(version=1, schema=tables.REPORT)
+@stage(version=2, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -32,13 +35,14 @@ def report(
     synthetic: Manifest,
     scores: list[Manifest],
     models: list[Manifest],
+    realism: Manifest,
     *,
     title: str,
     notice: str,
     settings: Sequence[str],
     model_names: Sequence[str],
 ) -> pa.Table:
-    """Write `report.html`, `scores.parquet` and `recordings.parquet`."""
+    """Write `report.html`, `scores.parquet`, `realism.parquet` and `recordings.parquet`."""
     all_scores = pa.concat_tables([manifest.table for manifest in scores])
     rows = all_scores.to_pylist()
     headline, *details = _score_tables(rows, settings)
@@ -47,18 +51,20 @@ def report(
         _grid("Asked for, and sampled", conditions, synthetic),
         _real_grid(frames),
         *details,
+        *realism_sections(realism.table.to_pylist(), realism.attached(DISTRIBUTIONS).to_pylist()),
         _curves("Fine-tuning of the generator", [checkpoint], ["generator"]),
         _curves("Downstream training", models, model_names),
         _recordings_table(recordings, frames),
-        _cost_table([recordings, frames, conditions, checkpoint, synthetic, *models, *scores]),
+        _cost_table([recordings, frames, conditions, checkpoint, synthetic, *models, *scores, realism]),
     ]
     page = render_report(
         title=title, lead=notice, verdict=verdict(rows, settings, _difference(scores)), sections=sections
     )
     (out.folder / "report.html").write_text(page, encoding="utf-8")
     pq.write_table(all_scores, out.folder / "scores.parquet")
+    pq.write_table(realism.table, out.folder / "realism.parquet")
     pq.write_table(recordings.table, out.folder / "recordings.parquet")
-    return pa.table({"table": ["scores", "recordings"], "file": ["scores.parquet", "recordings.parquet"]})
+    return pa.table({"table": list(_TABLES), "file": [f"{name}.parquet" for name in _TABLES]})
 
 
 def _difference(scores: list[Manifest]) -> Difference | None:
@@ -86,8 +92,8 @@ def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
     """Put the newest report of an experiment where a person looks for it, and say where that is."""
     folder = home / "reports"
     (folder / name).mkdir(parents=True, exist_ok=True)
-    for source in ("scores.parquet", "recordings.parquet"):
-        shutil.copyfile(ref.path / source, folder / name / source)
+    for table in _TABLES:
+        shutil.copyfile(ref.path / f"{table}.parquet", folder / name / f"{table}.parquet")
     temporary = folder / f".{name}.html"
     shutil.copyfile(ref.path / "report.html", temporary)
     temporary.replace(folder / f"{name}.html")

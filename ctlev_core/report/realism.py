@@ -1,0 +1,94 @@
+"""The sections of the report that set synthetic beside real in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ctlev_core.realism import AXES
+from ctlev_core.report.html import Curves, Section, Table
+
+_HOW_TO_READ = (
+    "Means over recordings, in brackets 95 % intervals under resampling of recordings. Distance: magnitude of the "
+    "difference, or between distributions the Wasserstein-1 distance in the unit named and the Jensen-Shannon "
+    "divergence (0 = equal, 1 = nothing in common). Floor: the same distance between random halves of the left set. "
+    "Bold: the distance lies above the floor's interval. Resampling repeats recordings, which makes divergences a "
+    "little larger: with few recordings their interval may lie above the value."
+)
+_TITLES = {
+    "frames": (
+        "How real do the synthetic frames look?",
+        "Event images have no time stamps: what compares them is where and how bright their pixels are. Active: value "
+        "of 26 of 255 and more. Speckle: active pixels in pieces of one or two.",
+    ),
+    "events": (
+        "How alike are the real recordings?",
+        "Events of the training split beside those of the test split: what the data are like, and how much subjects "
+        "and recordings differ. Noise rate: events that nothing around joins within 10 ms, a pixel and second in which "
+        "nothing happens around.",
+    ),
+}
+_DISTANCE_COLUMN = 3
+
+
+def realism_sections(rows: Sequence[dict[str, Any]], distributions: Sequence[dict[str, Any]]) -> list[Section]:
+    """Tables of numbers and distances, and a chart of the values of active pixels.
+
+    Args:
+        rows: of the table `scores` with the task `realism`.
+        distributions: of the table `distributions`.
+    Returns:
+        One table a group, frames first; the chart follows the frames' where they have values.
+    """
+    sections: list[Section] = []
+    for group, (title, caption) in _TITLES.items():
+        of_group = [row for row in rows if row["group"] == group]
+        if of_group:
+            sections.append(_table(of_group, title, f"{caption} {_HOW_TO_READ}"))
+        if group == "frames":
+            sections += _values([row for row in distributions if row["axis"] == "value"])
+    return sections
+
+
+def _values(rows: Sequence[dict[str, Any]]) -> list[Section]:
+    series: dict[str, tuple[Sequence[float], Sequence[float]]] = {}
+    for setting in dict.fromkeys(row["setting"] for row in rows):
+        of_set = [row for row in rows if row["setting"] == setting]
+        series[setting] = ([row["centre"] for row in of_set], np.cumsum([row["share"] for row in of_set]).tolist())
+    caption = (
+        "The area between the lines is their Wasserstein-1 distance in grey levels. Real lines have steps: event "
+        "images hold few different counts."
+    )
+    title, labels = "Brightness of active pixels", (AXES["value"].label, "share of active pixels up to it")
+    return [Curves(title, series, *labels, caption=caption)] if series else []
+
+
+def _table(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
+    """Numbers down; the two sets, their distance and the floor across."""
+    found = {(row["setting"], row["metric"]): row for row in rows}
+    sets = [name for name in dict.fromkeys(row["setting"] for row in rows) if " against " not in name]
+    first, second = (*sets, "", "")[:2]
+    settings = (first, second, f"{second} against {first}", f"{first} against {first}")
+    body: list[list[str]] = []
+    bold: set[tuple[int, int]] = set()
+    for metric in dict.fromkeys(row["metric"] for row in rows):
+        cells = [found.get((setting, metric)) for setting in settings]
+        if _is_above(cells[2], cells[3]):
+            bold.add((len(body), _DISTANCE_COLUMN))
+        body.append([metric, *(_cell(cell) for cell in cells)])
+    counts = [next((row["num_samples"] for row in rows if row["setting"] == name), 0) for name in (first, second)]
+    columns = ["number", f"{first} ({counts[0]})", f"{second} ({counts[1]})", "distance", f"floor: {first}, halves"]
+    return Table(title, columns, body, caption=caption, bold=bold, footnotes=["In parentheses: recordings."])
+
+
+def _is_above(distance: dict[str, Any] | None, floor: dict[str, Any] | None) -> bool:
+    return bool(distance and floor and floor["high"] is not None and distance["value"] > floor["high"])
+
+
+def _cell(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return ""
+    text = f"{row['value']:.3g}"
+    return text if row["low"] is None else f"{text} [{row['low']:.2g}, {row['high']:.2g}]"

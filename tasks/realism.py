@@ -1,0 +1,98 @@
+"""How real do recordings and synthetic frames look? Numbers, and distances beside a real-against-real floor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core import event_files, realism_distances
+from ctlev_core.realism import AXES, Summary, summarise_events, summarise_frames
+from ctlev_core.windows import spread
+from data_contracts import tables
+from data_contracts.manifest import Manifest
+from tasks.stage import Output, stage
+
+MAX_EVENTS = 2_000_000
+"""Of a longer recording the middle stretch of so many events."""
+MAX_RECORDINGS = 100
+"""Of a larger split so many, evenly spread."""
+MAX_FRAMES = 1000
+"""Of a larger set of frames so many, evenly spread."""
+
+
+@stage(version=1, schema=tables.SCORES)
+def realism(out: Output, recordings: Manifest, frames: Manifest, synthetic: Manifest) -> pa.Table:
+    """Events of the test split beside those of the training split, and synthetic beside real training frames.
+
+    Rows have the task `realism` and the group `events` or `frames`. Settings: the two sets, `A against B` for their
+    distances and `A against A` for the floor. Distributions lie beside the table.
+    """
+    sets = {split: _summarise_recordings(recordings, split) for split in ("train", "test")}
+    rows, distributions = _compare("events", "train", "test", sets, recordings.ref.digest)
+    sets = {"real": _summarise_frames(frames), "synthetic": _summarise_frames(synthetic)}
+    more_rows, more_distributions = _compare("frames", "real", "synthetic", sets, synthetic.ref.digest)
+    schema = realism_distances.DISTRIBUTIONS
+    out.write_table(pa.Table.from_pylist(distributions + more_distributions, schema.arrow()), schema)
+    return pa.Table.from_pylist(rows + more_rows, schema=tables.SCORES.arrow())
+
+
+def _summarise_recordings(recordings: Manifest, split: str) -> list[Summary]:
+    files = dict(zip(recordings.column("recording_id"), recordings.column("events_file"), strict=True))
+    parts = [part for part in recordings.attached(tables.PARTS).to_pylist() if part["split"] == split]
+    parts = [part for part in parts if files[part["recording_id"]]]
+    found = []
+    for number in spread(len(parts), MAX_RECORDINGS).tolist():
+        start, stop = parts[number]["event_start"], parts[number]["event_stop"]
+        start += max(0, stop - start - MAX_EVENTS) // 2
+        path = recordings.path(files[parts[number]["recording_id"]])
+        found.append(summarise_events(event_files.read_events_range(path, start, min(stop, start + MAX_EVENTS))))
+    return found
+
+
+def _summarise_frames(frames: Manifest) -> list[Summary]:
+    """One summary a recording, because frames of one resemble one another."""
+    rows = frames.rows_where(split="train")
+    rows = rows[spread(len(rows), MAX_FRAMES)]
+    names = np.array(frames.column("recording_id"))[rows]
+    images = frames.array("frames")
+    return [summarise_frames(np.asarray(images[rows[names == name]])) for name in dict.fromkeys(names.tolist())]
+
+
+def _compare(
+    group: str, first: str, second: str, sets: dict[str, list[Summary]], data_digest: str
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows of the table and of the distributions: two sets, their distances, and the floor of the first."""
+    found = {name: realism_distances.estimate_numbers(summaries) for name, summaries in sets.items()}
+    found[f"{second} against {first}"] = realism_distances.estimate_distances(sets[first], sets[second])
+    found[f"{first} against {first}"] = realism_distances.estimate_floor(sets[first])
+    sizes = {name: len(summaries) for name, summaries in sets.items()}
+    rows = [
+        {
+            "task": "realism",
+            "setting": setting,
+            "seed": 0,
+            "group": group,
+            "metric": metric,
+            "value": estimate.value,
+            "low": None if np.isnan(estimate.low) else estimate.low,
+            "high": None if np.isnan(estimate.high) else estimate.high,
+            "num_samples": sizes[setting.split(" against ")[0]],
+            "num_train": 0,
+            "model_digest": "",
+            "data_digest": data_digest,
+        }
+        for setting, estimates in found.items()
+        for metric, estimate in estimates.items()
+    ]
+    return rows, [row for name, summaries in sets.items() for row in _distribution_rows(group, name, summaries)]
+
+
+def _distribution_rows(group: str, setting: str, summaries: Sequence[Summary]) -> list[dict[str, Any]]:
+    return [
+        {"group": group, "setting": setting, "axis": axis, "centre": float(centre), "share": float(share)}
+        for axis, shares in realism_distances.mean_distributions(summaries).items()
+        for centre, share in zip(AXES[axis].centres, shares, strict=True)
+    ]

@@ -1,0 +1,46 @@
+"""The realism stage and its sections in the report of a finished smoke run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from ctlev_core.realism import summarise_frames
+from ctlev_core.realism_distances import DISTRIBUTIONS
+from data_contracts.manifest import ManifestRef, read_manifest
+
+
+def only_artefact(home, stage):
+    (folder,) = (home / "artefacts" / stage).iterdir()
+    return read_manifest(ManifestRef(key=folder.name, path=folder), full=True)
+
+
+def test_the_report_sets_synthetic_beside_real(smoke_home):
+    page = (smoke_home / "reports" / "smoke.html").read_text()
+    for expected in ("How real do the synthetic frames look?", "How alike are the real recordings?", "noise_rate_hz"):
+        assert expected in page
+    published = pq.read_table(smoke_home / "reports" / "smoke" / "realism.parquet")
+    assert published.equals(only_artefact(smoke_home, "realism").table)
+
+
+def test_numbers_are_those_of_the_frames_that_were_sampled(smoke_home):
+    rows = only_artefact(smoke_home, "realism").table.to_pylist()
+    found = {(row["group"], row["setting"], row["metric"]): row for row in rows}
+    synthetic = only_artefact(smoke_home, "sample")
+    shares = [summarise_frames(frame[None]).numbers["active_pixel_share"] for frame in synthetic.array("frames")]
+    row = found["frames", "synthetic", "active_pixel_share"]
+    np.testing.assert_allclose(row["value"], np.mean(shares))
+    assert row["num_samples"] == len(synthetic) and row["low"] <= row["value"] <= row["high"]
+    assert found["events", "train", "noise_rate_hz"]["num_samples"] == 8
+    for setting in ("synthetic against real", "real against real"):
+        assert 0 <= found["frames", setting, "value_js_bits"]["value"] <= 1
+
+
+def test_distributions_add_up_to_1(smoke_home):
+    table = only_artefact(smoke_home, "realism").attached(DISTRIBUTIONS).to_pylist()
+    sums: dict[tuple, float] = {}
+    for row in table:
+        key = (row["group"], row["setting"], row["axis"])
+        sums[key] = sums.get(key, 0) + row["share"]
+    assert {("events", "train", "interval"), ("events", "test", "pixel_rate"), ("frames", "real", "value")} <= set(sums)
+    np.testing.assert_allclose(list(sums.values()), 1)

@@ -1,0 +1,65 @@
+"""The realism sections of the report."""
+
+from __future__ import annotations
+
+from ctlev_core.report.html import Curves, Table, render_report
+from ctlev_core.report.realism import realism_sections
+
+
+def row(group: str, setting: str, metric: str, value: float, low: float | None = None, high: float | None = None):
+    return {
+        "group": group, "setting": setting, "metric": metric, "value": value, "low": low, "high": high,
+        "num_samples": {"real": 6, "synthetic": 9}.get(setting, 5),
+    }  # fmt: skip
+
+
+ROWS = [
+    row("events", "train", "spread", 0.5),
+    row("events", "test", "spread", 0.75),
+    row("events", "test against train", "spread", 0.25),
+    row("events", "train against train", "spread", 0.1),
+    row("frames", "real", "speckle_share", 0.25, 0.2, 0.3),
+    row("frames", "synthetic", "speckle_share", 0.05),
+    row("frames", "synthetic against real", "speckle_share", 0.2, 0.1, 0.3),
+    row("frames", "synthetic against real", "value_js_bits", 0.01),
+    row("frames", "real against real", "speckle_share", 0.02, 0.0, 0.04),
+    row("frames", "real against real", "value_js_bits", 0.02, 0.0, 0.04),
+]
+DISTRIBUTIONS = [
+    {"group": "frames", "setting": setting, "axis": axis, "centre": centre, "share": share}
+    for setting, shares in (("real", (0.75, 0.25)), ("synthetic", (0.5, 0.5)))
+    for axis in ("value", "other")
+    for centre, share in zip((26.0, 27.0), shares, strict=True)
+]
+
+
+def test_frames_come_first_with_both_sets_their_distance_and_the_floor():
+    frames, values, events = realism_sections(ROWS, DISTRIBUTIONS)
+    assert isinstance(frames, Table) and isinstance(values, Curves) and isinstance(events, Table)
+    assert frames.columns == ["number", "real (6)", "synthetic (9)", "distance", "floor: real, halves"]
+    assert frames.rows == [
+        ["speckle_share", "0.25 [0.2, 0.3]", "0.05", "0.2 [0.1, 0.3]", "0.02 [0, 0.04]"],
+        ["value_js_bits", "", "", "0.01", "0.02 [0, 0.04]"],
+    ]
+    assert events.rows == [["spread", "0.5", "0.75", "0.25", "0.1"]]
+
+
+def test_bold_is_what_lies_above_the_interval_of_the_floor():
+    frames, _, events = realism_sections(ROWS, DISTRIBUTIONS)
+    assert isinstance(frames, Table) and isinstance(events, Table)
+    assert set(frames.bold) == {(0, 3)}
+    assert not events.bold  # the floor has no interval, so nothing is known
+
+
+def test_the_chart_adds_the_shares_up():
+    values = realism_sections(ROWS, DISTRIBUTIONS)[1]
+    assert isinstance(values, Curves)
+    assert values.series == {"real": ([26.0, 27.0], [0.75, 1.0]), "synthetic": ([26.0, 27.0], [0.5, 1.0])}
+
+
+def test_what_is_missing_is_left_out():
+    assert realism_sections([], []) == []
+    (only,) = realism_sections([row("events", "train", "spread", 0.5)], [])
+    assert isinstance(only, Table) and only.rows == [["spread", "0.5", "", "", ""]]
+    page = render_report(title="t", lead="", verdict="", sections=realism_sections(ROWS, DISTRIBUTIONS))
+    assert "How real do the synthetic frames look?" in page and "<svg" in page
