@@ -33,6 +33,7 @@ _MAGIC = b"\x89HDF\r\n\x1a\n"
 _GROUPS = ("events", "CD/events", "/")
 _MATRIX_COLUMNS = ("x", "y", "t", "p")
 _BLOCK = 1 << 18
+_LARGEST_COMPRESSION = 1 << 20
 
 
 def sniff(path: Path) -> bool:
@@ -176,8 +177,10 @@ def _check_stored(dataset: Any, where: str) -> None:
     """A shape alone may promise more than any disk holds."""
     if dataset.dtype.kind not in "buif":
         raise DataError(f"{where}: expected numbers, got {dataset.dtype}")
-    if dataset.size and not dataset.id.get_storage_size():
-        raise DataError(f"{where}: {dataset.shape} values declared, none stored")
+    if dataset.nbytes > _LARGEST_COMPRESSION * dataset.id.get_storage_size():
+        raise DataError(
+            f"{where}: {dataset.shape} values declared, {dataset.id.get_storage_size()} bytes stored: incomplete"
+        )
 
 
 def _time_offset(file: Any, path: Path) -> int:

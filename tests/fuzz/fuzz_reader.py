@@ -37,8 +37,13 @@ def check_reader(module: ModuleType, path: Path) -> bool:
     """Read the file in both ways; was it valid?
 
     Raises:
-        Failure: another exception than DataError, wrong events, or pieces that differ from the whole.
+        Failure: several formats claim the file, another exception than DataError, wrong events, or pieces that differ
+            from the whole.
     """
+    others = [plugins.load("formats", name) for name in plugins.names("formats")]
+    claims = [other.__name__ for other in others if getattr(other, "HAS_SIGNATURE", True) and other.sniff(path)]
+    if len(claims) > 1:
+        raise Failure(f"claimed by {', '.join(claims)}")
     whole = _attempt(module, lambda: [module.read(path)])
     pieces = _attempt(module, lambda: list(module.read_chunks(path, 3)))
     if (whole is None) != (pieces is None):
@@ -140,7 +145,8 @@ def fuzz_with_atheris(name: str, path: Path, corpus: Path, seconds: int, max_len
         path.write_bytes(content)
         check_reader(module, path)
 
-    flags = [f"-max_total_time={seconds}", f"-max_len={max_length}", "-rss_limit_mb=4096", "-timeout=30", "-verbosity=0",
+    flags = [f"-max_total_time={seconds}", f"-max_len={max_length}",
+             "-rss_limit_mb=4096", "-timeout=30", "-verbosity=0",
              f"-artifact_prefix={tempfile.gettempdir()}/{name}-"]  # fmt: skip
     atheris.Setup([sys.argv[0], *flags, str(corpus)], run)
     atheris.Fuzz()

@@ -142,6 +142,19 @@ def test_formats_without_a_signature_are_asked_last(tmp_path, monkeypatch):
     assert event_files.find_format(path).__name__.endswith(".evt2")
 
 
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings are not beside the project")
+@pytest.mark.parametrize(
+    "file", ["person/tonic_sample.aedat4", "street/expelliarmus_evt3.raw", "spot/expelliarmus_evt2.raw"]
+)
+def test_real_recordings_in_pieces(file, tmp_path):
+    events = event_files.read_events_file(REAL / file)
+    summary = event_files.write_event_chunks_parquet(
+        tmp_path / "a.parquet", event_files.read_event_chunks(REAL / file, 10_007)
+    )
+    assert summary == event_files.summarise(events)
+    assert_same(event_files.read_events_file(tmp_path / "a.parquet"), events)
+
+
 # Pieces ------------------------------------------------------------------------------------------------------------
 
 

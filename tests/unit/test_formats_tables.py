@@ -317,6 +317,24 @@ def test_hdf5_filter_that_is_not_installed_says_what_to_install(tmp_path):
     raises_both_ways(path, "compressed with a filter that is not installed; pip install hdf5plugin")
 
 
+def test_hdf5_with_a_shape_and_no_values_is_an_error(tmp_path):
+    path = write_dsec(tmp_path / "a.h5", {"t": T, "x": X, "y": Y})
+    with h5py.File(path, "a") as file:
+        file["events"].create_dataset("p", shape=(1 << 50,), dtype="u1", chunks=(1 << 20,))
+        for name in "txy":
+            del file[f"events/{name}"]
+            file[f"events/{name}"] = file["events/p"]
+    raises_both_ways(path, "column [txyp]: .* values declared, 0 bytes stored")
+
+
+def test_hdf5_of_dsec_as_it_is_compressed(tmp_path):
+    hdf5plugin = pytest.importorskip("hdf5plugin")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, values in zip("txyp", (T, X, Y, P), strict=True):
+            file.create_dataset(f"events/{name}", data=values, **hdf5plugin.Blosc(cname="zstd"))
+    assert_events(read_both_ways(tmp_path / "a.h5"))
+
+
 # Text --------------------------------------------------------------------------------------------------------------
 
 SECONDS = "".join(f"{t / 1e6:.9f} {x} {y} {p}\n" for t, x, y, p in zip(T, X, Y, P, strict=True))
