@@ -59,6 +59,8 @@ class Axis:
         num_bins: values below the first and above the last bin count there.
         unit: of the values, and of a Wasserstein distance along this axis.
         label: for a chart.
+        num_merged: neighbouring bins that a divergence takes as one: it cannot tell near from far, and the few counts
+            of an event image fall on other grey levels in each.
     """
 
     low: float
@@ -66,6 +68,7 @@ class Axis:
     num_bins: int
     unit: str
     label: str
+    num_merged: int = 1
 
     @property
     def centres(self) -> np.ndarray:
@@ -76,7 +79,7 @@ class Axis:
 AXES = {
     "pixel_rate": Axis(-3.0, 0.1, 80, "decades", "events per second of an active pixel"),
     "interval": Axis(0.0, 0.1, 80, "decades", "microseconds between two events of a pixel"),
-    "value": Axis(ACTIVE_VALUE - 0.5, 1.0, 256 - ACTIVE_VALUE, "grey levels", "value of an active pixel"),
+    "value": Axis(ACTIVE_VALUE - 0.5, 1.0, 256 - ACTIVE_VALUE, "grey levels", "value of an active pixel", 23),
 }
 
 

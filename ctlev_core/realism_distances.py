@@ -5,7 +5,8 @@ each recording counts once, however many events it has. Distances:
 
     NAME                        magnitude of the difference of a number
     NAME_wasserstein_UNIT       Wasserstein-1 distance of a distribution: the area between the cumulative sums
-    NAME_js_bits                Jensen-Shannon divergence of a distribution: 0 = equal, 1 = nothing in common
+    NAME_js_bits                Jensen-Shannon divergence of a distribution: 0 = equal, 1 = nothing in common; of
+                                `value` over 10 bins of 23 grey levels
 
 Intervals are percentiles (95 %) under resampling of whole recordings; with fewer than `MIN_RECORDINGS` there is none.
 Resampling repeats recordings, which makes divergences a little larger: with few their interval may lie above the value.
@@ -136,7 +137,8 @@ def _distances(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]
             continue
         axis = AXES[name]
         found[f"{name}_wasserstein_{axis.unit.replace(' ', '_')}"] = wasserstein(a, b, axis.width)
-        found[f"{name}_js_bits"] = jensen_shannon(a, b)
+        merged = (part.reshape(len(part), -1, axis.num_merged).sum(axis=-1) for part in (a, b))
+        found[f"{name}_js_bits"] = jensen_shannon(*merged)
     return found
 
 

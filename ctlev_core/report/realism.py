@@ -43,10 +43,12 @@ def realism_sections(rows: Sequence[dict[str, Any]], distributions: Sequence[dic
         One table a group, frames first; the chart follows the frames' where they have values.
     """
     sections: list[Section] = []
+    how_to_read = _HOW_TO_READ
     for group, (title, caption) in _TITLES.items():
         of_group = [row for row in rows if row["group"] == group]
         if of_group:
-            sections.append(_table(of_group, title, f"{caption} {_HOW_TO_READ}"))
+            sections.append(_table(of_group, title, f"{caption} {how_to_read}"))
+            how_to_read = "To be read like the table of frames."
         if group == "frames":
             sections += _values([row for row in distributions if row["axis"] == "value"])
     return sections
@@ -90,5 +92,10 @@ def _is_above(distance: dict[str, Any] | None, floor: dict[str, Any] | None) -> 
 def _cell(row: dict[str, Any] | None) -> str:
     if row is None:
         return ""
-    text = f"{row['value']:.3g}"
-    return text if row["low"] is None else f"{text} [{row['low']:.2g}, {row['high']:.2g}]"
+    text = _digits(row["value"], 3)
+    return text if row["low"] is None else f"{text} [{_digits(row['low'], 2)}, {_digits(row['high'], 2)}]"
+
+
+def _digits(value: float, digits: int) -> str:
+    """Significant digits, but no powers of ten for large values."""
+    return f"{value:.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"

@@ -106,3 +106,13 @@ def test_equal_seeds_give_equal_intervals():
     first, second = random_set(10, 0, 0), random_set(10, 1, 1)
     assert estimate_distances(first, second, seed=3) == estimate_distances(first, second, seed=3)
     assert estimate_floor(first, seed=3) == estimate_floor(first, seed=3)
+
+
+def test_the_divergence_of_values_takes_near_grey_levels_as_one():
+    def at_value(value: int) -> Summary:
+        return Summary({}, {"value": np.eye(AXES["value"].num_bins)[value - 26]})
+
+    near, far = (estimate_distances([at_value(30)], [at_value(value)]) for value in (40, 200))
+    assert (near["value_js_bits"].value, far["value_js_bits"].value) == (0, 1)
+    assert near["value_wasserstein_grey_levels"].value == pytest.approx(10)
+    assert far["value_wasserstein_grey_levels"].value == pytest.approx(170)

@@ -51,6 +51,11 @@ def test_bold_is_what_lies_above_the_interval_of_the_floor():
     assert not events.bold  # the floor has no interval, so nothing is known
 
 
+def test_large_numbers_are_written_out():
+    (table,) = realism_sections([row("events", "train", "pixel_rate_hz", 12345.6, 110.4, 0.000123)], [])
+    assert isinstance(table, Table) and table.rows[0][1] == "12346 [110, 0.00012]"
+
+
 def test_the_chart_adds_the_shares_up():
     values = realism_sections(ROWS, DISTRIBUTIONS)[1]
     assert isinstance(values, Curves)
