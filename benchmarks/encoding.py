@@ -11,9 +11,10 @@ wanders.
 Two ways to take the result. `kept`: one new array holds every window, as ctlev's tasks want it; new memory is most of
 the cost then. `streamed`: one window after the other into memory that is used again (for peers: an array a window,
 dropped at once; tonic, which has one way only, is compared with both). `limit` is one pass over the 5 bytes an event
-in the columns x, y and p, in the same rounds; the events of `whole` do not fit the caches. `new memory` is the making
-of the array of `kept` alone. Peers that are not installed are left out, and every result is checked against ours first.
-Slow peers count the first `--slow-events` events where the window is the whole.
+in the columns x, y and p, in the same rounds; the events of `whole` do not fit the caches. `increments` is what is left
+when cell numbers are known, nothing is checked and counts wrap: one increment an event in a byte a cell. `new memory`
+is the making of the array of `kept` alone. Peers that are not installed are left out, and every result is checked
+against ours first. Slow peers count the first `--slow-events` events where the window is the whole.
 """
 
 from __future__ import annotations
@@ -108,6 +109,7 @@ def jobs(events: Events, ranges: np.ndarray, method: str, slow_events: int) -> l
     width, height = events.sensor_size
     found = [
         Job("limit", lambda: read_columns(events), len(events)),
+        *increments(events, ranges),
         Job("new memory", lambda: new_memory((len(ranges), 2, height, width)), counted),
         Job("ctlev", lambda: event_histogram.encode(events, ranges, options), counted),
         Job("ctlev streamed", lambda: drop(event_histogram.encode_each(events, ranges, options)), counted),
@@ -201,6 +203,21 @@ def tonic_to_frame(events: Events, ranges: np.ndarray, method: str):
         records[name] = getattr(counted, name)
     how = {"whole": {"n_event_bins": 1}, "7,500 events": {"event_count": 7500}, "8.333 ms": {"time_window": 8333}}
     return records, ToFrame(sensor_size=(*events.sensor_size, 2), **how[method])
+
+
+def increments(events: Events, ranges: np.ndarray) -> list[Job]:
+    """Increments alone, for the recording as a whole: a bound for every method that makes one an event."""
+    if len(ranges) > 1:
+        return []
+    cells = _cells(events, 0, len(events), np.int64).astype(np.uint32)
+    counts = np.zeros(2 * events.sensor_size[0] * events.sensor_size[1], np.uint8)
+    return [Job("increments", lambda: _increment(cells, counts), len(events))]
+
+
+@njit(nogil=True)
+def _increment(cells: np.ndarray, counts: np.ndarray) -> None:
+    for i in range(len(cells)):
+        counts[np.uint64(cells[i])] += np.uint8(1)
 
 
 def new_memory(shape: tuple[int, ...]) -> None:
