@@ -45,7 +45,7 @@ def main() -> None:
     recordings = find_recordings(arguments.recording)
     with tempfile.TemporaryDirectory() as folder:
         if arguments.memory:
-            for name in SUFFIXES:
+            for name in (*SUFFIXES, "parquet"):
                 print_memory(name, tile(next(iter(recordings.values())), 4_000_000), arguments.gigabytes, Path(folder))
             return
         for label, recording in recordings.items():
@@ -173,14 +173,15 @@ def compare(columns: list[np.ndarray], events: Events) -> str:
 
 def print_memory(name: str, events: Events, gigabytes: float, folder: Path) -> None:
     """Peak memory of a chunked read of a large file, in a process of its own."""
-    path = folder / f"large{SUFFIXES[name]}"
+    path = folder / f"large{SUFFIXES.get(name, '')}"
     size = write_large(name, path, events, int(gigabytes * 1e9))
     code = (
-        "import resource, sys, time\n"
+        "import re, sys, time\n"
         "from pathlib import Path\n"
         "from ctlev_core import event_files, plugins\n"
         "import numba, pyarrow\n"
-        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024\n"
+        # Not ru_maxrss, which a new process takes over from the one that started it.
+        "peak = lambda: int(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1]) / 1024\n"
         "before, start = peak(), time.perf_counter()\n"
         "total = sum(len(piece) for piece in event_files.read_event_chunks(Path(sys.argv[1])))\n"
         "seconds = time.perf_counter() - start\n"
@@ -194,6 +195,15 @@ def print_memory(name: str, events: Events, gigabytes: float, folder: Path) -> N
 
 def write_large(name: str, path: Path, events: Events, num_bytes: int) -> int:
     """Write the recording again and again until the file has `num_bytes`; returns its size."""
+    if name == "parquet":
+        period = events.duration_us + 1
+        copies = max(1, num_bytes // (4 * len(events)))  # about 4 bytes an event
+        event_files.write_event_chunks_parquet(
+            path,
+            (Events(events.t + copy * period, events.x, events.y, events.p, events.sensor_size)
+             for copy in range(copies)),
+        )  # fmt: skip
+        return path.stat().st_size
     part = path.with_suffix(".part")
     with path.open("wb") as file:
         for content in parts(name, part, events):

@@ -97,8 +97,9 @@ def _open(path: Path) -> Iterator[tuple[pq.ParquetFile, SensorSize]]:
     import pyarrow.parquet as pq
 
     try:
-        # Not read_table: that would take a folder named `key=value` for one more column.
-        with pq.ParquetFile(path, memory_map=True) as file:
+        # Not read_table: that would take a folder named `key=value` for one more column. A map or buffers of the file
+        # would stay in memory as it is read.
+        with pq.ParquetFile(path, memory_map=False, pre_buffer=False) as file:
             got = {field.name: str(field.type) for field in file.schema_arrow}
             expected = {name: np.dtype(dtype).name for name, dtype in EVENT_DTYPES.items()}
             if got != expected or len(file.schema_arrow) != len(expected):
