@@ -139,3 +139,11 @@ def check_ranges(windows: np.ndarray, num_events: int) -> np.ndarray:
         row = int(np.argmax(wrong))
         raise ValueError(f"window {row} must be a range within {num_events} events, got {windows[row].tolist()}")
     return windows
+
+
+def check_order(t: np.ndarray) -> None:
+    """Raise `DataError` where a time stamp is before the one ahead of it."""
+    descending = t[1:] < t[:-1]
+    if descending.any():
+        first = int(np.argmax(descending)) + 1
+        raise DataError(f"t decreases at event {first}: {t[first - 1]} us, then {t[first]} us")

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core import image_geometry
-from ctlev_core.windows import check_ranges
+from ctlev_core.windows import check_order, check_ranges
 from data_contracts.events import Events
 
 VERSION = 1
@@ -42,11 +42,12 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         events is 0. Where several sensor pixels share an image pixel, the newest counts.
     Raises:
         ValueError: a window is not a range of the events.
-        DataError: an event lies outside the sensor.
+        DataError: an event lies outside the sensor, or time stamps go back.
     """
     from ctlev_core import temporal_kernels as kernels
 
     windows = check_ranges(windows, len(events))
+    check_order(events.t)
     width, height = image_geometry.image_size(events.sensor_size, options)
     column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
     num_channels = 2 if options.polarity else 1

@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core import image_geometry
-from ctlev_core.windows import check_ranges
+from ctlev_core.windows import check_order, check_ranges
 from data_contracts.events import Events
 
 VERSION = 1
@@ -40,7 +40,10 @@ class Options(image_geometry.ImageFit):
         "the voxels that are not 0 (E2VID)",
     )
     full_scale: float | None = Field(
-        default=None, gt=0, description="what becomes 255 in the image; the window's own largest value where not given"
+        default=None,
+        gt=0,
+        description="what becomes 255 in the image; where not given, three standard deviations of the window's pixels, "
+        "as DHP19 normalises counts",
     )
 
 
@@ -56,11 +59,12 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         window without events is 0.
     Raises:
         ValueError: a window is not a range of the events.
-        DataError: an event lies outside the sensor.
+        DataError: an event lies outside the sensor, or time stamps go back.
     """
     from ctlev_core import temporal_kernels as kernels
 
     windows = check_ranges(windows, len(events))
+    check_order(events.t)
     width, height = image_geometry.image_size(events.sensor_size, options)
     column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
     is_separate = options.polarity == "separate"
@@ -106,7 +110,8 @@ def _normalise(grid: np.ndarray, options: Options) -> None:
 def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     """Images of the grids: value = min(255, floor(255 v / full scale)), red where positive and blue where negative.
 
-    The bins are added up: of `signed` grids red is the sum of what is positive, blue that of what is negative.
+    The bins are added up: of `signed` grids red is the sum of what is positive, blue that of what is negative. Full
+    scale is three standard deviations (n - 1) of red + blue over the pixels where that is not 0; equal ones are at it.
 
     Args:
         histogram: [N, C, H, W] float32 as `encode` returns it.
@@ -127,13 +132,19 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
             red, blue = np.maximum(grid, 0).sum(axis=0), np.maximum(-grid, 0).sum(axis=0)
         if options.polarity == "discarded":
             red = blue = red + blue
-        largest = max(red.max(initial=0), blue.max(initial=0))
-        full_scale = options.full_scale or (largest if largest > 0 else 1.0)
+        full_scale = options.full_scale or _three_sigma(red if options.polarity == "discarded" else red + blue)
         for channel, values in ((0, red), (2, blue)):
             image[..., channel] = np.minimum(255, np.floor(255.0 * values.astype(np.float64) / full_scale))
         if options.polarity == "discarded":
             image[..., 1] = image[..., 0]
     return images
+
+
+def _three_sigma(magnitudes: np.ndarray) -> float:
+    used = magnitudes[magnitudes > 0].astype(np.float64)
+    sigma = float(used.std(ddof=1)) if len(used) > 1 else 0.0
+    # A lone pixel, and pixels that are all equal, come out white, as in the event histogram.
+    return 3 * sigma if sigma > 0 else float(used.max(initial=0)) or 1.0
 
 
 map_points = image_geometry.map_points

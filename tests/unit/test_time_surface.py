@@ -82,6 +82,11 @@ def test_an_event_outside_the_sensor(position):
         surface_of([(0, 4, 3, 1), (1, *position, 1), (2, *position, 1)])
 
 
+def test_time_stamps_that_go_back():
+    with pytest.raises(DataError, match="t decreases at event 2: 9 us, then 8 us"):
+        surface_of([(0, 0, 0, 1), (9, 0, 0, 1), (8, 0, 0, 1)])
+
+
 def test_a_window_that_is_no_range():
     with pytest.raises(ValueError, match="window 0 must be a range within 1 events"):
         encode(make_events([(0, 0, 0, 1)]), np.array([[0, 2]]), Options())

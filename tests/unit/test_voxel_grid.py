@@ -113,6 +113,11 @@ def test_an_event_outside_the_sensor(position):
         grid_of([(0, 4, 3, 1), (1, *position, 1)])
 
 
+def test_time_stamps_that_go_back():
+    with pytest.raises(DataError, match="t decreases at event 2: 9 us, then 8 us"):
+        grid_of([(0, 0, 0, 1), (9, 0, 0, 1), (8, 0, 0, 1)])
+
+
 def test_a_window_that_is_no_range():
     with pytest.raises(ValueError, match="window 0 must be a range within 1 events"):
         encode(make_events([(0, 0, 0, 1)]), np.array([[0, 2]]), Options())
@@ -129,13 +134,23 @@ def test_scaled_images_keep_every_event_where_its_point_maps_to():
 def test_images_are_red_where_positive_and_blue_where_negative():
     rows = [(0, 0, 0, 1), (0, 0, 0, 1), (0, 1, 0, 0), (0, 2, 0, 1), (0, 2, 0, 0)]
     for polarity, both in (("signed", [0, 0, 0]), ("separate", [127, 0, 127])):
-        options = Options(num_bins=2, polarity=polarity)
+        options = Options(num_bins=2, polarity=polarity, full_scale=2)
         image = render_image(grid_of(rows, **options.model_dump())[None], options)[0]
         assert image[0, :3].tolist() == [[255, 0, 0], [0, 0, 127], both] and image.sum() == 382 + sum(both)
     options = Options(num_bins=2, polarity="discarded", full_scale=4)
     image = render_image(grid_of(rows, **options.model_dump())[None], options)[0]
     assert image[0, :3].tolist() == [[127] * 3, [63] * 3, [127] * 3]
     assert not render_image(grid_of([])[None], Options()).any()
+
+
+def test_full_scale_is_three_standard_deviations_of_the_pixels():
+    rows = [(0, 0, 0, 1)] * 9 + [(0, 1, 0, 0)] * 2 + [(0, 2, 0, 1)] * 4
+    image = render_image(grid_of(rows)[None], Options())[0, 0]
+    full_scale = 3 * np.std([9, 2, 4], ddof=1)
+    nine, two, four = (int(255 * count / full_scale) for count in (9, 2, 4))
+    assert image[:4].tolist() == [[nine, 0, 0], [0, 0, two], [four, 0, 0], [0, 0, 0]]
+    equal = render_image(grid_of([(0, 0, 0, 1), (0, 3, 1, 0)])[None], Options())[0]
+    assert equal[0, 0].tolist() == [255, 0, 0] and equal[1, 3].tolist() == [0, 0, 255]
 
 
 def test_images_of_other_arrays_are_refused():
