@@ -7,12 +7,12 @@ Root and layout as published (the folder of annotations):
         gBR_sBM_cAll_d04_mBR0_ch01.pkl      (smpl_poses [T, 72], smpl_trans [T, 3], smpl_scaling [1], smpl_loss)
       ignore_list.txt                       (motions whose reconstruction is bad; left out)
 
-The files are pickles, read by `ctlev_core.safe_pickle` without running what they may carry. Positions are those of a
+The files are pickles, read by `dataset_files.safe_pickle` without running what they may carry. Positions are those of a
 body `smpl_scaling` times as large as SMPL's, about centimetres: trans / scaling are metres of SMPL's body, as the
 authors' own feature extraction has it. y is up. Shape coefficients are not given: the mean body (zeros) dances.
 
 A motion's name says genre, situation, camera, dancer, music and choreography: the class is the genre, the subject the
-dancer. The moments are seen by a virtual camera (`ctlev_core.pose_sources`), not by one of AIST's nine.
+dancer. The moments are seen by a virtual camera (`ctlev_core.dataset_files.pose_sources`), not by one of AIST's nine.
 
 Source: Li et al., AI Choreographer (AIST++), ICCV 2021 (google.github.io/aistplusplus_dataset;
 github.com/google/aistplusplus_api `aist_plusplus/loader.py`, `demos/extract_motion_feats.py`); Tsuchida et al., AIST
@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.dataset_trees import check_root, list_files, read_lines
-from ctlev_core.pose_sources import PoseSourceOptions, SmplSequence, check_sequence
-from ctlev_core.pose_sources import labels_before_camera as _labels_before_camera
+from ctlev_core.dataset_files.pose_sources import PoseSourceOptions, SmplSequence, check_sequence
+from ctlev_core.dataset_files.pose_sources import labels_before_camera as _labels_before_camera
+from ctlev_core.dataset_files.trees import check_root, list_files, read_lines
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events
@@ -120,7 +120,7 @@ def read_sequence(file: Path) -> SmplSequence:
     Raises:
         DataError: as `read_labels`.
     """
-    from ctlev_core import safe_pickle
+    from ctlev_core.dataset_files import safe_pickle
 
     loaded = safe_pickle.load(file)
     if not isinstance(loaded, dict):

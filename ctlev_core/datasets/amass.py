@@ -17,7 +17,7 @@ hands, which those have as fingers instead: the two hands are straight here (zer
 coefficients are kept; those of SMPL-H, SMPL-X and of the female and male bodies are not quite SMPL's, so shapes are
 plausible ones and not the actors'. Gender and soft tissue (dmpls) are ignored.
 
-AMASS has z up; it is turned to y up, then seen by a virtual camera (`ctlev_core.pose_sources`).
+AMASS has z up; it is turned to y up, then seen by a virtual camera (`ctlev_core.dataset_files.pose_sources`).
 
 Source: Mahmood et al., AMASS, ICCV 2019 (amass.is.tue.mpg.de, own licence); ControlEvents, section 4.3: challenging
 poses from AMASS to sample from.
@@ -33,9 +33,15 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core import array_files
-from ctlev_core.dataset_trees import check_inside, check_root, list_folder, recording_ids
-from ctlev_core.pose_sources import Z_UP_TO_Y_UP, PoseSourceOptions, SmplSequence, check_sequence, move_world
-from ctlev_core.pose_sources import labels_before_camera as _labels_before_camera
+from ctlev_core.dataset_files.pose_sources import (
+    Z_UP_TO_Y_UP,
+    PoseSourceOptions,
+    SmplSequence,
+    check_sequence,
+    move_world,
+)
+from ctlev_core.dataset_files.pose_sources import labels_before_camera as _labels_before_camera
+from ctlev_core.dataset_files.trees import check_inside, check_root, list_folder, recording_ids
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events

@@ -26,9 +26,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from ctlev_core import cdehp_files as files
-from ctlev_core.picture_files import read_grey_pictures
-from ctlev_core.subject_splits import SubjectSplit
+from ctlev_core.dataset_files import cdehp_files as files
+from ctlev_core.dataset_files.picture_files import read_grey_pictures
+from ctlev_core.dataset_files.subject_splits import SubjectSplit
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events

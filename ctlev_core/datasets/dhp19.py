@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from ctlev_core import dhp19_files as files
-from ctlev_core.subject_splits import SubjectSplit
+from ctlev_core.dataset_files import dhp19_files as files
+from ctlev_core.dataset_files.subject_splits import SubjectSplit
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events

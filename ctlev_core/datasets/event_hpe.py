@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import event_hpe_files as files
-from ctlev_core.picture_files import read_grey_pictures
-from ctlev_core.subject_splits import SubjectSplit
+from ctlev_core.dataset_files import event_hpe_files as files
+from ctlev_core.dataset_files.picture_files import read_grey_pictures
+from ctlev_core.dataset_files.subject_splits import SubjectSplit
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events

@@ -36,7 +36,15 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core import event_files
-from ctlev_core.dataset_trees import check_inside, check_root, first_of, list_files, list_folder, read_lines, shuffled
+from ctlev_core.dataset_files.trees import (
+    check_inside,
+    check_root,
+    first_of,
+    list_files,
+    list_folder,
+    read_lines,
+    shuffled,
+)
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events

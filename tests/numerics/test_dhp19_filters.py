@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core import dhp19_filters as filters
+from ctlev_core.dataset_files import dhp19_filters as filters
 
 COLUMNS, ROWS = 4 * 346, 260
 

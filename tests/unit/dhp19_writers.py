@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import scipy.io
 
-from ctlev_core import dhp19_files
+from ctlev_core.dataset_files import dhp19_files
 
 SPECIAL = 0x400
 START = 5_000_000

@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ctlev_core import plugins
+from ctlev_core.dataset_files.pose_sources import REST_PELVIS
 from ctlev_core.datasets import aist
-from ctlev_core.pose_sources import REST_PELVIS
 from data_contracts.config import DatasetChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels

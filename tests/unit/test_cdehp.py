@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from ctlev_core import cdehp_files, plugins
+from ctlev_core import plugins
+from ctlev_core.dataset_files import cdehp_files
 from ctlev_core.datasets import cdehp
 from ctlev_core.plugins import PluginError
 from ctlev_core.skeletons import JOINT_SETS, SMPL_TO_DHP19, joint_indices

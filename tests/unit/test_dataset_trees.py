@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core import dataset_trees
+from ctlev_core.dataset_files import trees
 from data_contracts.errors import DataError
 
 TREE = "expected the tree"
@@ -17,42 +17,42 @@ NAMES = st.lists(st.text("abc01.", min_size=1, max_size=5), unique=True, min_siz
 
 @given(NAMES, st.integers(0, 2**70), st.randoms(use_true_random=False))
 def test_an_order_ignores_the_listing_and_survives_a_lost_file(names, seed, random):
-    order = dataset_trees.shuffled(names, seed, "salt")
+    order = trees.shuffled(names, seed, "salt")
     assert sorted(order) == sorted(names)
     again = random.sample(names, len(names))
-    assert dataset_trees.shuffled(again, seed, "salt") == order
+    assert trees.shuffled(again, seed, "salt") == order
     lost = again.pop()
-    assert dataset_trees.shuffled(again, seed, "salt") == [name for name in order if name != lost]
+    assert trees.shuffled(again, seed, "salt") == [name for name in order if name != lost]
 
 
 def test_orders_depend_on_seed_and_salt_and_are_balanced():
     names = [str(number) for number in range(8)]
-    orders = [dataset_trees.shuffled(names, seed, "a") for seed in range(2000)]
+    orders = [trees.shuffled(names, seed, "a") for seed in range(2000)]
     firsts = [sum(order[0] == name for order in orders) for name in names]
     assert max(firsts) < 2 * min(firsts)  # 250 each if all are alike: a coin this unfair has p < 1e-6
-    assert dataset_trees.shuffled(names, 1, "a", "b") != dataset_trees.shuffled(names, 1, "ab")
+    assert trees.shuffled(names, 1, "a", "b") != trees.shuffled(names, 1, "ab")
 
 
 def test_first_of_takes_all_or_some():
-    assert dataset_trees.first_of("abc", None) == ["a", "b", "c"]
-    assert dataset_trees.first_of("abc", 2) == ["a", "b"] and dataset_trees.first_of("abc", 9) == ["a", "b", "c"]
+    assert trees.first_of("abc", None) == ["a", "b", "c"]
+    assert trees.first_of("abc", 2) == ["a", "b"] and trees.first_of("abc", 9) == ["a", "b", "c"]
 
 
 def test_recording_ids_are_paths_with_underscores(tmp_path):
     paths = [tmp_path / "A" / "B3 - walk (1)_poses.npz", tmp_path / "c.d" / "e.f.npz"]
-    assert dataset_trees.recording_ids(paths, tmp_path) == ["A/B3_-_walk_1__poses", "c.d/e.f"]
+    assert trees.recording_ids(paths, tmp_path) == ["A/B3_-_walk_1__poses", "c.d/e.f"]
     with pytest.raises(
         DataError, match=r"B3_-_walk_1__poses.* would get the recording id .* of .*B3 - walk \(1\)_poses"
     ):
-        dataset_trees.recording_ids([*paths, tmp_path / "A" / "B3_-_walk_1__poses.npz"], tmp_path)
+        trees.recording_ids([*paths, tmp_path / "A" / "B3_-_walk_1__poses.npz"], tmp_path)
 
 
 def test_lines_come_without_blanks_ends_and_byte_order_mark(tmp_path):
     file = tmp_path / "list.txt"
     file.write_bytes("\ufeffone\r\n\n  \ntwo three \nfour".encode())
-    assert dataset_trees.read_lines(file) == [(1, "one"), (4, "two three"), (5, "four")]
+    assert trees.read_lines(file) == [(1, "one"), (4, "two three"), (5, "four")]
     with pytest.raises(DataError, match="cannot be read as text"):
-        dataset_trees.read_lines(tmp_path)
+        trees.read_lines(tmp_path)
 
 
 def is_root(folder: Path) -> bool:
@@ -63,16 +63,16 @@ def test_a_root_is_found_two_levels_away_but_no_home_folder_is_searched(tmp_path
     root = tmp_path / "a" / "b"
     (root / "c" / "d").mkdir(parents=True)
     (root / "mark").touch()
-    assert dataset_trees.check_root(root, TREE, is_root) == root
+    assert trees.check_root(root, TREE, is_root) == root
     for wrong in (tmp_path, tmp_path / "a", root / "c", root / "c" / "d"):
         with pytest.raises(DataError, match=f"the root is {root}; {TREE}"):
-            dataset_trees.check_root(wrong, TREE, is_root)
+            trees.check_root(wrong, TREE, is_root)
     asked = []
-    for number in range(3 * dataset_trees.MAX_SEARCHED):
+    for number in range(3 * trees.MAX_SEARCHED):
         (tmp_path / "home" / f"{number}").mkdir(parents=True)
     with pytest.raises(DataError, match=f"not the expected folder; {TREE}"):
-        dataset_trees.check_root(tmp_path / "home", TREE, lambda folder: bool(asked.append(folder)))
-    assert len(asked) <= dataset_trees.MAX_SEARCHED + 3
+        trees.check_root(tmp_path / "home", TREE, lambda folder: bool(asked.append(folder)))
+    assert len(asked) <= trees.MAX_SEARCHED + 3
 
 
 def test_hidden_entries_are_not_listed_and_links_are_checked(tmp_path):
@@ -80,21 +80,21 @@ def test_hidden_entries_are_not_listed_and_links_are_checked(tmp_path):
     root.mkdir()
     for name in (".hidden", "b.bin", "a.bin", "c.txt"):
         (root / name).touch()
-    assert [path.name for path in dataset_trees.list_folder(root)] == ["a.bin", "b.bin", "c.txt"]
-    assert [path.name for path in dataset_trees.list_files(root, root, ".bin")] == ["a.bin", "b.bin"]
+    assert [path.name for path in trees.list_folder(root)] == ["a.bin", "b.bin", "c.txt"]
+    assert [path.name for path in trees.list_files(root, root, ".bin")] == ["a.bin", "b.bin"]
     (root / "d.bin").symlink_to(root / "a.bin")
-    assert len(dataset_trees.list_files(root, root, ".bin")) == 3
+    assert len(trees.list_files(root, root, ".bin")) == 3
     (tmp_path / "outside.bin").touch()
     (root / "e.bin").symlink_to(tmp_path / "outside.bin")
     with pytest.raises(DataError, match=r"e\.bin: links to .*outside\.bin, outside the dataset folder"):
-        dataset_trees.list_files(root, root, ".bin")
+        trees.list_files(root, root, ".bin")
     (root / "e.bin").unlink()
     (root / "f.bin").symlink_to(root / "gone")
     with pytest.raises(DataError, match=r"f\.bin: a link to nothing"):
-        dataset_trees.list_folder(root)
+        trees.list_folder(root)
 
 
 def test_names_that_cannot_be_part_of_an_id(tmp_path):
-    assert dataset_trees.check_name(tmp_path / "a.b-c_1") == "a.b-c_1"
+    assert trees.check_name(tmp_path / "a.b-c_1") == "a.b-c_1"
     with pytest.raises(DataError, match="expected a name of letters, digits"):
-        dataset_trees.check_name(tmp_path / "two words")
+        trees.check_name(tmp_path / "two words")

@@ -10,8 +10,9 @@ import pytest
 import scipy.io
 from dhp19_writers import busy, matrix, write_aedat, write_vicon
 
-from ctlev_core import dhp19_files, plugins
+from ctlev_core import plugins
 from ctlev_core.camera import project
+from ctlev_core.dataset_files import dhp19_files
 from ctlev_core.datasets import dhp19
 from ctlev_core.plugins import PluginError
 from data_contracts.config import DatasetChoice, cache_material

@@ -132,7 +132,9 @@ def test_a_folder_inside_a_class_folder(root):
     assert_refused(root, "day_1: a folder inside a class folder")
 
 
-@pytest.mark.parametrize("content", [b"", b"walking, first take\n", b"% evt 2.1\n"], ids=["empty", "text", "unknown version"])
+@pytest.mark.parametrize(
+    "content", [b"", b"walking, first take\n", b"% evt 2.1\n"], ids=["empty", "text", "unknown version"]
+)
 def test_a_file_no_format_recognises(content, root):
     (root / "car" / "notes.raw").write_bytes(content)
     assert_refused(root, r"notes\.raw: not an event file of a known format", shows_tree=False)

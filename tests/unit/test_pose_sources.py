@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.camera import Camera, is_inside, project
-from ctlev_core.pose_sources import (
+from ctlev_core.dataset_files.pose_sources import (
     REST_PELVIS,
     Z_UP_TO_Y_UP,
     PoseSourceOptions,

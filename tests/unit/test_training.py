@@ -177,7 +177,7 @@ def test_min_snr_weights_follow_the_definition():
 
 
 def test_a_network_that_predicts_the_latents_is_weighted_like_one_that_predicts_v():
-    """|v - v'|^2 = (snr + 1) |x - x'|^2 at the same noisy latents, so equal networks have equal losses up to the cap."""
+    """|v - v'|^2 = (snr + 1) |x - x'|^2 at the same noisy latents: equal networks have equal losses up to the cap."""
     schedule = NoiseSchedule({**shared_prior().scheduler_config, "prediction_type": "sample"})
     latents, noise = torch.randn(2, 3, 4, 4), torch.randn(2, 3, 4, 4)
     assert torch.equal(schedule.noised(latents, noise, torch.tensor([10, 800]))[1], latents)

@@ -88,6 +88,25 @@ def test_many_events_on_one_pixel_lose_none():
     assert grid_of(rows, polarity="discarded")[0, 1, 1] == 2**16 + 1
 
 
+@pytest.mark.parametrize("polarity", ["signed", "separate"])
+def test_short_and_long_windows_leave_nothing_behind(polarity):
+    # 5 x 90 x 100 cells: the short windows copy what they touch, the long one everything.
+    rng = np.random.default_rng(0)
+    size = (100, 90)
+    rows = sorted(zip(*(rng.integers(0, n, 9000).tolist() for n in (10**6, *size, 2)), strict=True))
+    events, options = make_events(rows, size), Options(polarity=polarity)
+    windows = np.array([[0, 100], [100, 9000], [8900, 9000], [50, 50], [50, 51]])
+    together = encode(events, windows, options)
+    for window, grid in zip(windows, together, strict=True):
+        part = events.slice(*window)
+        touched = np.zeros(size[::-1], bool)
+        touched[part.y, part.x] = True
+        assert not grid[:, ~touched].any()
+        total = np.where(part.p, 1, -1 if polarity == "signed" else 1).sum()
+        assert grid.sum(dtype=float) == pytest.approx(total, abs=1e-3)
+        assert (encode(events, window[None], options)[0] == grid).all()
+
+
 def test_windows_have_their_own_time():
     rows = [(t, 0, 0, 1) for t in (0, 10, 500, 510)]
     grids = encode(make_events(rows), np.array([[0, 2], [2, 4]]), Options(num_bins=2))

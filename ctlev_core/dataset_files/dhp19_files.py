@@ -90,7 +90,7 @@ def read_stream(path: Path, num_vicon_rows: int, filters: bool) -> Stream:
     x, y = width - 1 - x.astype(np.int64), height - 1 - y.astype(np.int64)
     keep = np.ones(len(stamp), np.bool_)
     if filters:
-        from ctlev_core.dhp19_filters import keep_events
+        from ctlev_core.dataset_files.dhp19_filters import keep_events
 
         keep = keep_events(width * channel.astype(np.int64) + x, y, stamp)
     return Stream(

@@ -1,8 +1,8 @@
 """Pickle and joblib files of datasets, read without running the code they may carry.
 
 `pickle.load` and `joblib.load` call whatever function a file names. Here a file may hold plain data and NumPy arrays
-alone (see `ctlev_core.plain_unpickler`); anything else is a `DataError` that names it, and was not called. Python 2
-files are read with their byte strings as latin-1 text, as is usual for them. Arrays come in the machine's byte order.
+alone (see `plain_unpickler`); anything else is a `DataError` that names it, and was not called. Python 2 files
+are read with their byte strings as latin-1 text, as is usual for them. Arrays come in the machine's byte order.
 
 Source of the joblib layout: `joblib.numpy_pickle`: a pickle in which each array is a small wrapper object, followed at
 once by its raw bytes; since joblib 1.2 with padding before them.
@@ -21,8 +21,8 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from ctlev_core.bounded_reader import BoundedReader
-from ctlev_core.plain_unpickler import NDARRAY, Marker, PlainUnpickler, array_of, count_bytes, dtype_of
+from ctlev_core.dataset_files.bounded_reader import BoundedReader
+from ctlev_core.dataset_files.plain_unpickler import NDARRAY, Marker, PlainUnpickler, array_of, count_bytes, dtype_of
 from data_contracts.errors import DataError
 
 MAX_BYTES = 4 * 2**30
