@@ -240,28 +240,52 @@ def full_scales(histogram: np.ndarray, scales: np.ndarray) -> None:
     pixel it is 0, so that a lone event comes out white, like equal counts. A window without events gets the floor.
 
     Args:
-        histogram: [N, C, H, W] uint16.
+        histogram: [N, C, H, W] uint16, C = 1 or 2, contiguous.
         scales: [N] float64, filled.
     """
     num_windows, num_channels, height, width = histogram.shape
+    num_cells = height * width
+    counts = np.empty(num_cells, np.int64)
     for window in range(num_windows):
+        channels = histogram[window].reshape(num_channels, num_cells)
         num_pixels, total = 0, 0
-        for row in range(height):
-            for column in range(width):
-                count = 0
-                for channel in range(num_channels):
-                    count += histogram[window, channel, row, column]
-                num_pixels += count > 0
-                total += count
+        for pixel in range(num_cells):
+            count = np.int64(channels[0, pixel])
+            if num_channels == 2:
+                count += np.int64(channels[1, pixel])
+            counts[num_pixels] = count
+            # A pixel without events is overwritten by the next.
+            num_pixels += count > 0
+            total += count
         mean = total / max(num_pixels, 1)
         # Around the mean in a second pass: with sums of squares the difference of two large numbers would be left.
         deviation = 0.0
-        for row in range(height):
-            for column in range(width):
-                count = 0
-                for channel in range(num_channels):
-                    count += histogram[window, channel, row, column]
-                if count > 0:
-                    deviation += (count - mean) ** 2
+        for count in counts[:num_pixels]:
+            deviation += (count - mean) ** 2
         sigma = np.sqrt(deviation / max(num_pixels - 1, 1))
         scales[window] = 3.0 * max(sigma, 0.1 / 255.0)
+
+
+@njit(cache=True, nogil=True)
+def draw(histogram: np.ndarray, scales: np.ndarray, images: np.ndarray) -> None:
+    """Counts to grey levels, floor(255 count / scale), at most 255: red = first channel, blue = last.
+
+    Args:
+        histogram: [N, C, H, W] uint16, C = 1 or 2.
+        scales: [N] float64, positive.
+        images: [N, H, W, 3] uint8, zeros on entry; all three channels are alike where C = 1.
+    """
+    num_windows, num_channels, height, width = histogram.shape
+    num_cells = height * width
+    for window in range(num_windows):
+        counts = histogram[window].reshape(num_channels, num_cells)
+        values = images[window].reshape(num_cells, 3)
+        for channel in range(num_channels):
+            for pixel in range(num_cells):
+                count = counts[channel, pixel]
+                if count == 0:
+                    continue
+                value = np.uint8(min(255.0, np.floor(255.0 * count / scales[window])))
+                values[pixel, 2 * channel] = value
+                if num_channels == 1:
+                    values[pixel, 1] = values[pixel, 2] = value

@@ -19,6 +19,7 @@ def add_to_bins(
     negative_start: int,
     negative_weight: float,
     scratch: np.ndarray,
+    touched: np.ndarray,
     grids: np.ndarray,
 ) -> int:
     """Share each event between the two temporal bins around it.
@@ -34,15 +35,18 @@ def add_to_bins(
         num_bins: bins between the first and the last event of a window, both included.
         negative_start: cell where the bins of negative events start; 0 where both polarities share theirs.
         negative_weight: what a negative event adds; a positive one adds 1.
-        scratch: [cells] float64, overwritten: sums of many small numbers would lose digits in 32 bits.
-        grids: [N, cells] float32, filled; the cells are those of [C, H, W].
+        scratch: [cells] float64, zeros: sums of many small numbers would lose digits in 32 bits.
+        touched: [M] int64, overwritten. Of windows with at most M / 2 events only the cells they touch are copied and
+            cleared.
+        grids: [N, cells] float32, zeros on entry, filled; the cells are those of [C, H, W].
     Returns:
         Index of the first event outside the sensor, where the sum stopped; -1 if there is none.
     """
     bin_size = len(scratch) // num_bins if negative_start == 0 else negative_start // num_bins
     for window in range(len(windows)):
         start, stop = windows[window]
-        scratch[:] = 0.0
+        is_sparse = 2 * (stop - start) <= len(touched)
+        num_touched = 0
         span = t[stop - 1] - t[start] if stop > start else 0
         # Without a span all events are at the first bin's centre.
         per_us = (num_bins - 1) / span if span > 0 else 0.0
@@ -60,10 +64,21 @@ def add_to_bins(
             if p[event] == 0:
                 cell += negative_start
                 weight = negative_weight
+            # In the last bin nothing is left to share: the second cell is the first once more.
+            next_cell = cell + bin_size if lower + 1 < num_bins else cell
             scratch[cell] += weight * (1.0 - share)
-            if lower + 1 < num_bins:
-                scratch[cell + bin_size] += weight * share
-        grids[window] = scratch
+            scratch[next_cell] += weight * share
+            if is_sparse:
+                touched[num_touched], touched[num_touched + 1] = cell, next_cell
+                num_touched += 2
+        if is_sparse:
+            for cell in touched[:num_touched]:
+                grids[window, cell] = scratch[cell]
+            for cell in touched[:num_touched]:
+                scratch[cell] = 0.0
+        else:
+            grids[window] = scratch
+            scratch[:] = 0.0
     return -1
 
 

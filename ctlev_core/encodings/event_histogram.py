@@ -143,16 +143,11 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     channels = 2 if options.polarity else 1
     if histogram.ndim != 4 or histogram.shape[1] != channels or histogram.dtype != np.uint16:
         raise ValueError(f"histogram must be [N, {channels}, H, W] uint16, got {histogram.shape} {histogram.dtype}")
-    values = np.empty(histogram.shape, np.uint8)
-    for window, full_scale in enumerate(_full_scales(histogram, options)):
-        # A few counts make a whole image: scale each possible count once, then look the pixels up.
-        possible = np.arange(int(histogram[window].max(initial=0)) + 1)
-        values[window] = np.minimum(255, np.floor(255.0 * possible / full_scale)).astype(np.uint8)[histogram[window]]
+    from ctlev_core import histogram as kernels
+
+    histogram = np.ascontiguousarray(histogram)
     images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
-    images[..., 0] = values[:, 0]
-    images[..., 2] = values[:, -1]
-    if not options.polarity:
-        images[..., 1] = values[:, 0]
+    kernels.draw(histogram, _full_scales(histogram, options), images)
     return images
 
 

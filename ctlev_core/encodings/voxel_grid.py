@@ -69,8 +69,10 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
     column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
     is_separate = options.polarity == "separate"
     num_channels = options.num_bins * (2 if is_separate else 1)
-    scratch = np.empty(num_channels * height * width)
-    grids = np.empty((len(windows), scratch.size), np.float32)
+    scratch = np.zeros(num_channels * height * width)
+    longest = (windows[:, 1] - windows[:, 0]).max(initial=0)
+    touched = np.empty(min(2 * longest, scratch.size // 8), np.int64)
+    grids = np.zeros((len(windows), scratch.size), np.float32)
     outside = kernels.add_to_bins(
         events.t,
         events.x,
@@ -83,6 +85,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         options.num_bins * height * width if is_separate else 0,
         -1.0 if options.polarity == "signed" else 1.0,
         scratch,
+        touched,
         grids,
     )
     image_geometry.check_inside(events, outside)
