@@ -97,7 +97,9 @@ class Summary:
 
 
 def summarise_events(events: Events) -> Summary:
-    """The numbers of a recording; see the head of this file. About 0.2 us an event and 0.1 us a pixel.
+    """The numbers of a recording; see the head of this file.
+
+    Takes 0.3 to 1 us an event, the more the larger the sensor.
 
     Args:
         events: N events, checked; a stretch of a recording that is too long gives numbers of that stretch.

@@ -15,10 +15,10 @@ from data_contracts import tables
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
-MAX_EVENTS = 2_000_000
+MAX_EVENTS = 500_000
 """Of a longer recording the middle stretch of so many events."""
-MAX_RECORDINGS = 100
-"""Of a larger split so many, evenly spread."""
+MAX_RECORDINGS = 40
+"""Of a larger split so many, evenly spread; with `MAX_EVENTS` this takes at most half a minute."""
 MAX_FRAMES = 1000
 """Of a larger set of frames so many, evenly spread."""
 
