@@ -22,7 +22,7 @@ def find_format(path: Path) -> ModuleType:
     of numbers, ATIS records) recognise what is merely plausible; they are asked only where no signature is found.
 
     Raises:
-        DataError: no such file; no format recognises it, then the message lists the known formats; or several do, then
+        DataError: no such file, or not to be read; no format recognises it, then the message lists the known formats; or several do, then
             it names them.
     """
     if not path.is_file():
@@ -30,7 +30,10 @@ def find_format(path: Path) -> ModuleType:
     formats = {name: plugins.load("formats", name) for name in plugins.names("formats")}
     for has_signature in (True, False):
         asked = [name for name in formats if getattr(formats[name], "HAS_SIGNATURE", True) == has_signature]
-        claims = [name for name in asked if formats[name].sniff(path)]
+        try:
+            claims = [name for name in asked if formats[name].sniff(path)]
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read: {error}") from error
         if len(claims) > 1:
             raise DataError(f"{path}: could be any of the formats {', '.join(claims)}; expected exactly one to fit")
         if claims:

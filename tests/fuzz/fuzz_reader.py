@@ -41,7 +41,7 @@ def check_reader(module: ModuleType, path: Path) -> bool:
             from the whole.
     """
     others = [plugins.load("formats", name) for name in plugins.names("formats")]
-    claims = [other.__name__ for other in others if getattr(other, "HAS_SIGNATURE", True) and other.sniff(path)]
+    claims = [other.__name__ for other in others if other.sniff(path) and getattr(other, "HAS_SIGNATURE", True)]
     if len(claims) > 1:
         raise Failure(f"claimed by {', '.join(claims)}")
     whole = _attempt(module, lambda: [module.read(path)])

@@ -155,6 +155,16 @@ def test_real_recordings_in_pieces(file, tmp_path):
     assert_same(event_files.read_events_file(tmp_path / "a.parquet"), events)
 
 
+def test_a_file_that_cannot_be_read_is_a_data_error(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError("no permission")
+
+    monkeypatch.setattr(plugins.load("formats", "evt2"), "sniff", refuse)
+    (tmp_path / "a.raw").write_bytes(b"x")
+    with pytest.raises(DataError, match=r"a\.raw: cannot be read: no permission"):
+        event_files.find_format(tmp_path / "a.raw")
+
+
 # Pieces ------------------------------------------------------------------------------------------------------------
 
 

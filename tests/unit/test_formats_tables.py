@@ -1,53 +1,21 @@
-"""Formats that are tables (npy, npz, HDF5, text), written with NumPy, h5py and plain string formatting."""
+"""NumPy arrays and archives of events, and what all tables share: units, types, polarities."""
 
 from __future__ import annotations
 
 import io
 import pickle
 import zipfile
-from decimal import Decimal
 from fractions import Fraction
-from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from format_helpers import P, T, X, Y, assert_events, raises_both_ways, read_both_ways
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.recfunctions import repack_fields
 
-from ctlev_core import event_files, event_pieces, event_tables, plugins
+from ctlev_core import event_files, event_tables
 from data_contracts.errors import DataError
-from data_contracts.events import Events
-
-T = [0, 5, 5, 1_000_003]
-X = [0, 345, 3, 7]
-Y = [1, 2, 259, 0]
-P = [1, 0, 0, 1]
-
-
-def assert_events(events: Events, t=T, x=X, y=Y, p=P) -> None:
-    assert [events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist()] == [list(t), x, y, p]
-
-
-def read_both_ways(path: Path) -> Events:
-    """Found by content, read whole and in pieces of three, which must agree."""
-    module = event_files.find_format(path)
-    events = module.read(path)
-    pieces = list(module.read_chunks(path, 3))
-    assert all(len(piece) == 3 for piece in pieces[:-1])
-    joined = event_pieces.concatenate(pieces)
-    assert_events(joined, events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist())
-    assert joined.sensor_size == events.sensor_size
-    return events
-
-
-def raises_both_ways(path: Path, match: str) -> None:
-    module = event_files.find_format(path)
-    with pytest.raises(DataError, match=match):
-        module.read(path)
-    with pytest.raises(DataError, match=match):
-        list(module.read_chunks(path, 3))
 
 
 def structured(dtypes: str = "<i8 <u2 <u2 |u1", names: str = "t x y p", p=P, t=T) -> np.ndarray:
@@ -232,182 +200,3 @@ def test_a_damaged_npz_is_an_error(tmp_path):
     damaged[len(content) // 3] ^= 0x55
     path.write_bytes(damaged)
     raises_both_ways(path, r"a\.npz: ")
-
-
-# HDF5 --------------------------------------------------------------------------------------------------------------
-
-
-def write_dsec(path: Path, columns: dict | None = None, offset: int | None = 49_599_300_523) -> Path:
-    columns = columns or {
-        "t": np.array(T, "u4"),
-        "x": np.array(X, "u2"),
-        "y": np.array(Y, "u2"),
-        "p": np.array(P, "u1"),
-    }
-    with h5py.File(path, "w") as file:
-        for name, values in columns.items():
-            file.create_dataset(f"events/{name}", data=values, compression="gzip", chunks=(2,))
-        file["ms_to_idx"] = np.searchsorted(T, np.arange(1001) * 1000).astype("u8")
-        if offset is not None:
-            file["t_offset"] = np.int64(offset)
-    return path
-
-
-def test_hdf5_of_dsec_adds_its_offset(tmp_path):
-    events = read_both_ways(write_dsec(tmp_path / "a.h5"))
-    assert_events(events, [49_599_300_523 + t for t in T])
-    assert_events(read_both_ways(write_dsec(tmp_path / "b.h5", offset=None)))
-
-
-@pytest.mark.parametrize("missing", "txyp")
-def test_hdf5_names_the_missing_column(missing, tmp_path):
-    columns = {"t": T, "x": X, "y": Y, "p": P}
-    del columns[missing]
-    raises_both_ways(write_dsec(tmp_path / "a.h5", columns), rf"a\.h5: group events: no column {missing} .*; got ")
-
-
-def test_hdf5_columns_of_different_lengths_or_types(tmp_path):
-    path = write_dsec(tmp_path / "a.h5", {"t": T[:-1], "x": X, "y": Y, "p": P})
-    raises_both_ways(path, "columns must be .* of one length")
-    path = write_dsec(tmp_path / "b.h5", {"t": np.array(["a"] * 4, "S1"), "x": X, "y": Y, "p": P})
-    raises_both_ways(path, "column t: expected numbers")
-
-
-def write_mvsec(path: Path) -> Path:
-    rows = np.stack([X, Y, 1.5e9 + np.array(T) / 1e6, np.array(P) * 2.0 - 1], 1)
-    with h5py.File(path, "w") as file:
-        file["davis/left/events"] = rows
-        file["davis/right/events"] = rows[:2]
-        file["davis/left/image_raw"] = np.zeros((2, 3))
-    return path
-
-
-def test_hdf5_of_mvsec_is_seconds_and_the_left_camera(tmp_path):
-    path = write_mvsec(tmp_path / "a.hdf5")
-    seconds = 1.5e9 + np.array(T) / 1e6
-    expected = [round(Fraction(float(value)) * 10**6) for value in seconds]
-    assert_events(read_both_ways(path), expected)
-    assert len(plugins.load("formats", "hdf5").read(path, camera="right")) == 2
-    with h5py.File(path, "a") as file:
-        del file["davis/left/events"]
-    raises_both_ways(path, "no dataset davis/left/events; davis has left, right")
-
-
-def test_hdf5_without_events_or_cut_is_an_error(tmp_path):
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        file["images"] = np.zeros(3)
-    raises_both_ways(path, "no events: expected the datasets x, y, t, p .*; the root has images")
-    content = write_dsec(path).read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-    raises_both_ways(path, "not a complete HDF5 file")
-
-
-def test_hdf5_filter_that_is_not_installed_says_what_to_install(tmp_path):
-    path = tmp_path / "a.h5"
-    write_dsec(path)
-    with h5py.File(path, "a") as file:
-        del file["events/t"]
-        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        properties.set_chunk((4,))
-        properties.set_filter(40_000, h5py.h5z.FLAG_OPTIONAL, (1, 2))  # a number nobody registered
-        space = h5py.h5s.create_simple((4,))
-        dataset = h5py.h5d.create(file["events"].id, b"t", h5py.h5t.NATIVE_INT64, space, properties)
-        dataset.write_direct_chunk((0,), np.array(T).tobytes())
-    raises_both_ways(path, "compressed with a filter that is not installed; pip install hdf5plugin")
-
-
-def test_hdf5_with_a_shape_and_no_values_is_an_error(tmp_path):
-    path = write_dsec(tmp_path / "a.h5", {"t": T, "x": X, "y": Y})
-    with h5py.File(path, "a") as file:
-        file["events"].create_dataset("p", shape=(1 << 50,), dtype="u1", chunks=(1 << 20,))
-        for name in "txy":
-            del file[f"events/{name}"]
-            file[f"events/{name}"] = file["events/p"]
-    raises_both_ways(path, "column [txyp]: .* values declared, 0 bytes stored")
-
-
-def test_hdf5_of_dsec_as_it_is_compressed(tmp_path):
-    hdf5plugin = pytest.importorskip("hdf5plugin")
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        for name, values in zip("txyp", (T, X, Y, P), strict=True):
-            file.create_dataset(f"events/{name}", data=values, **hdf5plugin.Blosc(cname="zstd"))
-    assert_events(read_both_ways(tmp_path / "a.h5"))
-
-
-# Text --------------------------------------------------------------------------------------------------------------
-
-SECONDS = "".join(f"{t / 1e6:.9f} {x} {y} {p}\n" for t, x, y, p in zip(T, X, Y, P, strict=True))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        SECONDS,
-        SECONDS.removesuffix("\n"),
-        SECONDS.replace("\n", "\r\n"),
-        SECONDS.replace(" ", ","),
-        "# t x y p\n\n" + SECONDS.replace(" ", " ; "),
-        "\ufefft,x,y,p\n" + SECONDS.replace(" ", ", "),
-        "".join(f"{t / 1e6:.18e}\t{x:.6e} {y}.0 {p}e0\n" for t, x, y, p in zip(T, X, Y, P, strict=True)),
-        "".join(f"{t} {x} {y} {2 * p - 1}\n" for t, x, y, p in zip(T, X, Y, P, strict=True)),
-        "polarity,Timestamp,row,col,extra\n"
-        + "".join(f"{bool(p)},{t},{y},{x},word\n" for t, x, y, p in zip(T, X, Y, P, strict=True)),
-    ],
-)
-def test_text_in_many_styles(text, tmp_path):
-    path = tmp_path / "events.txt"
-    path.write_text(text, encoding="utf-8", newline="")
-    events = read_both_ways(path)
-    assert_events(events)
-    assert events.sensor_size == (346, 260)
-
-
-@settings(max_examples=150, deadline=None)
-@example(Decimal("8.3757164552060269014E-7"), "f")
-@example(Decimal("5.000000000000000000E-7"), "e")
-@example(Decimal("5.0000000000000000001E-7"), "f")
-@given(st.decimals(0, 9 * 10**11, allow_nan=False, allow_infinity=False), st.sampled_from(["f", "e"]))
-def test_text_seconds_are_rounded_exactly(tmp_path_factory, value, style):
-    path = tmp_path_factory.mktemp("text") / "a.txt"
-    text = format(value, style)
-    path.write_text(f"{text}{'' if '.' in text or 'e' in text else '.'} 1 2 0\n")
-    expected = int((Decimal(text) * 10**6).quantize(Decimal(1))) if abs(value) > 0 else 0
-    assert plugins.load("formats", "csv").read(path).t.tolist() == [expected]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("0.1 1 2 1\n0.2 1 2\n", "row at byte 10: 3 fields, expected 4, got '0.2 1 2'"),
-        ("0.1 1 2 1\n0.2 1 2 1 7\n", "more than the expected 4 fields"),
-        ("0.1 1 2 1\n0.2 1 a 1\n", "field 3 is not a number"),
-        ("0.1 1 2 1\n0.2 1.5 2 1\n", "field 2 is not a whole number"),
-        ("0.1 1 2 1\n99999999999999999999 1 2 1\n", "field 1 is too large"),
-        ("0.1 1 2 1\n0.05 1 2 1\n", "t decreases at event 1: 100000 us, then 50000 us"),
-        ("-0.1 1 2 1\n", "t .* whole number from 0"),
-        ("nan 1 2 1\n", "not an event file"),
-        ("t,x,y\n1,2,3\n", "no column p"),
-        ("t,x,y,p\n", "no events, and nothing else tells the sensor size"),
-        ("# sensor_size 20x10\n0.1 20 2 1\n", "x must be below 20, got 20 at event 0"),
-        ("# sensor_size 20x10\n0.1 19 10 1\n", "y must be below 10, got 10 at event 0"),
-        ("dear reader, this is no table of events\n", "not an event file"),
-        ("1 2 3\n", "not an event file"),
-    ],
-)
-def test_wrong_text_names_the_row(text, message, tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text(text)
-    with pytest.raises(DataError, match=message):
-        event_files.read_events_file(path)
-
-
-def test_text_is_parsed_the_same_across_blocks(tmp_path, monkeypatch):
-    module = plugins.load("formats", "csv")
-    monkeypatch.setattr(module, "_BLOCK_BYTES", 37)
-    path = tmp_path / "a.txt"
-    path.write_text(SECONDS)
-    assert_events(read_both_ways(path))
-    path.write_text("0.1 1 2 1\n" + "0" * 100 + "1 1 2 1\n")
-    with pytest.raises(DataError, match="a line of more than 37 bytes"):
-        module.read(path)

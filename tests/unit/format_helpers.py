@@ -1,0 +1,40 @@
+"""What the tests of tables of events share: four events, and reading a file whole and in pieces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ctlev_core import event_files, event_pieces
+from data_contracts.errors import DataError
+from data_contracts.events import Events
+
+T = [0, 5, 5, 1_000_003]
+X = [0, 345, 3, 7]
+Y = [1, 2, 259, 0]
+P = [1, 0, 0, 1]
+
+
+def assert_events(events: Events, t=T, x=X, y=Y, p=P) -> None:
+    assert [events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist()] == [list(t), x, y, p]
+
+
+def read_both_ways(path: Path) -> Events:
+    """Found by content, read whole and in pieces of three, which must agree."""
+    module = event_files.find_format(path)
+    events = module.read(path)
+    pieces = list(module.read_chunks(path, 3))
+    assert all(len(piece) == 3 for piece in pieces[:-1])
+    joined = event_pieces.concatenate(pieces)
+    assert_events(joined, events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist())
+    assert joined.sensor_size == events.sensor_size
+    return events
+
+
+def raises_both_ways(path: Path, match: str) -> None:
+    module = event_files.find_format(path)
+    with pytest.raises(DataError, match=match):
+        module.read(path)
+    with pytest.raises(DataError, match=match):
+        list(module.read_chunks(path, 3))
