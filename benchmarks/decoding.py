@@ -169,7 +169,7 @@ def compare(columns: list[np.ndarray], events: Events) -> str:
     for name, column in zip(COLUMNS, columns, strict=True):
         error = np.abs(np.asarray(column).astype(np.int64) - getattr(events, name).astype(np.int64))
         if error.any():
-            problems.append(f"{name} wrong in {np.count_nonzero(error) / len(events):.0%}, by up to {error.max():,}")
+            problems.append(f"{name} differs in {np.count_nonzero(error) / len(events):.1%}, by up to {error.max():,}")
     return "; ".join(problems) or "exact"
 
 

@@ -22,8 +22,8 @@ def find_format(path: Path) -> ModuleType:
     of numbers, ATIS records) recognise what is merely plausible; they are asked only where no signature is found.
 
     Raises:
-        DataError: no such file, or not to be read; no format recognises it, then the message lists the known formats; or several do, then
-            it names them.
+        DataError: no such file, or not to be read; no format recognises it, then the message lists the known formats;
+            or several do, then it names them.
     """
     if not path.is_file():
         raise DataError(f"{path}: expected an event file, got {'a folder' if path.is_dir() else 'nothing there'}")
