@@ -1,14 +1,17 @@
-"""What the tests of tables of events share: four events, and reading a file whole and in pieces."""
+"""What the tests of event files share: making events, and reading a file whole and in pieces."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ctlev_core import event_files, event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
+
+SIZE = (640, 480)
 
 T = [0, 5, 5, 1_000_003]
 X = [0, 345, 3, 7]
@@ -38,3 +41,15 @@ def raises_both_ways(path: Path, match: str) -> None:
         module.read(path)
     with pytest.raises(DataError, match=match):
         list(module.read_chunks(path, 3))
+
+
+def make_events(rows: list[tuple[int, int, int, int]], sensor_size: tuple[int, int] = SIZE) -> Events:
+    """Rows of (t, x, y, p) as events."""
+    t, x, y, p = np.array(rows, np.int64).reshape(-1, 4).T
+    return Events(t.copy(), x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8), sensor_size)
+
+
+def to_rows(events: Events) -> list[tuple[int, int, int, int]]:
+    return list(
+        zip(events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True)
+    )  # fmt: skip
