@@ -71,10 +71,11 @@ def read_events_range(path: Path, start: int, stop: int) -> Events:
     Raises:
         DataError: no such file or another format, or a range that does not lie in the recording.
     """
-    module = find_format(path)
-    if not hasattr(module, "read_range"):
-        raise DataError(f"{path}: only parts of Parquet files can be read, got {module.__name__.rsplit('.', 1)[-1]}")
-    return module.read_range(path, start, stop)
+    parquet = plugins.load("formats", "parquet")
+    if not path.is_file() or not parquet.sniff(path):
+        other = find_format(path).__name__.rsplit(".", 1)[-1]
+        raise DataError(f"{path}: only parts of Parquet files can be read, got {other}")
+    return parquet.read_range(path, start, stop)
 
 
 def write_events_parquet(path: Path, events: Events) -> None:
