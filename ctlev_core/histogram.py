@@ -1,12 +1,11 @@
 """The loops behind the event histogram, compiled.
 
-What limits them was measured on one core of an AMD EPYC (Zen 4, 3.65 GHz; benchmarks/encoding.py prints it anew):
+What limits them was measured on one core of an AMD EPYC (Zen 4, 3.65 GHz; benchmarks/encoding.py measures it anew):
 incrementing random cells of a histogram that fits the first-level cache takes 1.05 cycles an event, of one in the
-second-level cache 3.0 cycles, whatever the width of a cell; computing cell numbers takes 0.7. Reading the 5 bytes of an
-event takes 0.6. So cell numbers are computed for a block of events at once, which the compiler vectorises, and blocks
-are small, so that the processor overlaps the next block's arithmetic with this block's cache misses. A second copy of
-the histogram, against increments that wait for one another on a busy pixel, gained nothing; sorting events into pieces
-that fit the first-level cache costs more than it saves.
+second-level cache 2 to 3, whatever the width of a cell; computing cell numbers takes 0.7, reading an event's 5 bytes
+0.6. So cell numbers are computed for a block of events at once, which the compiler vectorises. A second copy of the
+histogram, against increments that wait for one another on a busy pixel, gained nothing, nor did large memory pages or
+tiles of pixels; sorting events into pieces that fit the first-level cache costs as much as it saves.
 """
 
 from __future__ import annotations
