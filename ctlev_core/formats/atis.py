@@ -23,7 +23,7 @@ from data_contracts.events import Events, SensorSize, check_events
 VERSION = 1
 SUFFIXES = (".bin",)
 HAS_SIGNATURE = False
-"""Nothing marks the file: it is recognised by times that do not descend, and only where no other format is."""
+"""Nothing marks the file: it is recognised by times that ascend, and only where no other format is."""
 
 SENSORS: tuple[SensorSize, ...] = ((34, 34), (240, 180), (304, 240))
 
@@ -35,9 +35,10 @@ _TEXT = bytes([9, 10, 13, *range(32, 127)])
 
 
 def sniff(path: Path) -> bool:
-    """Do the first records read as events: rows of the sensor, and times that advance and never descend?
+    """Do the first records read as events: rows of the sensor, and times that advance and hardly ever descend?
 
-    Among fewer than 16 records that proves little; then the suffix has to be `.bin` too.
+    One descent among a hundred is let pass here, so that `read` can name it; bytes of other files give one every other
+    time. Fewer than 16 records prove little: then none may descend, and the suffix has to be `.bin` too.
     """
     size = path.stat().st_size
     if size == 0 or size % _RECORD_BYTES:
@@ -51,7 +52,7 @@ def sniff(path: Path) -> bool:
     t = (records[:, 2] & 0x7F) << 16 | records[:, 3] << 8 | records[:, 4]
     t += _OVERFLOW_US * np.cumsum(rows == _OVERFLOW_ROW)
     t = t[rows != _OVERFLOW_ROW]
-    if rows.max() > _OVERFLOW_ROW or len(t) == 0 or (t[1:] < t[:-1]).any():
+    if rows.max() > _OVERFLOW_ROW or len(t) == 0 or np.count_nonzero(t[1:] < t[:-1]) * 100 > len(t):
         return False
     return t[-1] > t[0] if len(records) >= _NUM_CERTAIN else path.suffix.lower() in SUFFIXES
 

@@ -182,6 +182,10 @@ def test_atis_is_recognised_by_plausible_times_alone(tmp_path):
     ):
         path.write_bytes(content)
         assert not module.sniff(path)
+    times[1000] = times[999] - 1  # one slip is for `read` to name
+    write_atis(path, [(t, 5, 6, 1) for t in times])
+    with pytest.raises(DataError, match="t decreases at event 1000"):
+        event_files.read_events_file(path)
     few = write_atis(tmp_path / "few.bin", [(0, 5, 200, 1)])
     assert module.sniff(few)
     assert not module.sniff(few.rename(tmp_path / "few.dat"))
