@@ -23,7 +23,7 @@ import argparse
 import importlib.util
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,7 +143,7 @@ def check(result: np.ndarray, events: Events, ranges: np.ndarray, name: str) -> 
         raise RuntimeError(f"{name} counts differently in {int((result != expected).sum())} cells")
 
 
-def keep(windows, ranges: np.ndarray, events: Events) -> np.ndarray:
+def keep(windows: Iterator[np.ndarray], ranges: np.ndarray, events: Events) -> np.ndarray:
     """Collect the windows of a generator in one new array."""
     width, height = events.sensor_size
     kept = np.empty((len(ranges), 2, height, width), np.uint16)
@@ -152,7 +152,7 @@ def keep(windows, ranges: np.ndarray, events: Events) -> np.ndarray:
     return kept
 
 
-def drop(windows) -> None:
+def drop(windows: Iterator[np.ndarray]) -> None:
     """Look at the windows of a generator, one after the other."""
     for _ in windows:
         pass
@@ -164,14 +164,14 @@ def _cells(events: Events, start: int, stop: int, dtype: type) -> np.ndarray:
     return ((1 - part.p.astype(dtype)) * height + part.y) * width + part.x
 
 
-def bincount(events: Events, ranges: np.ndarray):
+def bincount(events: Events, ranges: np.ndarray) -> Iterator[np.ndarray]:
     """One np.bincount of flat cell numbers a window."""
     num_cells = 2 * events.sensor_size[0] * events.sensor_size[1]
     for start, stop in ranges.tolist():
         yield np.bincount(_cells(events, start, stop, np.int64), minlength=num_cells)
 
 
-def torch_index_add(events: Events, ranges: np.ndarray):
+def torch_index_add(events: Events, ranges: np.ndarray) -> Iterator[np.ndarray]:
     """One torch index_add_ of ones a window."""
     import torch
 
@@ -183,7 +183,7 @@ def torch_index_add(events: Events, ranges: np.ndarray):
         yield counts.index_add_(0, cells, torch.ones(stop - start, dtype=torch.int32)).numpy()
 
 
-def add_at(events: Events, ranges: np.ndarray):
+def add_at(events: Events, ranges: np.ndarray) -> Iterator[np.ndarray]:
     """The plain NumPy loop."""
     width, height = events.sensor_size
     for start, stop in ranges.tolist():
@@ -193,9 +193,11 @@ def add_at(events: Events, ranges: np.ndarray):
         yield counts
 
 
-def tonic_to_frame(events: Events, ranges: np.ndarray, method: str):
+def tonic_to_frame(
+    events: Events, ranges: np.ndarray, method: str
+) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """The transform of tonic and the array of records it takes; making that is not timed."""
-    from tonic.transforms import ToFrame
+    from tonic.transforms import ToFrame  # pyright: ignore[reportMissingImports]
 
     counted = events.slice(0, int(ranges[-1, 1])) if method == "7,500 events" else events
     records = np.zeros(len(counted), [("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", np.int8)])
@@ -233,7 +235,7 @@ def read_columns(events: Events) -> None:
 
 
 @njit(nogil=True)
-def _read(words: np.ndarray) -> int:
+def _read(words: np.ndarray) -> np.uint64:
     total = np.uint64(0)
     for i in range(len(words)):
         total += words[i]
