@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -85,25 +86,24 @@ def slow_evt3(words: list[int]) -> list[tuple[int, int, int, int]]:  # noqa: C90
     return rows
 
 
-def decode(encoding: str, words: list[int]) -> list[tuple[int, int, int, int]]:
-    """The compiled decoder without the checks of `read`, for words in any order."""
+def decode(encoding: str, words: list[int], block: int = 1 << 30) -> list[tuple[int, int, int, int]]:
+    """The compiled decoder without the checks of `read`, for words in any order; `block` words at a time."""
     array = np.array(words, prophesee.WORD_DTYPES[encoding])
     own_state = getattr(prophesee_decoding, f"{encoding}_STATE")
     state = np.array([0] * record_files.NUM_SHARED + list(own_state), np.int64)
-    count = prophesee_decoding.count_evt3(array) if encoding == "EVT3" else len(array)
-    t, x, y, p = (np.empty(count, dtype) for dtype in (np.int64, np.uint16, np.uint16, np.uint8))
-    written = getattr(prophesee_decoding, f"decode_{encoding.lower()}")(array, state, t, x, y, p)
-    assert written <= count
-    events = Events(t[:written], x[:written], y[:written], p[:written], SIZE)
-    if written:  # what the decoder says of its events is what spares a check of each
-        went_back = bool((events.t[1:] < events.t[:-1]).any() or events.t[0] < 0)
-        assert state[: record_files.NUM_SHARED].tolist() == [
-            t[written - 1],
-            went_back,
-            x[:written].max(),
-            y[:written].max(),
-        ]
-    return to_rows(events)
+    rows: list[tuple[int, int, int, int]] = []
+    for start in range(0, len(array), block):
+        part = array[start : start + block]
+        count = prophesee_decoding.count_evt3(part) if encoding == "EVT3" else len(part)
+        t, x, y, p = (np.empty(count, dtype) for dtype in (np.int64, np.uint16, np.uint16, np.uint8))
+        written = getattr(prophesee_decoding, f"decode_{encoding.lower()}")(part, state, t, x, y, p)
+        assert written <= count
+        rows += to_rows(Events(t[:written], x[:written], y[:written], p[:written], SIZE))
+    if rows:  # what the decoder says of its events is what spares a check of each
+        t, x, y, _ = (list(column) for column in zip(*rows, strict=True))
+        went_back = t[0] < 0 or any(late < early for early, late in pairwise(t))
+        assert state[: record_files.NUM_SHARED].tolist() == [t[-1], went_back, max(x), max(y)]
+    return rows
 
 
 @needs_real
@@ -186,6 +186,18 @@ def test_evt3_equals_the_slow_decoder_on_any_words(start, pairs):
 def test_evt2_equals_the_slow_decoder_on_any_words(start, pairs):
     words = start + [kind << 28 | payload for kind, payload in pairs]
     assert decode("EVT2", words) == slow_evt2(words)
+
+
+@pytest.mark.parametrize("encoding", ["EVT2", "EVT3"])
+@settings(max_examples=100, deadline=None)
+@given(
+    pairs=st.lists(st.tuples(st.sampled_from([0, 1, 2, 3, 4, 5, 6, 8]), st.integers(0, 4095)), max_size=30),
+    size=st.integers(1, 7),
+)
+def test_any_words_decode_the_same_in_blocks_of_any_size(encoding, pairs, size):
+    shift, start = (28, [0x80000000]) if encoding == "EVT2" else (12, [0x8000, 0x0000, 0x3000])
+    words = start + [kind << shift | payload for kind, payload in pairs]
+    assert decode(encoding, words, size) == decode(encoding, words)
 
 
 # Writers -----------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctlev_core import event_files, event_pieces, plugins
+from ctlev_core import event_files, event_pieces, plugins, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -32,6 +32,12 @@ def read_both_ways(path: Path, name: str) -> Events:
     assert to_rows(event_pieces.concatenate(pieces)) == to_rows(events)
     assert all(piece.sensor_size == events.sensor_size for piece in pieces)
     return events
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are decoded two records at a time, so that every state is carried from block to block."""
+    monkeypatch.setattr(record_files, "_SMALLEST_BLOCK", 2)
 
 
 def raises_both_ways(path: Path, name: str, match: str) -> None:
