@@ -125,7 +125,7 @@ class Encoding(Protocol):
     Options: type[Frozen]
 
     def encode(self, events: Events, windows: np.ndarray, options: Any) -> np.ndarray:
-        """Counts [N, C, H, W] uint16 of the event index ranges `windows` [N, 2] int64."""
+        """[N, C, H, W] of the event index ranges `windows` [N, 2] int64: uint16 counts, or float32."""
         ...
 
     def render_image(self, histogram: np.ndarray, options: Any) -> np.ndarray:

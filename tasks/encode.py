@@ -26,7 +26,8 @@ from tasks.stage import Output, stage
 
 MAX_EVENTS = 1 << 24
 """Events held at a time: 0.2 GiB."""
-MAX_WINDOWS = 128
+MAX_WINDOWS = 64
+"""Frames made at a time: the pages of large new arrays cost more than the counting in them."""
 GREY_SCALE = 256
 """Counts that a grey value of 1 becomes, so that averages keep their fractions."""
 

@@ -21,7 +21,7 @@ from data_contracts.manifest import MANIFEST_FILE, ManifestRef, read_manifest
 # The report's digest covers the time each stage took.
 DETERMINISTIC = (
     "ingest", "encode", "condition_frames", "condition_samples", "finetune", "sample", "train_downstream",
-    "score_model", "score_distance",
+    "score_model", "score_distance", "realism",
 )  # fmt: skip
 
 
