@@ -24,7 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core import event_files, plugins, prophesee
+from ctlev_core import event_files, plugins
+from ctlev_core.format_files import prophesee
 from data_contracts.events import Events
 
 REAL = Path(__file__).resolve().parents[1].parent / "shared" / "real" / "events"

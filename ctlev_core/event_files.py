@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 
-from ctlev_core import event_pieces, plugins
+from ctlev_core import plugins
+from ctlev_core.format_files import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

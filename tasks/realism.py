@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core import event_files, realism_distances
-from ctlev_core.realism import AXES, Summary, summarise_events, summarise_frames
+from ctlev_core import event_files
+from ctlev_core.realism import distances
+from ctlev_core.realism.summary import AXES, Summary, summarise_events, summarise_frames
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.manifest import Manifest
@@ -34,7 +35,7 @@ def realism(out: Output, recordings: Manifest, frames: Manifest, synthetic: Mani
     rows, distributions = _compare("events", "train", "test", sets, recordings.ref.digest)
     sets = {"real": _summarise_frames(frames), "synthetic": _summarise_frames(synthetic)}
     more_rows, more_distributions = _compare("frames", "real", "synthetic", sets, synthetic.ref.digest)
-    schema = realism_distances.DISTRIBUTIONS
+    schema = distances.DISTRIBUTIONS
     out.write_table(pa.Table.from_pylist(distributions + more_distributions, schema.arrow()), schema)
     return pa.Table.from_pylist(rows + more_rows, schema=tables.SCORES.arrow())
 
@@ -65,9 +66,9 @@ def _compare(
     group: str, first: str, second: str, sets: dict[str, list[Summary]], data_digest: str
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows of the table and of the distributions: two sets, their distances, and the floor of the first."""
-    found = {name: realism_distances.estimate_numbers(summaries) for name, summaries in sets.items()}
-    found[f"{second} against {first}"] = realism_distances.estimate_distances(sets[first], sets[second])
-    found[f"{first} against {first}"] = realism_distances.estimate_floor(sets[first])
+    found = {name: distances.estimate_numbers(summaries) for name, summaries in sets.items()}
+    found[f"{second} against {first}"] = distances.estimate_distances(sets[first], sets[second])
+    found[f"{first} against {first}"] = distances.estimate_floor(sets[first])
     sizes = {name: len(summaries) for name, summaries in sets.items()}
     rows = [
         {
@@ -93,6 +94,6 @@ def _compare(
 def _distribution_rows(group: str, setting: str, summaries: Sequence[Summary]) -> list[dict[str, Any]]:
     return [
         {"group": group, "setting": setting, "axis": axis, "centre": float(centre), "share": float(share)}
-        for axis, shares in realism_distances.mean_distributions(summaries).items()
+        for axis, shares in distances.mean_distributions(summaries).items()
         for centre, share in zip(AXES[axis].centres, shares, strict=True)
     ]

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.intervals import MIN_RECORDINGS, bootstrap_interval
-from ctlev_core.realism_distances import DISTRIBUTIONS
+from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.report.html import Curves, ImageGrid, Section, Table, render_report
 from ctlev_core.report.realism import realism_sections
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict

@@ -32,7 +32,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import array_files
 from ctlev_core.dataset_files.pose_sources import (
     Z_UP_TO_Y_UP,
     PoseSourceOptions,
@@ -42,6 +41,7 @@ from ctlev_core.dataset_files.pose_sources import (
 )
 from ctlev_core.dataset_files.pose_sources import labels_before_camera as _labels_before_camera
 from ctlev_core.dataset_files.trees import check_inside, check_root, list_folder, recording_ids
+from ctlev_core.format_files import array_files
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.realism import AXES
+from ctlev_core.realism.summary import AXES
 from ctlev_core.report.html import Curves, Section, Table
 
 _HOW_TO_READ = (

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pyarrow.parquet as pq
 
-from ctlev_core.realism import summarise_frames
-from ctlev_core.realism_distances import DISTRIBUTIONS
+from ctlev_core.realism.distances import DISTRIBUTIONS
+from ctlev_core.realism.summary import summarise_frames
 from data_contracts.manifest import ManifestRef, read_manifest
 
 

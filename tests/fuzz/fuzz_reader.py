@@ -22,7 +22,8 @@ from types import ModuleType
 
 import numpy as np
 
-from ctlev_core import event_pieces, plugins
+from ctlev_core import plugins
+from ctlev_core.format_files import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 
@@ -41,7 +42,7 @@ def check_reader(module: ModuleType, path: Path) -> bool:
         Failure: several formats claim the file, another exception than DataError, wrong events, or pieces that differ
             from the whole.
     """
-    record_files = importlib.import_module("ctlev_core.record_files")
+    record_files = importlib.import_module("ctlev_core.format_files.record_files")
     record_files._SMALLEST_BLOCK = 3  # so that small files cross from block to block
     others = [plugins.load("formats", name) for name in plugins.names("formats")]
     claims = [other.__name__ for other in others if other.sniff(path) and getattr(other, "HAS_SIGNATURE", True)]

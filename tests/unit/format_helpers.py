@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctlev_core import event_files, event_pieces
+from ctlev_core import event_files
+from ctlev_core.format_files import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

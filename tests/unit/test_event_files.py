@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core import event_files, event_pieces, plugins
+from ctlev_core import event_files, plugins
+from ctlev_core.format_files import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

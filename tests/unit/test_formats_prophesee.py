@@ -11,7 +11,8 @@ from format_helpers import make_events, to_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core import event_files, plugins, prophesee, prophesee_decoding, record_files
+from ctlev_core import event_files, plugins
+from ctlev_core.format_files import prophesee, prophesee_decoding, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

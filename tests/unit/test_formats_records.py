@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctlev_core import event_files, event_pieces, plugins, record_files
+from ctlev_core import event_files, plugins
+from ctlev_core.format_files import event_pieces, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.recfunctions import repack_fields
 
-from ctlev_core import event_files, event_tables
+from ctlev_core import event_files
+from ctlev_core.format_files import event_tables
 from data_contracts.errors import DataError
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.realism import AXES, HOT_MIN_EVENTS, RADIUS_US, summarise_events, summarise_frames
+from ctlev_core.realism.summary import AXES, HOT_MIN_EVENTS, RADIUS_US, summarise_events, summarise_frames
 from data_contracts.events import Events
 
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import wasserstein_distance
 
-from ctlev_core.realism import AXES, Summary
-from ctlev_core.realism_distances import (
+from ctlev_core.realism.distances import (
     Estimate,
     estimate_distances,
     estimate_floor,
@@ -19,6 +18,7 @@ from ctlev_core.realism_distances import (
     mean_distributions,
     wasserstein,
 )
+from ctlev_core.realism.summary import AXES, Summary
 
 BINS = AXES["interval"].num_bins
 SHARES = st.lists(st.integers(0, 9), min_size=6, max_size=6).filter(any).map(lambda n: np.array(n) / sum(n))

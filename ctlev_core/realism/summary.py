@@ -28,7 +28,7 @@ from 26 of 255 on, so that the faint rest that a decoder leaves does not count):
     distributions           `value` of the active pixels
 
 Numbers that are not defined for a recording (no events, no time) are left out there. Sets of recordings are compared in
-`realism_distances`.
+`realism.distances`.
 
 Sources: the isolated events are those that a background activity filter drops (Delbruck, Frame-free dynamic digital
 vision, 2008; there an event needs support from before it alone).
@@ -104,7 +104,7 @@ def summarise_events(events: Events) -> Summary:
     Args:
         events: N events, checked; a stretch of a recording that is too long gives numbers of that stretch.
     """
-    from ctlev_core import realism_kernels as kernels
+    from ctlev_core.realism import kernels
 
     if len(events) == 0:
         return Summary()

@@ -19,7 +19,7 @@ def decode_atis(
 
     Args:
         content: [5 R] uint8.
-        state: [5] int64, see `ctlev_core.record_files`; own part: what markers have added so far, microseconds.
+        state: [5] int64, see `record_files`; own part: what markers have added so far, microseconds.
         t: [R] int64, filled, as the other columns.
         x: [R] uint16, filled.
         y: [R] uint16, filled.

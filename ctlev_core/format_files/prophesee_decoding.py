@@ -1,4 +1,4 @@
-"""The loops over EVT 2.0, EVT 3.0 and DAT words, compiled. `ctlev_core.prophesee` is the way in.
+"""The loops over EVT 2.0, EVT 3.0 and DAT words, compiled. `ctlev_core.format_files.prophesee` is the way in.
 
 Words before the first TIME_HIGH carry no time, EVT3 events before the first row or vector base no position: they are
 skipped, as Prophesee's own decoders do. So are triggers and reserved types (some cameras pad with 0x9999).
@@ -24,7 +24,7 @@ UNKNOWN = -(1 << 62)  # so far below 0 that no number of vectors makes a base of
 EVT2_STATE = (0, UNKNOWN)
 EVT3_STATE = (0, UNKNOWN, 0, UNKNOWN, UNKNOWN, 0)
 DAT_STATE = (0, 0)
-"""What the decoders' own parts of the state start as, see `ctlev_core.record_files`."""
+"""What the decoders' own parts of the state start as, see `record_files`."""
 
 _BLOCK = 8192
 _LOWEST_BIT = np.array([(value & -value).bit_length() - 1 if value else 0 for value in range(1 << 12)], np.uint8)
@@ -56,7 +56,7 @@ def decode_evt2(
 
     Args:
         words: [W] uint32.
-        state: [6] int64, see `ctlev_core.record_files`; own part: overflows, last TIME_HIGH.
+        state: [6] int64, see `record_files`; own part: overflows, last TIME_HIGH.
         t: [W] int64, filled, as the other columns.
         x: [W] uint16, filled.
         y: [W] uint16, filled.
@@ -129,7 +129,7 @@ def decode_evt3(  # noqa: C901 one branch a word type
 
     Args:
         words: [W] uint16.
-        state: [10] int64, see `ctlev_core.record_files`; own part: overflows, TIME_HIGH, TIME_LOW, row, vector base,
+        state: [10] int64, see `record_files`; own part: overflows, TIME_HIGH, TIME_LOW, row, vector base,
             its polarity.
         t: [M] int64, filled; M is at least `count_evt3(words)`, as for the other columns.
         x: [M] uint16, filled; a vector that runs past 16 bits is clipped, so that the check of the sensor size sees it.
@@ -183,7 +183,7 @@ def decode_dat(items: np.ndarray, state: np.ndarray, t: np.ndarray, x: np.ndarra
 
     Args:
         items: [2 R] uint32.
-        state: [6] int64, see `ctlev_core.record_files`; own part: overflows, last clock.
+        state: [6] int64, see `record_files`; own part: overflows, last clock.
         t: [R] int64, filled, as the other columns.
         x: [R] uint16, filled.
         y: [R] uint16, filled.

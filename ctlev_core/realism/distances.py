@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core.intervals import MIN_RECORDINGS
-from ctlev_core.realism import AXES, Summary
+from ctlev_core.realism.summary import AXES, Summary
 from data_contracts.tables import Column, TableSchema
 
 DISTRIBUTIONS = TableSchema(
@@ -33,7 +33,7 @@ DISTRIBUTIONS = TableSchema(
     (
         Column("group", pa.string(), "events or frames"),
         Column("setting", pa.string(), "which set of recordings or frames"),
-        Column("axis", pa.string(), "what is distributed (ctlev_core.realism.AXES)"),
+        Column("axis", pa.string(), "what is distributed (ctlev_core.realism.summary.AXES)"),
         Column("centre", pa.float64(), "middle of the bin, in the unit of the axis"),
         Column("share", pa.float64(), "share of the bin, mean over recordings", minimum=0, maximum=1.000001),
     ),
