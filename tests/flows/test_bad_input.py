@@ -23,11 +23,17 @@ def refused(home, *arguments, preset="folder"):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("--preset", "nonesuch"), "unknown preset 'nonesuch'; known: demo, folder, smoke"),
+        (
+            ("--preset", "nonesuch"),
+            "unknown preset 'nonesuch'; known: cdehp, demo, dhp19, event_hpe, folder, n_caltech101, n_imagenet, smoke",
+        ),
         (("--set", "nonesuch=1"), "unknown option 'nonesuch'; known: name,"),
         (("--set", "windows.num_events=0"), "option 'windows.num_events': input should be greater than 0, got 0"),
         (("--set", "dataset.options.colour=red"), "datasets 'studio': unknown option 'colour'; known: "),
-        (("--set", "dataset.name=dhp91"), "unknown plug-in 'dhp91' in datasets; known: folder, studio"),
+        (
+            ("--set", "dataset.name=dhp91"),
+            "unknown plug-in 'dhp91' in datasets; known: aist, amass, cdehp, dhp19, event_hpe, folder, ",
+        ),
         (("--set", "generator.options.num_steps=many"), "generators 'controlnet': option 'num_steps'"),
         (("--set", "sampling.num_inference_steps=0"), "option 'num_inference_steps': input should be greater"),
         (("--set", "novalue"), "--set expects key=value, got 'novalue'"),
