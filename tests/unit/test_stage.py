@@ -171,7 +171,7 @@ def test_unknown_plugin_in_an_argument_is_refused():
         """Names a plug-in."""
         return curve([0])
 
-    with pytest.raises(PluginError, match="unknown plug-in 'nonesuch' in datasets; known: folder"):
+    with pytest.raises(PluginError, match="unknown plug-in 'nonesuch' in datasets; known: aist, amass, cdehp"):
         run(uses, dataset=DatasetChoice(name="nonesuch"))
 
 
