@@ -113,9 +113,12 @@ def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str
     summary, sizes = event_files.Summary(), set()
 
     def watched(pieces: Iterable[Events]) -> Iterator[Events]:
-        for piece in pieces:
-            sizes.add(piece.sensor_size)
-            yield piece
+        # Only a recording that takes long gets a bar of its own.
+        with tqdm(desc=recording.recording_id, unit="event", unit_scale=True, delay=5, leave=False, disable=None) as bar:
+            for piece in pieces:
+                sizes.add(piece.sensor_size)
+                yield piece
+                bar.update(len(piece))
 
     if finished.exists():  # by an earlier run that was interrupted
         for piece in watched(event_files.read_event_chunks(finished)):
