@@ -114,8 +114,8 @@ def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str
 
     def watched(pieces: Iterable[Events]) -> Iterator[Events]:
         # Only a recording that takes long gets a bar of its own.
-        name = recording.recording_id
-        with tqdm(desc=name, unit="event", unit_scale=True, delay=5, leave=False, disable=None) as bar:
+        label = recording.recording_id
+        with tqdm(desc=label, unit="event", unit_scale=True, delay=5, leave=False, disable=None) as bar:
             for piece in pieces:
                 sizes.add(piece.sensor_size)
                 yield piece
