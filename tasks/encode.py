@@ -24,8 +24,10 @@ from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, concat_labels, label_columns, labels_of
 from tasks.stage import Output, stage
 
-MAX_EVENTS = 1 << 24
-"""Events held at a time: 0.2 GiB."""
+MAX_EVENTS = 1 << 22
+"""Events held at a time; with what reading them takes, 0.2 GiB."""
+MAX_GAP = 1 << 18
+"""Events between two windows that are read rather than skipped."""
 MAX_WINDOWS = 64
 """Frames made at a time: the pages of large new arrays cost more than the counting in them."""
 GREY_SCALE = 256
@@ -160,11 +162,13 @@ def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iter
 
 
 def _groups(ranges: np.ndarray) -> Iterator[np.ndarray]:
-    """Consecutive windows that are encoded together: few, and spanning few events unless a window alone has more."""
+    """Consecutive windows that are encoded together: few, close, and of few events unless a window alone has more."""
     first = 0
+    skips = np.flatnonzero(ranges[1:, 0] - ranges[:-1, 1] > MAX_GAP) + 1
     while first < len(ranges):
         fitting = int(np.searchsorted(ranges[:, 1], ranges[first, 0] + MAX_EVENTS, side="right"))
-        last = min(max(fitting, first + 1), first + MAX_WINDOWS)
+        skip = int(np.append(skips, len(ranges))[np.searchsorted(skips, first, side="right")])
+        last = min(max(fitting, first + 1), first + MAX_WINDOWS, skip)
         yield np.arange(first, last)
         first = last
 

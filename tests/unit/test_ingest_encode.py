@@ -181,6 +181,7 @@ def test_recordings_larger_than_what_is_held_give_the_same_frames(frames_of, mon
     expected = [whole.array(name).copy() for name in ("histograms", "frames")], whole.table.drop_columns("joints3d_mm")
     monkeypatch.setattr("tasks.encode.MAX_EVENTS", 10)
     monkeypatch.setattr("tasks.encode.MAX_WINDOWS", 2)
+    monkeypatch.setattr("tasks.encode.MAX_GAP", 3)
     monkeypatch.setattr(encode, "version", 10**6)  # not the cached artefact
     _, pieces = frames_of(make_dataset(), windows=windows)
     for name, array in zip(("histograms", "frames"), expected[0], strict=True):
