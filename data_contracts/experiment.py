@@ -32,6 +32,9 @@ class Experiment(Frozen):
     data_notice: str = Field("", description="first line of the report: what data this is")
     seed: int = Field(0, ge=0, description="seed of conditions, fine-tuning and sampling")
     dataset: DatasetChoice
+    poses: DatasetChoice | None = Field(
+        None, description="another dataset whose poses (recordings of split `condition`) are sampled from instead"
+    )
     windows: Windows = Windows()
     encoding: EncodingChoice
     condition: ConditionChoice
@@ -53,5 +56,5 @@ class Experiment(Frozen):
     def choices(self) -> list[Any]:
         """Every plug-in the experiment names."""
         chosen = [self.dataset, self.encoding, self.condition, self.generator, self.sampling_choice, self.downstream]
-        extractor = [self.feature_extractor] if self.feature_extractor else []
-        return [*chosen, *extractor, *self.metrics]
+        optional = [choice for choice in (self.poses, self.feature_extractor) if choice]
+        return [*chosen, *optional, *self.metrics]

@@ -37,7 +37,11 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         seed=experiment.seed,
         label=f"{experiment.condition.name}, training",
     )
+    poses = recordings
+    if experiment.poses is not None:
+        poses = ingest(dataset=experiment.poses, label=f"{experiment.poses.name}, poses")
     sample_conditions = condition_samples(
+        poses,
         recordings,
         frames,
         condition=experiment.condition,

@@ -8,9 +8,11 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.body.virtual_camera import with_joints
 from ctlev_core.plugins import Plugin
 from data_contracts import tables
 from data_contracts.config import ConditionChoice, EncodingChoice
+from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, label_columns, labels_of
 from tasks.stage import Output, stage
@@ -31,6 +33,7 @@ def condition_frames(
 @stage(version=2, schema=tables.CONDITIONS)
 def condition_samples(
     out: Output,
+    poses: Manifest,
     recordings: Manifest,
     frames: Manifest,
     *,
@@ -41,11 +44,14 @@ def condition_samples(
 ) -> pa.Table:
     """Choose `count` labels to sample from and render them.
 
-    They come from the label-only recordings (split `condition`: poses no frame was trained on) where the dataset has
+    They come from the label-only recordings of `poses` (split `condition`: poses no frame was trained on) where it has
     such, and otherwise from the training frames. Classes take turns; within a class the order is random, and starts
-    over when it is used up.
+    over when it is used up. `poses` are the recordings of the experiment or those of another dataset; bodies without 2D
+    joints are seen by a virtual camera.
     """
-    names, subjects, labels = _label_only(recordings, frames, encoding)
+    names, subjects, labels = _label_only(poses, recordings, frames, encoding)
+    if not names and poses.ref.key != recordings.ref.key:
+        raise DataError(f"{poses.ref.path}: the dataset of poses has no recording in split 'condition'")
     if not names:
         rows = frames.rows_where(split="train")
         names = [frames.column("sample_id")[row] for row in rows]
@@ -72,20 +78,23 @@ def balanced_choice(class_names: tuple[str, ...], count: int, seed: int) -> np.n
 
 
 def _label_only(
-    recordings: Manifest, frames: Manifest, encoding: EncodingChoice
+    poses: Manifest, recordings: Manifest, frames: Manifest, encoding: EncodingChoice
 ) -> tuple[list[str], list[str], Labels]:
-    """Every label moment of the recordings in split `condition`, in image pixels."""
-    wanted = set(np.array(recordings.column("recording_id"))[recordings.rows_where(splits="condition")].tolist())
-    table = recordings.attached(tables.LABELS)
+    """Every label moment of the recordings of `poses` in split `condition`, in image pixels."""
+    wanted = set(np.array(poses.column("recording_id"))[poses.rows_where(splits="condition")].tolist())
+    table = poses.attached(tables.LABELS)
     table = table.filter(pa.array([name in wanted for name in table["recording_id"].to_pylist()], pa.bool_()))
     times = table["t_us"].to_pylist()
     names = [f"{name}:{t_us}" for name, t_us in zip(table["recording_id"].to_pylist(), times, strict=True)]
     labels = labels_of(table)
+    # A label-only recording has no sensor of its own: its labels are in the frame of the dataset's sensor.
+    with_events = recordings.table.to_pylist()
+    size = next((r["sensor_width_px"], r["sensor_height_px"]) for r in with_events if r["sensor_width_px"])
+    joint_set = frames.labels.joint_set
+    if names and joint_set and labels.joints2d is None:
+        labels = with_joints(labels, size, joint_set)
     if labels.joints2d is not None:
         plugin = plugins.load_options(encoding)
-        # A label-only recording has no sensor of its own: its labels are in the frame of the dataset's sensor.
-        with_events = recordings.table.to_pylist()
-        size = next((r["sensor_width_px"], r["sensor_height_px"]) for r in with_events if r["sensor_width_px"])
         mapped = plugin.module.map_points(labels.joints2d, size, plugin.options).astype(np.float32)
         labels = replace(labels, joints2d=mapped)
     return names, table["subject"].to_pylist(), labels

@@ -1,0 +1,69 @@
+"""Bodies of SMPL parameters before a virtual camera."""
+
+import numpy as np
+import pytest
+
+from ctlev_core.body.layer import joint_transforms, load_body
+from ctlev_core.body.rotations import matrix_from_axis_angle
+from ctlev_core.body.virtual_camera import FOCAL_PER_SIDE, with_joints
+from ctlev_core.skeletons import JOINT_SETS, SMPL_TO_DHP19
+from data_contracts.errors import DataError
+from data_contracts.labels import Labels, check_labels
+
+SENSOR = (346, 260)
+
+
+def labels_of(pose, transl, betas=None):
+    count = len(pose)
+    return Labels(
+        ("walk",) * count,
+        np.arange(count, dtype=np.int64),
+        smpl_pose=np.asarray(pose, np.float32),
+        smpl_betas=np.zeros((count, 10), np.float32) if betas is None else betas.astype(np.float32),
+        smpl_transl=np.asarray(transl, np.float32),
+    )
+
+
+def facing():
+    """Upright in a T pose, the face to the camera: turned by pi about x, from y up to y down."""
+    pose = np.zeros((1, 72))
+    pose[0, 0] = np.pi
+    return pose
+
+
+def test_a_person_who_faces_the_camera_has_the_left_hand_on_the_right_of_the_picture():
+    labels = check_labels(with_joints(labels_of(facing(), [[0, 0, 3]]), SENSOR, "dhp19"), "test")
+    assert labels.joints2d is not None and labels.visible is not None
+    at = dict(zip(JOINT_SETS["dhp19"].joints, labels.joints2d[0], strict=True))
+    assert at["left_hand"][0] > SENSOR[0] / 2 > at["right_hand"][0]
+    assert at["head"][1] < at["left_hip"][1] < at["left_foot"][1]
+    assert labels.visible.all()
+    height = at["left_foot"][1] - at["head"][1]
+    assert 0.4 * SENSOR[1] < height < 0.9 * SENSOR[1]
+
+
+def test_joints_are_those_of_each_rows_own_body():
+    random = np.random.default_rng(0)
+    pose, transl = random.normal(0, 0.4, (6, 72)), random.uniform(-0.3, 0.3, (6, 3)) + np.array([0.0, 0.0, 4.0])
+    betas = np.repeat(random.normal(0, 1, (2, 10)), 3, axis=0)[[0, 3, 1, 4, 2, 5]]
+    labels = with_joints(labels_of(pose, transl, betas), SENSOR, "dhp19")
+    assert labels.joints2d is not None and labels.joints3d is not None
+    focal = FOCAL_PER_SIDE * 260
+    for row in range(6):
+        rotations = matrix_from_axis_angle(pose[row].astype(np.float32).reshape(1, 24, 3))
+        _, joints = joint_transforms(load_body(), rotations, betas[row], transl[row : row + 1])
+        x, y, z = joints[0, list(SMPL_TO_DHP19)].T
+        expected = np.stack([focal * x / z + 173, focal * y / z + 130], axis=1)
+        np.testing.assert_allclose(labels.joints2d[row], expected, atol=1e-2)  # float32 parameters, hundreds of px
+        np.testing.assert_allclose(labels.joints3d[row], 1000 * np.stack([x, y, z], axis=1), atol=1e-2)
+
+
+def test_a_body_behind_the_camera_is_not_seen():
+    labels = check_labels(with_joints(labels_of(facing(), [[0, 0, -3]]), SENSOR, "smpl"), "test")
+    assert labels.joints2d is not None and labels.visible is not None
+    assert np.isnan(labels.joints2d).all() and not labels.visible.any()
+
+
+def test_labels_without_a_body_are_an_error():
+    with pytest.raises(DataError, match="neither joints nor SMPL parameters"):
+        with_joints(Labels(("walk",), np.zeros(1, np.int64)), SENSOR, "dhp19")
