@@ -15,6 +15,7 @@ from data_contracts.manifest import read_manifest
 from tasks.condition import condition_frames
 from tasks.encode import encode
 from tasks.ingest import ingest
+from tasks.realism import realism
 from tasks.store import Store
 
 SENSOR = (32, 24)
@@ -187,3 +188,9 @@ def test_recordings_larger_than_what_is_held_give_the_same_frames(frames_of, mon
     for name, array in zip(("histograms", "frames"), expected[0], strict=True):
         np.testing.assert_array_equal(pieces.array(name), array)
     assert pieces.table.drop_columns("joints3d_mm").equals(expected[1]), "without a column of NaN, which equals nothing"
+
+
+def test_recordings_without_events_have_no_event_numbers_in_the_realism_table(frames_of):
+    recordings, frames = frames_of(make_dataset(images=True), polarity=False)
+    made = read_manifest(run_stage(realism, recordings=recordings.ref, frames=frames.ref, synthetic=frames.ref))
+    assert set(made.column("group")) == {"frames"}
