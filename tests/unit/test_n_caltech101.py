@@ -128,7 +128,8 @@ def test_only_the_zero_shot_classes_are_sampled_and_none_of_them_is_learnt(root,
     text = ConditionChoice(name="text")
     learnt = run_stage(condition_frames, recordings=recordings, frames=frames, condition=text, seed=0)
     asked = {"encoding": encoding, "count": 6, "seed": 0}
-    sampled = run_stage(condition_samples, recordings=recordings, frames=frames, condition=text, **asked)
+    both = {"poses": recordings, "recordings": recordings, "frames": frames}
+    sampled = run_stage(condition_samples, **both, condition=text, **asked)
     names = [set(read_manifest(manifest).column("prompt")) for manifest in (learnt, sampled)]
     assert names[0] == {"A photo of accordion", "A photo of crocodile head"}
     assert names[1] == {"A photo of bonsai", "A photo of ferry"}
