@@ -31,6 +31,18 @@ class Camera:
         return replace(self, K=K, image_size=(round(width * factor), round(height * factor)))
 
 
+def orbit_rotation(yaw_rad: float, pitch_rad: float) -> np.ndarray:
+    """World-to-camera rotation [3, 3] float64 of a camera that looks at the middle of an upright world (y up).
+
+    Yaw turns around the vertical axis, 0 sees the front of somebody who faces +z; positive pitch looks down.
+    """
+    pitch, yaw = pitch_rad, yaw_rad
+    turn_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    turn_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
+    # World y points up and people face +z; the camera has y down and looks along +z: half a turn about x.
+    return np.diag([1.0, -1.0, -1.0]) @ turn_x @ turn_y
+
+
 def project(camera: Camera, points_world: np.ndarray) -> np.ndarray:
     """Pixels [..., 2] float64 of world points [..., 3] m; NaN on or behind the plane of the camera."""
     points = points_world @ camera.R.T + camera.translation

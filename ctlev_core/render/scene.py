@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, shape_vertices, skin
-from ctlev_core.camera import Camera, project
+from ctlev_core.camera import Camera, orbit_rotation, project
 from ctlev_core.render.rasteriser import NEAR_M, rasterise
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
@@ -146,10 +146,7 @@ def sample_camera(
     if len(points) == 0 or not np.isfinite(points).all():
         raise DataError(f"a camera needs finite joints to look at, got {points.shape[0]} points")
     pitch, yaw = rng.uniform(*ranges.pitch_rad), rng.uniform(*ranges.yaw_rad)
-    turn_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
-    turn_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
-    # World y points up and people face +z; the camera has y down and looks along +z: half a turn about x.
-    R = np.diag([1.0, -1.0, -1.0]) @ turn_x @ turn_y
+    R = orbit_rotation(yaw, pitch)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     side, up = ranges.offset_m
     offset = np.array([rng.uniform(-side, side), rng.uniform(-up, up), rng.uniform(*ranges.distance_m)])
