@@ -18,11 +18,12 @@ from typing import Any, Protocol
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from ctlev_core.body.motion_clip import MotionClip
 from data_contracts.config import Choice, Frozen
 from data_contracts.events import Events, SensorSize
 from data_contracts.labels import Conditions, History, ImageTrack, Labels, Recording
 
-KINDS = ("datasets", "formats", "encodings", "conditions", "generators", "downstream", "metrics")
+KINDS = ("datasets", "formats", "motions", "encodings", "conditions", "generators", "downstream", "metrics")
 
 
 class PluginError(ValueError):
@@ -97,7 +98,11 @@ class DatasetWithIntensity(Dataset, Protocol):
 
 
 class Format(Protocol):
-    """A raw event file format."""
+    """A raw event file format.
+
+    One whose files carry no signature says `HAS_SIGNATURE = False`: its `sniff` takes what is merely plausible, and
+    is asked only where no other format knows the file (`ctlev_core.event_files.find_format`).
+    """
 
     VERSION: int
     SUFFIXES: tuple[str, ...]
@@ -115,6 +120,24 @@ class Format(Protocol):
 
         Every piece is checked and has the sensor size of the whole file.
         """
+        ...
+
+
+class MotionFormat(Protocol):
+    """A file format of motions: poses over time.
+
+    `HAS_SIGNATURE = False` has the meaning that it has for a `Format` (`ctlev_core.motion_formats.find_format`).
+    """
+
+    VERSION: int
+    SUFFIXES: tuple[str, ...]
+
+    def sniff(self, path: Path) -> bool:
+        """Does the content look like this format?"""
+        ...
+
+    def read(self, path: Path) -> MotionClip:
+        """Every frame of the file, checked with `check_clip`: metres, y up, the poses those of SMPL's 24 joints."""
         ...
 
 

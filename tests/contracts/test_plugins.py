@@ -13,12 +13,14 @@ from data_contracts.config import DatasetChoice, Frozen, MetricChoice
 PROTOCOLS = {
     "datasets": plugins.Dataset,
     "formats": plugins.Format,
+    "motions": plugins.MotionFormat,
     "encodings": plugins.Encoding,
     "conditions": plugins.Condition,
     "generators": plugins.Generator,
     "downstream": plugins.Downstream,
     "metrics": plugins.Metric,
 }
+WITHOUT_OPTIONS = ("formats", "motions")
 ALL = [(kind, name) for kind in plugins.KINDS for name in plugins.names(kind)]
 
 
@@ -39,7 +41,7 @@ def test_module_keeps_its_protocol(kind, name):
         assert list(inspect.signature(function).parameters)[: len(wanted)] == wanted, f"{kind}/{name}.{function_name}"
 
 
-@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, name in ALL if kind != "formats"])
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, name in ALL if kind not in WITHOUT_OPTIONS])
 def test_options_are_frozen_documented_and_have_defaults(kind, name):
     module = plugins.load(kind, name)
     models = [module.Options, *([module.SampleOptions] if kind == "generators" else [])]

@@ -1,0 +1,56 @@
+"""Motion files of any known format: which format a file has, and the motion in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+from ctlev_core import plugins
+from ctlev_core.body.motion_clip import MotionClip
+from data_contracts.errors import DataError
+
+
+def list_formats() -> dict[str, ModuleType]:
+    """Every format plug-in of motions, by name."""
+    return {name: plugins.load("motions", name) for name in plugins.names("motions")}
+
+
+def find_format(path: Path) -> ModuleType | None:
+    """The one format plug-in whose `sniff` recognises the file's content; None where none does.
+
+    Formats whose files carry a signature are asked first, all of them. Those without (`HAS_SIGNATURE = False`: arrays
+    without names) recognise what is merely plausible; they are asked only where no signature is found.
+
+    Raises:
+        DataError: no such file, or not to be read; or several formats recognise it, then it names them.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: expected a motion file, got {'a folder' if path.is_dir() else 'nothing there'}")
+    formats = list_formats()
+    for has_signature in (True, False):
+        asked = [name for name in formats if getattr(formats[name], "HAS_SIGNATURE", True) == has_signature]
+        try:
+            claims = [name for name in asked if formats[name].sniff(path)]
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read: {error}") from error
+        if len(claims) > 1:
+            raise DataError(f"{path}: could be any of the formats {', '.join(claims)}; expected exactly one to fit")
+        if claims:
+            return formats[claims[0]]
+    return None
+
+
+def read_motion(path: Path) -> MotionClip:
+    """The motion in a file of any known format, every frame, checked: metres, y up, SMPL's 24 joints.
+
+    Raises:
+        DataError: see `find_format` and the format's own `read`; or no format recognises the file, then the message
+            lists the known ones.
+    """
+    module = find_format(path)
+    if module is None:
+        known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in list_formats().items())
+        raise DataError(
+            f"{path}: not a motion file of a known format ({path.stat().st_size} bytes); known formats: {known}"
+        )
+    return module.read(path)
