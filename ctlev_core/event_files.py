@@ -10,7 +10,7 @@ from types import ModuleType
 from ctlev_core import plugins
 from ctlev_core.format_files import event_pieces
 from data_contracts.errors import DataError
-from data_contracts.events import Events
+from data_contracts.events import Events, SensorSize
 
 CHUNK_EVENTS = 1 << 20
 """Events a piece where nothing else is asked for: 13 MiB."""
@@ -84,7 +84,7 @@ def write_events_parquet(path: Path, events: Events) -> None:
     write_event_chunks_parquet(path, [events])
 
 
-def write_event_chunks_parquet(path: Path, chunks: Iterable[Events]) -> dict[str, int]:
+def write_event_chunks_parquet(path: Path, chunks: Iterable[Events]) -> Summary:
     """Write a recording that comes in pieces in the project's own format, in memory that does not grow with it.
 
     The file appears under its name only when it is complete; where a piece is wrong, nothing is left.
@@ -93,7 +93,7 @@ def write_event_chunks_parquet(path: Path, chunks: Iterable[Events]) -> dict[str
         path: the file.
         chunks: at least one piece, all of one sensor size, each starting where the last one ended or later.
     Returns:
-        What `summarise` says of the whole recording.
+        What a manifest says of the whole recording.
     Raises:
         DataError: the pieces break `check_events` or do not join.
     """
@@ -104,17 +104,19 @@ def write_event_chunks_parquet(path: Path, chunks: Iterable[Events]) -> dict[str
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
-    return summary.result()
+    return summary
 
 
 class Summary:
-    """What a manifest says of a recording, gathered piece by piece."""
+    """What a manifest says of a recording, gathered piece by piece; `sensor_size` is None before the first piece."""
 
     def __init__(self) -> None:
+        self.sensor_size: SensorSize | None = None
         self.num_events = self.num_positive = self.t_first_us = self.t_last_us = 0
 
     def add(self, events: Events) -> None:
         """Count the next piece."""
+        self.sensor_size = events.sensor_size
         if len(events) == 0:
             return
         if self.num_events == 0:

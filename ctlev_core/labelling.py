@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from ctlev_core.camera import is_inside
 from data_contracts.labels import Labels
 
 
@@ -43,6 +45,30 @@ def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarr
             visible[row] = labels.visible[start:stop].mean(axis=0) >= 0.5
     visible &= np.isfinite(joints).all(axis=-1)
     return replace(at_end, t_us=t_end_us, joints2d=joints, visible=visible)
+
+
+def labels_in_image(
+    labels: Labels, map_points: Callable[[np.ndarray], np.ndarray], image_size: tuple[int, int]
+) -> Labels:
+    """Labels in sensor pixels as labels in image pixels.
+
+    Args:
+        labels: N rows in sensor pixels.
+        map_points: points [..., 2] in sensor pixels to image pixels; each axis is scaled and shifted on its own.
+        image_size: (width, height) px of the image.
+    Returns:
+        Joints and intrinsics of the image; a joint that the crop or the border cut off is not visible.
+    """
+    moved: dict[str, np.ndarray] = {}
+    if labels.joints2d is not None and labels.visible is not None:
+        joints = map_points(labels.joints2d).astype(np.float32)
+        moved = {"joints2d": joints, "visible": labels.visible & is_inside(joints, image_size)}
+    if labels.intrinsics is not None:
+        offset, unit = map_points(np.array([[0.0, 0.0], [1.0, 1.0]]))
+        focal = labels.intrinsics[:, :2] * (unit - offset)
+        centre = map_points(labels.intrinsics[:, 2:].astype(np.float64))
+        moved["intrinsics"] = np.concatenate([focal, centre], axis=1).astype(np.float32)
+    return replace(labels, **moved)
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from data_contracts.config import (
 )
 
 Setting = Literal["real", "synthetic", "real+synthetic"]
+PoseOrder = Literal["random", "in_time"]
 
 
 class Experiment(Frozen):
@@ -34,6 +35,9 @@ class Experiment(Frozen):
     dataset: DatasetChoice
     poses: DatasetChoice | None = Field(
         None, description="another dataset whose poses (recordings of split `condition`) are sampled from instead"
+    )
+    pose_order: PoseOrder = Field(
+        "random", description="of the labels to sample from: classes in turn and at random, or as they follow in time"
     )
     windows: Windows = Windows()
     encoding: EncodingChoice

@@ -88,6 +88,7 @@ LABEL_ARRAYS: dict[str, tuple[type, int | None]] = {
     "smpl_pose": (np.float32, 72),
     "smpl_betas": (np.float32, 10),
     "smpl_transl": (np.float32, 3),
+    "intrinsics": (np.float32, 4),
 }
 """The optional arrays of `Labels`: dtype, and length of the last axis (None: one value a joint)."""
 _OF_JOINTS = ("joints2d", "visible", "joints3d")
@@ -108,6 +109,8 @@ class Labels:
         smpl_pose: [N, 72] float32, rad, axis-angle of the 24 SMPL joints, the root's (global orientation) first.
         smpl_betas: [N, 10] float32, shape coefficients.
         smpl_transl: [N, 3] float32, m, camera frame.
+        intrinsics: [N, 4] float32, px: fx, fy, cx, cy of the camera that sees the row, in the image of `joints2d`;
+            without them a body has a place in space but none in the image.
     """
 
     class_names: tuple[str, ...]
@@ -119,6 +122,7 @@ class Labels:
     smpl_pose: np.ndarray | None = None
     smpl_betas: np.ndarray | None = None
     smpl_transl: np.ndarray | None = None
+    intrinsics: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.class_names)
@@ -154,9 +158,12 @@ def check_labels(labels: Labels, where: str) -> Labels:
         if array.shape != expected or array.dtype != dtype:
             kind = np.dtype(dtype).name
             raise DataError(f"{where}: {name} must be {list(expected)} {kind}, got {list(array.shape)} {array.dtype}")
-        if name in _OF_SMPL and not np.isfinite(array).all():
+        if name in (*_OF_SMPL, "intrinsics") and not np.isfinite(array).all():
             row = int(np.argwhere(~np.isfinite(array))[0, 0])
             raise DataError(f"{where}: {name} of row {row} is not finite")
+    if labels.intrinsics is not None and (labels.intrinsics[:, :2] <= 0).any():
+        row = int(np.argmax((labels.intrinsics[:, :2] <= 0).any(axis=1)))
+        raise DataError(f"{where}: focal lengths must be positive, row {row} has {labels.intrinsics[row, :2].tolist()}")
     if labels.joints2d is None or labels.visible is None:
         return labels
     wrong = labels.visible & ~np.isfinite(labels.joints2d).all(axis=-1)

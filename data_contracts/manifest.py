@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -173,6 +173,7 @@ LABEL_COLUMNS = {
     "smpl_pose": "smpl_pose_rad",
     "smpl_betas": "smpl_betas",
     "smpl_transl": "smpl_transl_m",
+    "intrinsics": "intrinsics_px",
 }
 """Column of a table for each array of `Labels`."""
 
@@ -215,11 +216,14 @@ def labels_of(table: pa.Table) -> Labels:
     return Labels(class_names, t_us.astype(np.int64), joint_set="".join(joint_sets), **arrays)
 
 
-def concat_labels(parts: Iterable[Labels]) -> Labels:
-    """Stack label rows; all parts must carry the same kind of labels."""
+def concat_labels(parts: Iterable[Labels], *, common: bool = False) -> Labels:
+    """Stack label rows; all parts must carry the same kinds of labels, or (`common`) only what all have is kept."""
     parts = [part for part in parts if len(part)]
     if not parts:
         return Labels((), np.zeros(0, np.int64))
+    if common:
+        shared = set.intersection(*(set(part.arrays) for part in parts))
+        parts = [replace(part, **{name: None for name in part.arrays if name not in shared}) for part in parts]
     kinds = {(part.joint_set, *part.arrays) for part in parts}
     if len(kinds) != 1:
         raise DataError(f"cannot mix labels of different kinds: {sorted(kinds)}")

@@ -69,6 +69,7 @@ _LABELS = (
     Column("smpl_pose_rad", pa.list_(pa.float32()), "24 x axis-angle, the root's first", nullable=True),
     Column("smpl_betas", pa.list_(pa.float32()), "10 shape coefficients", nullable=True),
     Column("smpl_transl_m", pa.list_(pa.float32()), "x, y, z, camera", nullable=True),
+    Column("intrinsics_px", pa.list_(pa.float32()), "fx, fy, cx, cy of the image of joints2d_px", nullable=True),
 )
 
 RECORDINGS = TableSchema(
@@ -126,7 +127,7 @@ SYNONYMS = TableSchema(
 )
 LABELS = TableSchema(
     "labels",
-    2,
+    3,
     None,
     (
         _RECORDING,
@@ -136,11 +137,11 @@ LABELS = TableSchema(
         *_LABELS,
     ),
 )
-WINDOW_LABELS = TableSchema("window_labels", 1, None, LABELS.columns)
+WINDOW_LABELS = TableSchema("window_labels", 2, None, LABELS.columns)
 """One row for each row of `windows`, where the authors also say how a window is labelled; else no rows."""
 FRAMES = TableSchema(
     "frames",
-    2,
+    3,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),
@@ -156,7 +157,7 @@ FRAMES = TableSchema(
 )
 CONDITIONS = TableSchema(
     "conditions",
-    2,
+    3,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key"),
@@ -179,7 +180,7 @@ TRAINING = TableSchema(
 )
 SYNTHETIC = TableSchema(
     "synthetic",
-    2,
+    3,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),

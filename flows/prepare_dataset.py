@@ -47,6 +47,7 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         condition=experiment.condition,
         encoding=experiment.encoding,
         count=experiment.num_synthetic,
+        order=experiment.pose_order,
         seed=experiment.seed,
         label=f"{experiment.condition.name}, to sample",
     )

@@ -1,24 +1,31 @@
 """Labels to conditions: what the generator learns from, and what it is then asked for."""
 
+# pyarrow.compute makes its functions when it is imported, where a type checker cannot see them.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from ctlev_core import plugins
 from ctlev_core.body.virtual_camera import with_joints
+from ctlev_core.labelling import labels_in_image
 from ctlev_core.plugins import Plugin
+from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import ConditionChoice, EncodingChoice
 from data_contracts.errors import DataError
+from data_contracts.experiment import PoseOrder
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, label_columns, labels_of
 from tasks.stage import Output, stage
 
 
-@stage(version=2, schema=tables.CONDITIONS)
+@stage(version=3, schema=tables.CONDITIONS)
 def condition_frames(
     out: Output, recordings: Manifest, frames: Manifest, *, condition: ConditionChoice, seed: int
 ) -> pa.Table:
@@ -30,7 +37,7 @@ def condition_frames(
     return _render(out, names, names, subjects, frames.labels.take(rows), plugin, _image_size(frames), seed)
 
 
-@stage(version=2, schema=tables.CONDITIONS)
+@stage(version=3, schema=tables.CONDITIONS)
 def condition_samples(
     out: Output,
     poses: Manifest,
@@ -40,28 +47,33 @@ def condition_samples(
     condition: ConditionChoice,
     encoding: EncodingChoice,
     count: int,
+    order: PoseOrder,
     seed: int,
 ) -> pa.Table:
     """Choose `count` labels to sample from and render them.
 
     They come from the label-only recordings of `poses` (split `condition`: poses no frame was trained on) where it has
-    such, and otherwise from the training frames. Classes take turns; within a class the order is random, and starts
-    over when it is used up. `poses` are the recordings of the experiment or those of another dataset; bodies without 2D
+    such, and otherwise from the training frames. In random order classes take turns; within a class the order is
+    random, and starts over when it is used up. In order of time the recordings follow one another, `count` moments
+    evenly spread over them. `poses` are the recordings of the experiment or those of another dataset; bodies without 2D
     joints are seen by a virtual camera.
     """
-    names, subjects, labels = _label_only(poses, recordings, frames, encoding)
-    if not names and poses.ref.key != recordings.ref.key:
+    moments = _label_only(poses)
+    if moments.num_rows:
+        chosen = _choose(moments, count, order, seed)
+        labels = _seen(labels_of(chosen), recordings, frames, encoding)
+        times = chosen["t_us"].to_pylist()
+        source_ids = [f"{name}:{t}" for name, t in zip(chosen["recording_id"].to_pylist(), times, strict=True)]
+    elif poses.ref.key != recordings.ref.key:
         raise DataError(f"{poses.ref.path}: the dataset of poses has no recording in split 'condition'")
-    if not names:
-        rows = frames.rows_where(split="train")
-        names = [frames.column("sample_id")[row] for row in rows]
-        subjects = [frames.column("subject")[row] for row in rows]
-        labels = frames.labels.take(rows)
-    chosen = balanced_choice(labels.class_names, count, seed)
+    else:
+        learnt = frames.table.take(frames.rows_where(split="train"))
+        chosen = _choose(learnt, count, order, seed)
+        labels, source_ids = labels_of(chosen), chosen["sample_id"].to_pylist()
     sample_ids = [f"condition/{number:06d}" for number in range(count)]
-    source_ids, subjects = [names[row] for row in chosen], [subjects[row] for row in chosen]
     plugin = _load_condition(condition, recordings)
-    return _render(out, sample_ids, source_ids, subjects, labels.take(chosen), plugin, _image_size(frames), seed)
+    subjects = chosen["subject"].to_pylist()
+    return _render(out, sample_ids, source_ids, subjects, labels, plugin, _image_size(frames), seed)
 
 
 def balanced_choice(class_names: tuple[str, ...], count: int, seed: int) -> np.ndarray:
@@ -77,27 +89,34 @@ def balanced_choice(class_names: tuple[str, ...], count: int, seed: int) -> np.n
     return np.array([queues[i % len(classes)][i // len(classes)] for i in range(count)], dtype=np.int64)
 
 
-def _label_only(
-    poses: Manifest, recordings: Manifest, frames: Manifest, encoding: EncodingChoice
-) -> tuple[list[str], list[str], Labels]:
-    """Every label moment of the recordings of `poses` in split `condition`, in image pixels."""
-    wanted = set(np.array(poses.column("recording_id"))[poses.rows_where(splits="condition")].tolist())
+def _choose(moments: pa.Table, count: int, order: PoseOrder, seed: int) -> pa.Table:
+    """`count` rows of the moments that could be asked for."""
+    if order == "random":
+        return moments.take(balanced_choice(tuple(moments["class_name"].to_pylist()), count, seed))
+    return moments.take(np.sort(np.resize(spread(moments.num_rows, count), count)))
+
+
+def _label_only(poses: Manifest) -> pa.Table:
+    """Every label moment of the recordings of `poses` in split `condition`, in the order of recordings and times."""
+    wanted = np.array(poses.column("recording_id"))[poses.rows_where(splits="condition")]
     table = poses.attached(tables.LABELS)
-    table = table.filter(pa.array([name in wanted for name in table["recording_id"].to_pylist()], pa.bool_()))
-    times = table["t_us"].to_pylist()
-    names = [f"{name}:{t_us}" for name, t_us in zip(table["recording_id"].to_pylist(), times, strict=True)]
-    labels = labels_of(table)
-    # A label-only recording has no sensor of its own: its labels are in the frame of the dataset's sensor.
+    return table.filter(pc.is_in(table["recording_id"], pa.array(wanted, pa.string())))
+
+
+def _seen(labels: Labels, recordings: Manifest, frames: Manifest, encoding: EncodingChoice) -> Labels:
+    """Label-only rows as labels in image pixels.
+
+    A label-only recording has no sensor of its own: its labels are in the frame of the dataset's sensor, or a virtual
+    camera with that sensor looks at its bodies.
+    """
     with_events = recordings.table.to_pylist()
     size = next((r["sensor_width_px"], r["sensor_height_px"]) for r in with_events if r["sensor_width_px"])
-    joint_set = frames.labels.joint_set
-    if names and joint_set and labels.joints2d is None:
-        labels = with_joints(labels, size, joint_set)
-    if labels.joints2d is not None:
-        plugin = plugins.load_options(encoding)
-        mapped = plugin.module.map_points(labels.joints2d, size, plugin.options).astype(np.float32)
-        labels = replace(labels, joints2d=mapped)
-    return names, table["subject"].to_pylist(), labels
+    if labels.joints2d is None and labels.smpl_pose is not None:
+        labels = with_joints(labels, size, frames.labels.joint_set or "smpl")
+    plugin = plugins.load_options(encoding)
+    return labels_in_image(
+        labels, lambda points: plugin.module.map_points(points, size, plugin.options), _image_size(frames)
+    )
 
 
 def _load_condition(condition: ConditionChoice, recordings: Manifest) -> Plugin:

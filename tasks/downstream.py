@@ -23,6 +23,7 @@ def train_downstream(
     plugin = plugins.load_options(downstream)
     rows = [manifest.rows_where(split="train") for manifest in training_sets]
     frames = np.concatenate([m.array("frames")[r] for m, r in zip(training_sets, rows, strict=True)])
-    labels = concat_labels([m.labels.take(r) for m, r in zip(training_sets, rows, strict=True)])
+    # Bodies of another dataset may carry more labels than the frames do.
+    labels = concat_labels([m.labels.take(r) for m, r in zip(training_sets, rows, strict=True)], common=True)
     history = plugin.module.train(frames, labels, plugin.options, seed=seed, out=out.folder / "model", work=out.work)
     return history_table(history)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,9 +11,8 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from ctlev_core import event_files, plugins
-from ctlev_core.camera import is_inside
 from ctlev_core.image_resampling import resample_images
-from ctlev_core.labelling import labels_at_windows
+from ctlev_core.labelling import labels_at_windows, labels_in_image
 from ctlev_core.windows import cut_chunks, spread
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
@@ -53,7 +51,7 @@ class _Samples(NamedTuple):
     labels: Labels
 
 
-@stage(version=2, schema=tables.FRAMES)
+@stage(version=3, schema=tables.FRAMES)
 def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windows: Windows) -> pa.Table:
     """Cut every recording into windows and encode each: arrays `histograms` (counts) and `frames` (8-bit RGB).
 
@@ -148,7 +146,7 @@ def _encode_events(
             counts = plugin.module.encode(events, local, plugin.options)
             t_start, t_end = events.t[local[:, 0]], events.t[local[:, 1] - 1]
             own = labels_at_windows(source.track, t_start, t_end) if labels is None else labels.take(rows)
-            own = _to_image(own, events.sensor_size, plugin, counts.shape[:1:-1])
+            own = _to_image(own, events.sensor_size, plugin, (counts.shape[3], counts.shape[2]))
             described = _rows(source.recording, part["split"], rows, t_start, t_end, local[:, 1] - local[:, 0])
             yield _Samples(described, counts, plugin.module.render_image(counts, plugin.options), own)
 
@@ -227,10 +225,8 @@ def _rows(
 
 
 def _to_image(
-    labels: Labels, sensor_size: tuple[int, int], plugin: plugins.Plugin, image_size: tuple[int, ...]
+    labels: Labels, sensor_size: tuple[int, int], plugin: plugins.Plugin, image_size: tuple[int, int]
 ) -> Labels:
-    """Joints from sensor pixels to image pixels; one that the crop or the border cut off is not visible."""
-    if labels.joints2d is None or labels.visible is None:
-        return labels
-    joints = plugin.module.map_points(labels.joints2d, sensor_size, plugin.options).astype(np.float32)
-    return replace(labels, joints2d=joints, visible=labels.visible & is_inside(joints, (image_size[0], image_size[1])))
+    return labels_in_image(
+        labels, lambda points: plugin.module.map_points(points, sensor_size, plugin.options), image_size
+    )

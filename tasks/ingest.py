@@ -54,7 +54,7 @@ def _list_recordings(plugin: Plugin) -> list[Recording]:
     return recordings
 
 
-@stage(version=2, schema=tables.RECORDINGS, raw_files=_raw_files)
+@stage(version=3, schema=tables.RECORDINGS, raw_files=_raw_files)
 def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     """Read every recording once, check it, and keep events and labels in the project's own form."""
     plugin = plugins.load_options(dataset)
@@ -110,32 +110,30 @@ def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str
     finished, attached = out.work / name, out.folder / name
     for path in (finished, attached):
         path.parent.mkdir(parents=True, exist_ok=True)
-    summary, sizes = event_files.Summary(), set()
 
     def watched(pieces: Iterable[Events]) -> Iterator[Events]:
         # Only a recording that takes long gets a bar of its own.
         label = recording.recording_id
         with tqdm(desc=label, unit="event", unit_scale=True, delay=5, leave=False, disable=None) as bar:
             for piece in pieces:
-                sizes.add(piece.sensor_size)
                 yield piece
                 bar.update(len(piece))
 
     if finished.exists():  # by an earlier run that was interrupted
+        summary = event_files.Summary()
         for piece in watched(event_files.read_event_chunks(finished)):
             summary.add(piece)
-        known = summary.result()
     else:
         if hasattr(plugin.module, "read_event_chunks"):
             pieces = plugin.module.read_event_chunks(recording, plugin.options)
         else:
             pieces = [check_events(plugin.module.read_events(recording, plugin.options), where)]
-        known = event_files.write_event_chunks_parquet(finished, watched(pieces))
-    if known["num_events"] == 0:
+        summary = event_files.write_event_chunks_parquet(finished, watched(pieces))
+    if summary.num_events == 0 or summary.sensor_size is None:
         raise DataError(f"{where}: the recording holds no events")
     os.link(finished, attached)
-    width, height = sizes.pop()
-    return {"events_file": name, "sensor_width_px": width, "sensor_height_px": height, **known}
+    width, height = summary.sensor_size
+    return {"events_file": name, "sensor_width_px": width, "sensor_height_px": height, **summary.result()}
 
 
 def _ingest_images(plugin: Plugin, recording: Recording, out: Output, kind: str, where: str) -> dict[str, Any]:

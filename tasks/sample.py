@@ -14,7 +14,7 @@ from data_contracts.manifest import LABEL_COLUMNS, Manifest, conditions_of
 from tasks.stage import Output, stage
 
 
-@stage(version=1, schema=tables.SYNTHETIC)
+@stage(version=2, schema=tables.SYNTHETIC)
 def sample(out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling: SamplingChoice, seed: int) -> pa.Table:
     """One frame per condition row, each from a seed of its own; the labels come along unchanged."""
     plugin = plugins.load_options(sampling)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -290,14 +291,22 @@ def _channel(recording: Recording) -> int:
 
 
 def _read_stream(recording: Recording, options: Options) -> files.Stream:
-    num_rows = len(files.read_vicon(_label_file(recording)))
-    return files.read_stream(recording.files[0], num_rows, options.filters)
+    path, labels = recording.files[0], _label_file(recording)
+    return _read_unchanged_stream(path, path.stat().st_mtime_ns, labels, labels.stat().st_mtime_ns, options.filters)
+
+
+@lru_cache(maxsize=4)
+def _read_unchanged_stream(path: Path, written: int, labels: Path, labels_written: int, filters: bool) -> files.Stream:
+    """A movement's stream is asked for by each of its cameras, for events, windows and labels: filtered once.
+
+    The times of the last writing are there so that a file that has changed is read anew.
+    """
+    return files.read_stream(path, len(files.read_vicon(labels)), filters)
 
 
 def _windows(recording: Recording, options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ranges [W, 2] of the authors' windows, their ends [W] us, and the first and last row [W, 2] of their labels."""
-    num_rows = len(files.read_vicon(_label_file(recording)))
-    stream = files.read_stream(recording.files[0], num_rows, options.filters)
+    stream, num_rows = _read_stream(recording, options), len(files.read_vicon(_label_file(recording)))
     ends = np.arange(options.events_per_window, len(stream.t) + 1, options.events_per_window, dtype=np.int64)
     end_us = stream.t[ends - 1]
     last_row = files.nearest_vicon_row(end_us)

@@ -109,6 +109,7 @@ def test_numbers_inside_lists_must_be_finite_where_the_schema_says_so():
             "smpl_pose_rad": pa.array([[0.0, 1.0], [2.0, nan]], pa.list_(pa.float32())),
             "smpl_betas": pa.nulls(2, pa.list_(pa.float32())),
             "smpl_transl_m": pa.nulls(2, pa.list_(pa.float32())),
+            "intrinsics_px": pa.nulls(2, pa.list_(pa.float32())),
         }
     )
     with pytest.raises(DataError, match=r"column 'smpl_pose_rad', row 1: expected finite numbers, got nan"):
