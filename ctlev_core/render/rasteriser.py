@@ -90,29 +90,38 @@ def rasterise(vertices, faces, attributes, K, near, cull_back, image, depth_inve
 
 
 @numba.njit(cache=True, nogil=True)
+def rasterise_normals(vertices, faces, intrinsics, near, normals, depth_inverse):
+    """Unit normals of a mesh in several poses, without checks: draws over `normals` and `depth_inverse`.
+
+    Args:
+        vertices: [N, V, 3] float, m, camera frame.
+        faces: [F, 3] int32.
+        intrinsics: [N, 4] float64, (fx, fy, cx, cy) px.
+        near: m.
+        normals: [N, H, W, 3], interpolated with perspective from the vertex normals, then normalised.
+        depth_inverse: [N, H, W].
+    """
+    corner_normals = np.empty(vertices.shape[1:], vertices.dtype)
+    K = np.zeros((3, 3))
+    for i in range(vertices.shape[0]):
+        K[0, 0], K[1, 1], K[0, 2], K[1, 2] = intrinsics[i, 0], intrinsics[i, 1], intrinsics[i, 2], intrinsics[i, 3]
+        _sum_face_normals(vertices[i], faces, corner_normals)
+        rasterise(vertices[i], faces, corner_normals, K, near, True, normals[i], depth_inverse[i])
+        _normalise_covered(normals[i], depth_inverse[i])
+
+
+@numba.njit(cache=True, nogil=True)
 def vertex_normals(vertices, faces):
     """Unit vertex normals [V, 3], area-weighted over the faces; 0 for a vertex without a face of positive area.
+
+    A face that is not finite counts for nothing.
 
     Args:
         vertices: [V, 3] float.
         faces: [F, 3] int32.
     """
-    normals = np.zeros_like(vertices)
-    for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-        wx, wy, wz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
-        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
-        for vertex in (a, b, c):
-            normals[vertex, 0] += nx
-            normals[vertex, 1] += ny
-            normals[vertex, 2] += nz
-    for i in range(vertices.shape[0]):
-        length = np.sqrt(normals[i, 0] ** 2 + normals[i, 1] ** 2 + normals[i, 2] ** 2)
-        if length > 0.0:
-            normals[i, 0] /= length
-            normals[i, 1] /= length
-            normals[i, 2] /= length
+    normals = np.empty_like(vertices)
+    _sum_face_normals(vertices, faces, normals)
     return normals
 
 
@@ -221,3 +230,42 @@ def _fill(screen, faces, attributes, cull_back, image, depth_inverse):
                     wa, wb, wc = wa * za * scale, wb * zb * scale, wc * zc * scale
                     for k in range(attributes.shape[1]):
                         image[row, column, k] = wa * attributes[a, k] + wb * attributes[b, k] + wc * attributes[c, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_face_normals(vertices, faces, normals):
+    """Unit vertex normals, into `normals`."""
+    normals[:] = 0.0
+    for f in range(faces.shape[0]):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        wx, wy, wz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+        if not np.isfinite(nx + ny + nz):
+            continue
+        for vertex in (a, b, c):
+            normals[vertex, 0] += nx
+            normals[vertex, 1] += ny
+            normals[vertex, 2] += nz
+    for i in range(vertices.shape[0]):
+        length = np.sqrt(normals[i, 0] ** 2 + normals[i, 1] ** 2 + normals[i, 2] ** 2)
+        if length > 0.0:
+            normals[i, 0] /= length
+            normals[i, 1] /= length
+            normals[i, 2] /= length
+
+
+@numba.njit(cache=True, nogil=True)
+def _normalise_covered(normals, depth_inverse):
+    """Unit length where there is a surface; towards the camera where normals of opposite faces have cancelled."""
+    for row in range(depth_inverse.shape[0]):
+        for column in range(depth_inverse.shape[1]):
+            if depth_inverse[row, column] > 0.0:
+                x, y, z = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
+                length = np.sqrt(x * x + y * y + z * z)
+                if length > 0.0:
+                    normals[row, column, 0] = x / length
+                    normals[row, column, 1] = y / length
+                    normals[row, column, 2] = z / length
+                else:
+                    normals[row, column, 2] = -1.0

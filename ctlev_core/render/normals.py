@@ -1,0 +1,140 @@
+"""Normal maps of posed meshes: one function over two renderers, and the pictures ControlNets are conditioned on.
+
+Normals are rendered without light or colour. They come from the posed faces, weighted by area, are interpolated with
+perspective and normalised in each pixel. OpenCV camera frame: x right, y down, z forward, pixel centres at
+integer + 0.5; the normal of a surface that faces the camera has z < 0.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from data_contracts.errors import DataError
+
+RENDERERS = ("numba", "pyrender")
+CONVENTIONS = ("controlnet", "rgb")
+FRAMES_AT_A_TIME = 8
+"""What one thread renders before it takes more: small enough to share, large enough not to wait for Python."""
+
+
+def render_normals(
+    vertices_cam: np.ndarray,
+    faces: np.ndarray,
+    intrinsics: np.ndarray,
+    image_size: tuple[int, int],
+    *,
+    renderer: str = "numba",
+    workers: int = 1,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normals and inverse depth of a mesh in N poses.
+
+    Faces that point away are culled, faces across the near plane are clipped, and a vertex that is not finite costs
+    its own faces only. Frames do not depend on one another nor on `workers`.
+
+    Args:
+        vertices_cam: [N, V, 3] float32, m, camera frame.
+        faces: [F, 3] integer, counter-clockwise seen from outside.
+        intrinsics: [N, 4] float, (fx, fy, cx, cy) px; the origin is the outer corner of the top left pixel.
+        image_size: (width, height) px.
+        renderer: one of `RENDERERS`: "numba", a z-buffer on the CPU, which needs nothing else; "pyrender", OpenGL.
+        workers: threads of "numba", 1 or more. OpenGL renders in one.
+    Returns:
+        normals: [N, H, W, 3] float32, unit length; 0 where there is nothing.
+        depth_inverse: [N, H, W] float32, 1 / m; 0 where there is nothing.
+    Raises:
+        DataError: shapes disagree, the image has no pixels, a face names a vertex that does not exist, intrinsics are
+            not finite or a focal length is not positive; "pyrender" finds no OpenGL.
+        ValueError: unknown renderer, or fewer than one worker.
+    """
+    if renderer not in RENDERERS:
+        raise ValueError(f"unknown renderer {renderer!r}; known: {', '.join(RENDERERS)}")
+    if workers < 1:
+        raise ValueError(f"workers must be 1 or more, got {workers}")
+    _check_mesh(vertices_cam, faces)
+    _check_cameras(intrinsics, len(vertices_cam), image_size)
+    vertices = np.ascontiguousarray(vertices_cam, np.float32)
+    triangles = np.ascontiguousarray(faces, np.int32)
+    cameras = np.ascontiguousarray(intrinsics, np.float64)
+    if renderer == "pyrender":
+        from ctlev_core.render.gl import render_normals_gl
+
+        return render_normals_gl(vertices, triangles, cameras, image_size)
+    return _render_numba(vertices, triangles, cameras, image_size, workers)
+
+
+def normal_map(normals: np.ndarray, convention: str) -> np.ndarray:
+    """Normals as the picture a network sees.
+
+    `controlnet`: ControlNet v1.0's "normal" condition. Its x and y are Sobel derivatives of MiDaS' inverse depth, which
+    grows towards a surface's near side: positive where the surface faces left, and up. Its z points to the camera.
+    Hence it is the negative of our normal. 127.5 x + 127.5, cut to whole numbers; the background is flat, (0, 0, 1).
+    Its app then reverses the channels, and so do we: the network sees (z, y, x). A ControlNet whose config has
+    `controlnet_conditioning_channel_order: bgr` reverses once more by itself; give it `normal_map(...)[..., ::-1]`.
+    Our normals are true ones. Those of v1.0 have the same direction on the screen, where pixels are square, but
+    another tilt: 2 pi stands in for the unknown scale of MiDaS' depth.
+
+    `rgb`: red = right, green = up, blue = towards the camera, as OpenGL's normal maps have it; 127.5 x + 127.5,
+    rounded. The background is black, which no normal is.
+
+    Args:
+        normals: [N, H, W, 3] float, unit length or 0, as `render_normals` returns them.
+        convention: one of `CONVENTIONS`.
+    Returns:
+        [N, H, W, 3] uint8, channels in the order in which the network takes them.
+    Raises:
+        ValueError: unknown convention.
+    Source: lllyasviel/ControlNet, annotator/midas/__init__.py and gradio_normal2image.py.
+    """
+    if convention not in CONVENTIONS:
+        raise ValueError(f"unknown convention {convention!r}; known: {', '.join(CONVENTIONS)}")
+    empty = ~normals.any(axis=-1, keepdims=True)
+    if convention == "controlnet":
+        towards_camera = np.where(empty, np.array([0.0, 0.0, 1.0], normals.dtype), -normals)
+        return (towards_camera * 127.5 + 127.5).clip(0.0, 255.0).astype(np.uint8)[..., ::-1].copy()
+    colours = np.rint(normals * np.array([127.5, -127.5, -127.5], normals.dtype) + 127.5)
+    return np.where(empty, 0, colours.clip(0.0, 255.0)).astype(np.uint8)
+
+
+def _render_numba(
+    vertices: np.ndarray, faces: np.ndarray, intrinsics: np.ndarray, image_size: tuple[int, int], workers: int
+) -> tuple[np.ndarray, np.ndarray]:
+    from ctlev_core.render.rasteriser import NEAR_M, rasterise_normals
+
+    width, height = image_size
+    normals = np.zeros((len(vertices), height, width, 3), np.float32)
+    depth_inverse = np.zeros((len(vertices), height, width), np.float32)
+
+    def render(start: int) -> None:
+        some = slice(start, start + FRAMES_AT_A_TIME)
+        rasterise_normals(vertices[some], faces, intrinsics[some], NEAR_M, normals[some], depth_inverse[some])
+
+    starts = range(0, len(vertices), FRAMES_AT_A_TIME)
+    if workers == 1:
+        for start in starts:
+            render(start)
+    else:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(render, starts))
+    return normals, depth_inverse
+
+
+def _check_mesh(vertices_cam: np.ndarray, faces: np.ndarray) -> None:
+    if vertices_cam.ndim != 3 or vertices_cam.shape[2] != 3:
+        raise DataError(f"vertices_cam must be [N, V, 3], got {vertices_cam.shape}")
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise DataError(f"faces must be [F, 3] integers, got {faces.shape} {faces.dtype}")
+    num_vertices = vertices_cam.shape[1]
+    if len(faces) and (faces.min() < 0 or faces.max() >= num_vertices):
+        raise DataError(f"faces must name vertices 0 .. {num_vertices - 1}, got {faces.min()} .. {faces.max()}")
+
+
+def _check_cameras(intrinsics: np.ndarray, num_frames: int, image_size: tuple[int, int]) -> None:
+    width, height = image_size
+    if width < 1 or height < 1:
+        raise DataError(f"image_size must be (width, height) of 1 px or more, got {image_size}")
+    if np.shape(intrinsics) != (num_frames, 4):
+        raise DataError(f"intrinsics must be [{num_frames}, 4], (fx, fy, cx, cy) a frame, got {np.shape(intrinsics)}")
+    if not np.isfinite(intrinsics).all() or (np.asarray(intrinsics)[:, :2] <= 0.0).any():
+        raise DataError("intrinsics must be finite and their focal lengths positive")
