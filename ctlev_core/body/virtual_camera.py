@@ -1,4 +1,4 @@
-"""Bodies given as SMPL parameters, before a virtual camera: the joints that a 2D label of them would have."""
+"""Bodies given as SMPL parameters, before a camera: the joints that a 2D label of them would have."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle
-from ctlev_core.camera import Camera, is_inside, project
+from ctlev_core.camera import camera_from_intrinsics, is_inside, project
 from ctlev_core.skeletons import joint_indices
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
@@ -21,18 +21,51 @@ FOCAL_PER_SIDE = 1.4
 def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str) -> Labels:
     """Labels with the joints of their SMPL bodies in 2D and 3D.
 
-    The body is the bundled one, shaped by the labels' coefficients. The camera has its principal point in the middle of
-    the sensor and no distortion; self-occlusion is not looked at.
+    The body is the bundled one, shaped by the labels' coefficients. The camera is that of the labels' intrinsics; where
+    they have none, one with its principal point in the middle of the sensor and `FOCAL_PER_SIDE`. It has no distortion;
+    self-occlusion is not looked at.
 
     Args:
         labels: N rows with SMPL parameters in the camera frame (x right, y down, z forward).
-        sensor_size: (width, height) px.
+        sensor_size: (width, height) px of the image which the intrinsics are of.
         joint_set: of the result, a key of `ctlev_core.skeletons.JOINT_SETS`.
     Returns:
-        The same rows with joints2d [N, J, 2] px, visible where they lie on the sensor, and joints3d [N, J, 3] mm. A
-        joint behind the camera is NaN in 2D.
+        The same rows with the intrinsics used, joints2d [N, J, 2] px, visible where they lie on the sensor, and
+        joints3d [N, J, 3] mm. A joint behind the camera is NaN in 2D.
     Raises:
-        DataError: the labels have no SMPL parameters.
+        DataError: the labels have no SMPL parameters, or SMPL lacks a joint of the set.
+    """
+    joints = smpl_joints(labels)[:, joint_indices("smpl", joint_set)]
+    intrinsics = labels.intrinsics
+    if intrinsics is None:
+        intrinsics = np.tile(default_intrinsics(sensor_size), (len(labels), 1))
+    joints2d = np.empty((*joints.shape[:2], 2))
+    cameras, of_row = np.unique(intrinsics, axis=0, return_inverse=True)
+    for number, camera in enumerate(cameras):
+        rows = of_row.reshape(-1) == number
+        joints2d[rows] = project(camera_from_intrinsics(camera, sensor_size), joints[rows])
+    return replace(
+        labels,
+        joints2d=joints2d.astype(np.float32),
+        visible=is_inside(joints2d, sensor_size),
+        joints3d=(1000 * joints).astype(np.float32),
+        joint_set=joint_set,
+        intrinsics=intrinsics,
+    )
+
+
+def default_intrinsics(sensor_size: SensorSize) -> np.ndarray:
+    """fx, fy, cx, cy [4] float32, px, of the virtual camera of labels that do not say what saw them."""
+    width, height = sensor_size
+    focal = FOCAL_PER_SIDE * min(sensor_size)
+    return np.array([focal, focal, width / 2, height / 2], dtype=np.float32)
+
+
+def smpl_joints(labels: Labels) -> np.ndarray:
+    """The joints [N, 24, 3] float64, m, camera frame, of the bundled body under the labels' SMPL parameters.
+
+    Raises:
+        DataError: the labels have none.
     """
     if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
         raise DataError("the recordings to sample poses from have neither joints nor SMPL parameters")
@@ -42,15 +75,4 @@ def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str) -> Labe
     for number, betas in enumerate(shapes):
         rows = of_row.reshape(-1) == number
         _, joints[rows] = joint_transforms(load_body(), rotations[rows], betas, labels.smpl_transl[rows])
-    joints = joints[:, joint_indices("smpl", joint_set)]
-    width, height = sensor_size
-    focal = FOCAL_PER_SIDE * min(sensor_size)
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    joints2d = project(Camera(K, np.eye(3), np.zeros(3), sensor_size), joints)
-    return replace(
-        labels,
-        joints2d=joints2d.astype(np.float32),
-        visible=is_inside(joints2d, sensor_size),
-        joints3d=(1000 * joints).astype(np.float32),
-        joint_set=joint_set,
-    )
+    return joints

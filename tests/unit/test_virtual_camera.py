@@ -1,5 +1,7 @@
 """Bodies of SMPL parameters before a virtual camera."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,3 +69,24 @@ def test_a_body_behind_the_camera_is_not_seen():
 def test_labels_without_a_body_are_an_error():
     with pytest.raises(DataError, match="neither joints nor SMPL parameters"):
         with_joints(Labels(("walk",), np.zeros(1, np.int64)), SENSOR, "dhp19")
+
+
+def test_intrinsics_of_the_labels_are_used_and_kept():
+    labels = labels_of(np.repeat(facing(), 3, axis=0), [[0, 0, 3], [0, 0, 3], [0.2, 0, 5]])
+    intrinsics = np.array([[300, 310, 170, 100], [500, 500, 160, 90], [300, 310, 170, 100]], np.float32)
+    seen = check_labels(with_joints(replace(labels, intrinsics=intrinsics), SENSOR, "smpl"), "test")
+    assert seen.joints2d is not None and seen.joints3d is not None
+    np.testing.assert_array_equal(seen.intrinsics, intrinsics)
+    x, y, z = np.moveaxis(seen.joints3d.astype(float), -1, 0)
+    fx, fy, cx, cy = intrinsics.T[:, :, None]
+    np.testing.assert_allclose(seen.joints2d[..., 0], fx * x / z + cx, atol=1e-3)  # float32, hundreds of px
+    np.testing.assert_allclose(seen.joints2d[..., 1], fy * y / z + cy, atol=1e-3)
+
+
+def test_the_default_camera_is_told():
+    labels = with_joints(labels_of(facing(), [[0, 0, 3]]), SENSOR, "dhp19")
+    assert labels.intrinsics is not None and labels.joints2d is not None
+    np.testing.assert_allclose(labels.intrinsics, [[FOCAL_PER_SIDE * 260, FOCAL_PER_SIDE * 260, 173, 130]], rtol=1e-6)
+    again = with_joints(labels, SENSOR, "dhp19")
+    assert again.joints2d is not None
+    np.testing.assert_array_equal(again.joints2d, labels.joints2d)
