@@ -7,9 +7,7 @@ Root and layout as published (the folder of annotations):
         gBR_sBM_cAll_d04_mBR0_ch01.pkl      (smpl_poses [T, 72], smpl_trans [T, 3], smpl_scaling [1], smpl_loss)
       ignore_list.txt                       (motions whose reconstruction is bad; left out)
 
-The files are pickles, read by `dataset_files.safe_pickle` without running what they may carry. Positions are those of a
-body `smpl_scaling` times as large as SMPL's, about centimetres: trans / scaling are metres of SMPL's body, as the
-authors' own feature extraction has it. y is up. Shape coefficients are not given: the mean body (zeros) dances.
+The files are read by the motion format `aist`, which runs nothing that such a pickle may carry.
 
 A motion's name says genre, situation, camera, dancer, music and choreography: the class is the genre, the subject the
 dancer. The moments are seen by a virtual camera (`ctlev_core.dataset_files.pose_sources`), not by one of AIST's nine.
@@ -23,12 +21,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from pydantic import Field
 
-from ctlev_core.dataset_files.pose_sources import PoseSourceOptions, SmplSequence, check_sequence
+from ctlev_core import plugins
+from ctlev_core.dataset_files.pose_sources import PoseSourceOptions
 from ctlev_core.dataset_files.pose_sources import labels_before_camera as _labels_before_camera
 from ctlev_core.dataset_files.trees import check_root, list_files, read_lines
 from data_contracts.config import RUN_SETTING
@@ -36,9 +33,8 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import Labels, Part, Recording
 
-VERSION = 1
+VERSION = 2
 
-RATE_HZ = 60.0
 GENRES = {
     "BR": "break",
     "PO": "pop",
@@ -110,37 +106,8 @@ def read_labels(recording: Recording, options: Options) -> Labels:
         DataError: the file cannot be read, holds code, lacks a key, has other shapes, no frames, or numbers that are
             not finite.
     """
-    sequence = read_sequence(recording.files[0])
-    return _labels_before_camera(sequence, recording.class_name, recording.recording_id, options)
-
-
-def read_sequence(file: Path) -> SmplSequence:
-    """The motion of a file, every frame, metres of SMPL's body, y up.
-
-    Raises:
-        DataError: as `read_labels`.
-    """
-    from ctlev_core.dataset_files import safe_pickle
-
-    loaded = safe_pickle.load(file)
-    if not isinstance(loaded, dict):
-        raise DataError(f"{file}: expected a dictionary, got {type(loaded).__name__}")
-    poses, transl, scaling = (_numbers(loaded, key, file) for key in ("smpl_poses", "smpl_trans", "smpl_scaling"))
-    if poses.ndim == 3 and poses.shape[1:] == (24, 3):
-        poses = poses.reshape(len(poses), 72)
-    if scaling.size != 1 or not 0 < float(scaling.reshape(())) < np.inf:
-        raise DataError(f"{file}: smpl_scaling must be one positive number, got {scaling.tolist()}")
-    sequence = SmplSequence(poses, np.zeros(10), transl / float(scaling.reshape(())), RATE_HZ)
-    return check_sequence(sequence, str(file))
-
-
-def _numbers(loaded: dict[Any, Any], key: str, file: Path) -> np.ndarray:
-    if key not in loaded:
-        raise DataError(f"{file}: lacks {key}; found {', '.join(map(str, loaded))}")
-    array = np.asarray(loaded[key])
-    if array.dtype.kind not in "fiu":
-        raise DataError(f"{file}: {key} must be numbers, got {array.dtype}")
-    return array.astype(np.float64)
+    clip = plugins.load("motions", "aist").read(recording.files[0])
+    return _labels_before_camera(clip, recording.class_name, recording.recording_id, options)
 
 
 def _read_ignored(root: Path) -> set[str]:

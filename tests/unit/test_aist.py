@@ -11,8 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ctlev_core import plugins
-from ctlev_core.dataset_files.pose_sources import REST_PELVIS
+from ctlev_core.body.motion_clip import REST_PELVIS
 from ctlev_core.datasets import aist
+from ctlev_core.motions import aist as aist_format
 from data_contracts.config import DatasetChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels
@@ -85,8 +86,8 @@ def test_labels_are_metres_before_the_camera(protocol, root):
 
 def test_poses_by_joint_are_the_same_poses(root):
     keys = motion()
-    flat = aist.read_sequence(write(root / "a.pkl", keys))
-    by_joint = aist.read_sequence(write(root / "a.pkl", keys | {"smpl_poses": keys["smpl_poses"].reshape(-1, 24, 3)}))
+    flat = aist_format.read(write(root / "a.pkl", keys))
+    by_joint = aist_format.read(write(root / "a.pkl", keys | {"smpl_poses": keys["smpl_poses"].reshape(-1, 24, 3)}))
     np.testing.assert_array_equal(flat.pose, by_joint.pose)
 
 
@@ -109,6 +110,7 @@ def test_code_in_a_motion_is_not_run(root, tmp_path):
     ("loaded", "message"),
     [
         (motion(smpl_poses=np.zeros((30, 66))), r"pose must be \[30, 72\], got \[30, 66\]"),
+        (motion(smpl_poses=np.zeros(30)), r"smpl_poses must be \[T, 72\], got \[30\]"),
         (motion(smpl_trans=np.zeros((29, 3))), r"transl must be \[30, 3\], got \[29, 3\]"),
         (motion(smpl_poses=np.full((30, 72), np.nan)), "pose of frame 0 is not finite"),
         (motion(0), "zero frames"),
@@ -123,7 +125,7 @@ def test_code_in_a_motion_is_not_run(root, tmp_path):
 def test_files_that_are_wrong(loaded, message, tmp_path):
     file = write(tmp_path / "a.pkl", loaded)
     with pytest.raises(DataError, match=message) as error:
-        aist.read_sequence(file)
+        aist_format.read(file)
     assert str(error.value).startswith(str(file))
 
 

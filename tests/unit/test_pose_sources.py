@@ -1,4 +1,4 @@
-"""SMPL sequences before a virtual camera: rigid motions move every point alike, and the camera sees what it should."""
+"""Motions before a virtual camera, which sees what it should at the moments it should."""
 
 from __future__ import annotations
 
@@ -9,75 +9,33 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from ctlev_core.body.layer import joint_transforms, load_body
+from ctlev_core.body.motion_clip import REST_PELVIS, MotionClip, take
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.camera import Camera, is_inside, project
 from ctlev_core.dataset_files.pose_sources import (
-    REST_PELVIS,
-    Z_UP_TO_Y_UP,
     PoseSourceOptions,
-    SmplSequence,
-    check_sequence,
-    choose_frames,
+    choose_times,
+    clip_of_labels,
     labels_before_camera,
-    move_world,
 )
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
+from data_contracts.labels import Labels
 
 FRONT = {"yaw_range_deg": (0.0, 0.0), "pitch_range_deg": (0.0, 0.0), "rate_hz": None}
 
 
-def sequence(num_frames: int = 5, seed: int = 0, rate_hz: float = 60.0) -> SmplSequence:
+def clip(num_frames: int = 5, seed: int = 0, rate_hz: float = 60.0) -> MotionClip:
     random = np.random.default_rng(seed)
     pose, transl = random.normal(0, 1, (num_frames, 72)), random.normal(0, 2, (num_frames, 3))
-    return SmplSequence(pose, random.normal(0, 1, 10), transl, rate_hz)
+    return MotionClip(pose, random.normal(0, 1, 10), transl, np.arange(num_frames) / rate_hz)
 
 
-def standing(num_frames: int = 1) -> SmplSequence:
-    return SmplSequence(np.zeros((num_frames, 72)), np.zeros(10), np.zeros((num_frames, 3)), 60.0)
-
-
-def points_of(root: np.ndarray, transl: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
-    """Points fixed to the trunk, by SMPL's definition, one frame and point at a time."""
-    rest = np.random.default_rng(9).normal(0, 1, (4, 3))
-    turned = [
-        [Rotation.from_rotvec(r).apply(x - pelvis) + pelvis + t for x in rest]
-        for r, t in zip(root, transl, strict=True)
-    ]
-    return np.array(turned)
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_a_rigid_motion_of_the_world_moves_every_point_of_the_body(seed):
-    random = np.random.default_rng(seed)
-    before = sequence(seed=seed)
-    turn, shift = Rotation.random(rng=random), random.normal(0, 3, 3)
-    after = move_world(before, turn.as_matrix(), shift)
-    expected = turn.apply(points_of(before.pose[:, :3], before.transl, REST_PELVIS).reshape(-1, 3)) + shift
-    got = points_of(after.pose[:, :3], after.transl, REST_PELVIS).reshape(-1, 3)
-    np.testing.assert_allclose(got, expected, atol=1e-12)
-    np.testing.assert_array_equal(after.pose[:, 3:], before.pose[:, 3:])
-
-
-def test_another_body_is_shifted_by_the_stated_constant():
-    pelvis = REST_PELVIS + np.array([0.01, -0.03, 0.02])
-    before = sequence()
-    turn, shift = Rotation.from_rotvec([0.3, -2.0, 1.0]), np.array([1.0, 2.0, 3.0])
-    after = move_world(before, turn.as_matrix(), shift)
-    expected = turn.apply(points_of(before.pose[:, :3], before.transl, pelvis).reshape(-1, 3)) + shift
-    got = points_of(after.pose[:, :3], after.transl, pelvis).reshape(-1, 3)
-    constant = (np.eye(3) - turn.as_matrix()) @ (pelvis - REST_PELVIS)
-    np.testing.assert_allclose(got - expected, np.tile(constant, (len(got), 1)), atol=1e-12)
-
-
-def test_z_up_becomes_y_up_without_a_mirror():
-    np.testing.assert_array_equal(Z_UP_TO_Y_UP @ [0, 0, 1], [0, 1, 0])
-    np.testing.assert_array_equal(Z_UP_TO_Y_UP @ [1, 0, 0], [1, 0, 0])
-    assert np.linalg.det(Z_UP_TO_Y_UP) == 1
+def standing(num_frames: int = 1) -> MotionClip:
+    return MotionClip(np.zeros((num_frames, 72)), np.zeros(10), np.zeros((num_frames, 3)), np.arange(num_frames) / 60)
 
 
 def in_camera(labels, offset) -> np.ndarray:
@@ -130,13 +88,13 @@ def test_a_still_camera_sees_the_whole_way_and_keeps_its_distance():
 
 
 def test_a_centred_camera_has_every_pelvis_on_its_axis():
-    labels = labels_before_camera(sequence(), "", "a", PoseSourceOptions(rate_hz=None, camera="centred"))
+    labels = labels_before_camera(clip(), "", "a", PoseSourceOptions(rate_hz=None, camera="centred"))
     np.testing.assert_allclose(labels.smpl_transl + REST_PELVIS, np.tile([0, 0, 3.0], (5, 1)), atol=1e-6)
 
 
 def test_the_view_follows_seed_and_recording_and_not_the_moments_taken():
     def root(recording_id: str = "a", **options) -> np.ndarray:
-        return labels_before_camera(sequence(60), "", recording_id, PoseSourceOptions(**options)).smpl_transl[0]
+        return labels_before_camera(clip(60), "", recording_id, PoseSourceOptions(**options)).smpl_transl[0]
 
     np.testing.assert_array_equal(root(), root(rate_hz=None))
     assert (root() != root("b")).any() and (root() != root(seed=1)).any()
@@ -144,45 +102,87 @@ def test_the_view_follows_seed_and_recording_and_not_the_moments_taken():
 
 @settings(max_examples=50, deadline=None)
 @given(
-    st.integers(1, 300), st.sampled_from([60.0, 100.0, 120.0, 250.0, 59.94]), st.sampled_from([1.0, 7.5, 30.0, 59.0])
+    st.integers(1, 300), st.sampled_from([60.0, 100.0, 120.0, 250.0, 59.94]), st.sampled_from([1.0, 7.5, 30.0, 600.0])
 )
-def test_each_moment_is_the_nearest_frame(count, rate_hz, wanted_hz):
-    frames = choose_frames(count, rate_hz, PoseSourceOptions(rate_hz=wanted_hz), "a")
-    assert len(np.unique(frames)) == len(frames) and frames[0] == 0 and frames[-1] < count
-    for moment, frame in enumerate(frames):
-        assert abs(frame / rate_hz - moment / wanted_hz) <= 0.5 / rate_hz + 1e-9
-    assert (len(frames) + 0.5) / wanted_hz > (count - 1) / rate_hz - 1 / wanted_hz
+def test_moments_follow_the_rate_from_the_first_frame_to_the_last(count, rate_hz, wanted_hz):
+    times = choose_times(standing(count) if rate_hz == 60 else clip(count, 0, rate_hz), asked(wanted_hz))
+    last = (count - 1) / rate_hz
+    np.testing.assert_allclose(times, np.arange(len(times)) / wanted_hz, atol=1e-7)
+    assert times[-1] <= last < times[-1] + 1 / wanted_hz + 1e-7
 
 
-def test_moments_can_be_limited_and_never_exceed_the_frames():
-    assert choose_frames(100, 60.0, PoseSourceOptions(rate_hz=None, max_moments=4), "a").tolist() == [12, 37, 62, 87]
-    assert choose_frames(3, 60.0, PoseSourceOptions(rate_hz=None, max_moments=4), "a").tolist() == [0, 1, 2]
-    assert choose_frames(3, 60.0, PoseSourceOptions(rate_hz=60.0), "a").tolist() == [0, 1, 2]
-    with pytest.raises(DataError, match=r"a: 120\.0 moments a second asked for, it has 60\.0 frames a second"):
-        choose_frames(3, 60.0, PoseSourceOptions(rate_hz=120.0), "a")
+def asked(rate_hz: float | None, **options) -> PoseSourceOptions:
+    return PoseSourceOptions(**{**FRONT, "rate_hz": rate_hz}, **options)
 
 
-def test_times_are_those_of_the_frames_taken():
-    labels = labels_before_camera(sequence(100, rate_hz=120.0), "", "a", PoseSourceOptions(rate_hz=50.0))
-    assert labels.t_us[:4].tolist() == [0, 16_667, 41_667, 58_333]  # frames 0, 2, 5, 7
+def test_moments_can_be_limited():
+    frames = [round(60 * t) for t in choose_times(standing(100), asked(None, max_moments=4))]
+    assert frames == [12, 37, 62, 87]
+    assert len(choose_times(standing(3), asked(None, max_moments=4))) == 3
+    assert choose_times(standing(1), asked(10.0, max_moments=4)).tolist() == [0]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"pose": np.zeros((0, 72)), "transl": np.zeros((0, 3))}, "zero frames"),
-        ({"pose": np.full((5, 72), np.nan)}, "pose of frame 0 is not finite"),
-        ({"transl": np.array([[0, 0, 0]] * 3 + [[0, np.inf, 0]] + [[0, 0, 0]])}, "transl of frame 3 is not finite"),
-        ({"betas": np.full(10, np.nan)}, "betas are not finite"),
-        ({"betas": np.zeros(16)}, r"betas must be \[10\], got \[16\]"),
-        ({"transl": np.zeros((4, 3))}, r"transl must be \[5, 3\], got \[4, 3\]"),
-        ({"rate_hz": 0.0}, "frame rate must be positive, got 0.0"),
-        ({"rate_hz": float("nan")}, "frame rate must be positive, got nan"),
-    ],
-)
-def test_sequences_that_are_wrong(change, message):
-    with pytest.raises(DataError, match=f"walk: .*{message}"):
-        check_sequence(replace(sequence(), **change), "walk")
+@pytest.mark.parametrize("rate_hz", [60.0, 30.0, 20.0, None])
+def test_moments_at_frames_are_those_frames(rate_hz):
+    whole, step = clip(61), 1 if rate_hz is None else round(60 / rate_hz)
+    labels = labels_before_camera(whole, "", "a", asked(rate_hz))
+    few = labels_before_camera(take(whole, np.arange(0, 61, step)), "", "a", asked(None))
+    np.testing.assert_array_equal(labels.smpl_pose, few.smpl_pose)
+    assert labels.t_us.tolist() == np.rint(np.arange(0, 61, step) * 1e6 / 60).tolist()
+
+
+@pytest.mark.parametrize("camera", ["still", "centred"])
+@pytest.mark.parametrize("rate_hz", [25.0, 240.0])
+def test_moments_between_frames_lie_on_the_shortest_way(rate_hz, camera):
+    """Against SciPy's own interpolation; the root is compared after the camera, whose rotation is half a turn."""
+    whole = clip(13)
+    labels = labels_before_camera(whole, "", "a", asked(rate_hz, camera=camera))
+    times = labels.t_us / 1e6
+    assert len(times) == np.floor(0.2 * rate_hz) + 1
+    for joint in range(24):
+        columns = slice(3 * joint, 3 * joint + 3)
+        expected = Slerp(whole.time_s, Rotation.from_rotvec(whole.pose[:, columns]))(np.minimum(times, 0.2))
+        if joint == 0:
+            expected = Rotation.from_rotvec([np.pi, 0, 0]) * expected
+        got = Rotation.from_rotvec(labels.smpl_pose[:, columns].astype(float))
+        # float32 labels, times in whole microseconds: a joint turns by up to pi a frame, 190 rad a second.
+        assert (got * expected.inv()).magnitude().max() < 3e-4
+
+
+def round_trip_options(**options) -> PoseSourceOptions:
+    return asked(None, **options)
+
+
+def test_labels_are_a_motion_again():
+    """Seen by a level camera, the world of `clip_of_labels` is the first one turned about the vertical and shifted."""
+    whole = replace(clip(7), caption="jump")
+    labels = labels_before_camera(whole, "jump", "a", round_trip_options())
+    again = clip_of_labels(labels, "a")
+    assert again.caption == "jump"
+    np.testing.assert_allclose(again.time_s, whole.time_s, atol=1e-6)
+    np.testing.assert_allclose(again.betas, whole.betas, atol=1e-6)
+    difference = again.transl - whole.transl
+    np.testing.assert_allclose(difference, np.tile(difference[0], (7, 1)), atol=1e-5)
+    for joint in range(24):
+        columns = slice(3 * joint, 3 * joint + 3)
+        turned = Rotation.from_rotvec(again.pose[:, columns]) * Rotation.from_rotvec(whole.pose[:, columns]).inv()
+        assert turned.magnitude().max() < 1e-5
+    seen_again = labels_before_camera(again, "jump", "a", round_trip_options())
+    np.testing.assert_allclose(seen_again.smpl_transl, labels.smpl_transl, atol=1e-5)
+
+
+def test_labels_that_are_no_motion():
+    labels = labels_before_camera(clip(4), "", "a", round_trip_options())
+    with pytest.raises(DataError, match="walk: expected SMPL parameters, got class names alone"):
+        clip_of_labels(Labels(("a",), np.zeros(1, np.int64)), "walk")
+    with pytest.raises(DataError, match="walk: expected the motion of one body, got no moments"):
+        clip_of_labels(labels.take([]), "walk")
+    with pytest.raises(DataError, match="walk: times must rise, frame 2 follows"):
+        clip_of_labels(labels.take([0, 1, 1]), "walk")
+    assert labels.smpl_betas is not None
+    labels.smpl_betas[2, 0] += 1
+    with pytest.raises(DataError, match="walk: expected one body, got another shape at moment 2"):
+        clip_of_labels(labels, "walk")
 
 
 def test_ranges_must_rise():
