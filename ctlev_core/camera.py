@@ -200,12 +200,11 @@ def _intersect_rays(
     equations = rays[..., None] * matrices[:, None, 2:] - matrices[:, None, :2]
     equations /= np.sqrt(1.0 + (rays**2).sum(axis=-1))[..., None, None]
     equations *= seen[..., None, None]
-    stacked = equations.transpose(1, 0, 2, 3).reshape(observed.shape[1], -1, 4)
+    stacked = equations.transpose(1, 0, 2, 3).reshape(-1, 2 * len(R), 4)
     _, singular, right = np.linalg.svd(stacked, full_matrices=False)
     solution = right[:, -1]
-    points = solution[:, :3] / solution[:, 3:]
     fixed = (singular[:, 2] > NO_PARALLAX * singular[:, 0]) & (np.abs(solution[:, 3]) > NO_PARALLAX)
-    return points, fixed & np.isfinite(points).all(axis=1)
+    return np.where(fixed[:, None], solution[:, :3] / solution[:, 3:], 0.0), fixed
 
 
 def _refine(
@@ -218,11 +217,13 @@ def _refine(
         homogeneous = np.einsum("cij,nj->cni", in_image, at) + np.einsum("cij,cj->ci", K, shifts)[:, None]
         projected = homogeneous[..., :2] / homogeneous[..., 2:]
         slopes = (in_image[:, None, :2] - projected[..., None] * in_image[:, None, 2:]) / homogeneous[..., 2:, None]
-        return (projected - observed) * seen[..., None], slopes * seen[..., None, None]
+        # Not a product: a camera that does not see the point may have it on its plane, where these are infinite.
+        return np.where(seen[..., None], projected - observed, 0.0), np.where(seen[..., None, None], slopes, 0.0)
 
     error, slopes = residuals(points)
     for _ in range(REFINEMENT_STEPS):
         normal = np.einsum("cnri,cnrj->nij", slopes, slopes)
+        normal = np.where(np.isfinite(normal).all(axis=(1, 2), keepdims=True), normal, 0.0)
         solvable = np.linalg.cond(normal) < 1.0 / np.finfo(float).eps
         normal[~solvable] = np.eye(3)
         step = np.linalg.solve(normal, np.einsum("cnri,cnr->ni", slopes, error)[..., None])[..., 0]
