@@ -1,13 +1,17 @@
-"""Distances between predicted and labelled joints in the image: what the 2D pose metrics share."""
+"""Distances between predicted and labelled joints, in the image and in space: what the pose metrics share."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from ctlev_core.procrustes import align_similarity
+from ctlev_core.skeletons import JOINT_SETS
 from data_contracts.labels import Labels
+
+Alignment = Literal["none", "pelvis", "procrustes"]
 
 
 def compute_joint_errors_px(predicted: Mapping[str, Any], target: Labels) -> np.ndarray:
@@ -36,6 +40,48 @@ def compute_joint_errors_px(predicted: Mapping[str, Any], target: Labels) -> np.
             f"predicted joint {joint} of row {row} is {points[row, joint].tolist()}, not a finite position"
         )
     return np.where(target.visible, distance, np.nan)
+
+
+def compute_joint_errors_mm(predicted: Mapping[str, Any], target: Labels, alignment: Alignment) -> np.ndarray:
+    """Euclidean distance of each joint in space, NaN where the label is not known.
+
+    Args:
+        predicted: `joints3d` [N, J, 3], mm, camera frame.
+        target: labels with `joints3d` [N, J, 3], mm, and a joint set; occluded joints count as well.
+        alignment: of each row before distances are taken. pelvis: both are moved until the middle of their hips is the
+            origin, and a row whose hips are not both known has no distance; procrustes: the prediction is turned,
+            scaled and moved to fit best.
+    Returns:
+        [N, J] float64, mm.
+    Raises:
+        ValueError: shapes differ, no joint is known, a prediction is not finite, or the joint set has no hips.
+    """
+    if target.joints3d is None:
+        raise ValueError("the target labels have no joints3d")
+    points, joints = np.asarray(predicted["joints3d"], dtype=np.float64), target.joints3d.astype(np.float64)
+    if points.shape != joints.shape:
+        raise ValueError(f"predicted joints3d must be {joints.shape}, got {points.shape}")
+    if not np.isfinite(points).all():
+        row, joint = np.argwhere(~np.isfinite(points).all(axis=-1))[0]
+        raise ValueError(
+            f"predicted joint {joint} of row {row} is {points[row, joint].tolist()}, not a finite position"
+        )
+    known = np.isfinite(joints).all(axis=-1)
+    if not known.any():
+        raise ValueError(f"no joint is known in any of the {len(target)} target rows")
+    if alignment == "pelvis":
+        hips = _hips(target.joint_set)
+        points, joints = (array - array[:, hips].mean(axis=1, keepdims=True) for array in (points, joints))
+    elif alignment == "procrustes":
+        points = align_similarity(points, joints, known)
+    return np.linalg.norm(points - joints, axis=-1)
+
+
+def _hips(joint_set: str) -> list[int]:
+    names = JOINT_SETS[joint_set].joints if joint_set in JOINT_SETS else ()
+    if not {"left_hip", "right_hip"} <= set(names):
+        raise ValueError(f"joint set {joint_set!r} has no hips to align by; known sets: {', '.join(JOINT_SETS)}")
+    return [names.index("left_hip"), names.index("right_hip")]
 
 
 def row_means(values: np.ndarray) -> np.ndarray:

@@ -31,6 +31,7 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
     return report(
         dataset.recordings,
         dataset.frames,
+        dataset.frame_conditions,
         dataset.sample_conditions,
         checkpoint,
         synthetic,

@@ -8,8 +8,9 @@ from data_contracts.config import Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from flows.command_line import main
-from flows.settings import flow
+from flows.settings import HOME, flow
 from tasks.condition import condition_frames, condition_samples
+from tasks.contact_sheet import contact_sheet, publish_contact_sheet
 from tasks.encode import encode
 from tasks.ingest import ingest
 
@@ -21,6 +22,7 @@ class PreparedDataset(Frozen):
     frames: ManifestRef
     frame_conditions: ManifestRef
     sample_conditions: ManifestRef
+    contact_sheet: ManifestRef
 
 
 @flow(name="prepare-dataset")
@@ -51,8 +53,20 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         seed=experiment.seed,
         label=f"{experiment.condition.name}, to sample",
     )
+    sheet = contact_sheet(
+        frames,
+        frame_conditions,
+        sample_conditions,
+        title=experiment.name,
+        notice=experiment.data_notice,
+        label="contact sheet of conditions",
+    )
     return PreparedDataset(
-        recordings=recordings, frames=frames, frame_conditions=frame_conditions, sample_conditions=sample_conditions
+        recordings=recordings,
+        frames=frames,
+        frame_conditions=frame_conditions,
+        sample_conditions=sample_conditions,
+        contact_sheet=sheet,
     )
 
 
@@ -60,9 +74,10 @@ if __name__ == "__main__":
     sys.exit(
         main(
             prepare_dataset,
-            lambda dataset, _: (
+            lambda dataset, experiment: (
                 f"recordings: {dataset.recordings.rows} in {dataset.recordings.path}\n"
-                f"frames:     {dataset.frames.rows} in {dataset.frames.path}"
+                f"frames:     {dataset.frames.rows} in {dataset.frames.path}\n"
+                + publish_contact_sheet(dataset.contact_sheet, HOME, experiment.name)
             ),
         )
     )

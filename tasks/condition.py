@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +27,13 @@ from data_contracts.manifest import Manifest, label_columns, labels_of
 from tasks.stage import Output, stage
 
 
-@stage(version=3, schema=tables.CONDITIONS)
+def _input_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
+    plugin = plugins.load_options(arguments["condition"])
+    files = plugin.module.input_files(plugin.options) if hasattr(plugin.module, "input_files") else []
+    return [(path.name, path) for path in files]
+
+
+@stage(version=3, schema=tables.CONDITIONS, raw_files=_input_files)
 def condition_frames(
     out: Output, recordings: Manifest, frames: Manifest, *, condition: ConditionChoice, seed: int
 ) -> pa.Table:
@@ -37,7 +45,7 @@ def condition_frames(
     return _render(out, names, names, subjects, frames.labels.take(rows), plugin, _image_size(frames), seed)
 
 
-@stage(version=3, schema=tables.CONDITIONS)
+@stage(version=3, schema=tables.CONDITIONS, raw_files=_input_files)
 def condition_samples(
     out: Output,
     poses: Manifest,

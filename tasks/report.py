@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from ctlev_core.intervals import MIN_RECORDINGS, bootstrap_interval
 from ctlev_core.realism.distances import DISTRIBUTIONS
+from ctlev_core.report.contact_sheet import contact_sheet_sections
 from ctlev_core.report.html import Curves, ImageGrid, Section, Table, render_report
 from ctlev_core.report.realism import realism_sections
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
@@ -25,11 +26,12 @@ GRID_COLUMNS = 10
 _TABLES = ("scores", "realism", "recordings")
 
 
-@stage(version=2, schema=tables.REPORT)
+@stage(version=3, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
     frames: Manifest,
+    frame_conditions: Manifest,
     conditions: Manifest,
     checkpoint: Manifest,
     synthetic: Manifest,
@@ -51,11 +53,14 @@ def report(
         _grid("Asked for, and sampled", conditions, synthetic),
         _real_grid(frames),
         *details,
+        *contact_sheet_sections(frames, frame_conditions, conditions),
         *realism_sections(realism.table.to_pylist(), realism.attached(DISTRIBUTIONS).to_pylist()),
         _curves("Fine-tuning of the generator", [checkpoint], ["generator"]),
         _curves("Downstream training", models, model_names),
         _recordings_table(recordings, frames),
-        _cost_table([recordings, frames, conditions, checkpoint, synthetic, *models, *scores, realism]),
+        _cost_table(
+            [recordings, frames, frame_conditions, conditions, checkpoint, synthetic, *models, *scores, realism]
+        ),
     ]
     page = render_report(
         title=title, lead=notice, verdict=verdict(rows, settings, _difference(scores)), sections=sections

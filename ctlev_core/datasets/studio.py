@@ -17,7 +17,6 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
-from ctlev_core.skeletons import SMPL_TO_DHP19
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events
@@ -28,8 +27,7 @@ if TYPE_CHECKING:
     from ctlev_core.camera import Camera
     from ctlev_core.render.scene import Subject
 
-VERSION = 1
-JOINT_SET = "dhp19"
+VERSION = 2
 SPLIT_NAMES = ("train", "test", "condition")
 MOTIONS_OF_SPLIT = {"train": SEEN, "test": SEEN + UNSEEN + HELD_OUT, "condition": UNSEEN}
 # Streams of random numbers, each with its own seed, so that any recording can be made alone.
@@ -62,6 +60,9 @@ class Options(Frozen):
     )
     sensor_preset: Literal["noisy", "ideal"] = Field(
         default="noisy", description="A key of `ctlev_core.sensor.PRESETS`."
+    )
+    joint_set: Literal["dhp19", "smpl"] = Field(
+        default="dhp19", description="13 markers as DHP19 labels them, or the 24 joints of SMPL as Event-HPE does"
     )
     textured: bool = Field(default=True, description="False: grey people before a plain wall, as in naive simulations.")
 
@@ -105,28 +106,22 @@ class _Performance:
 
 
 def read_labels(recording: Recording, options: Options) -> Labels:
-    """The joints at `label_rate_hz` from time 0 on; a label-only recording has one moment.
+    """Joints in 2D and 3D and the SMPL body at `label_rate_hz` from time 0 on; a label-only recording has one moment.
 
     Raises:
         DataError: the recording is not one of the studio with these options.
     """
-    from ctlev_core.body.layer import joint_transforms, load_body
+    from ctlev_core.body.body_labels import labels_in_camera
     from ctlev_core.body.motions import pose_at
-    from ctlev_core.camera import is_inside, project
+    from ctlev_core.body.virtual_camera import with_joints
 
     performance = _perform(recording, options)
     t_us = _times_us(options.label_rate_hz, options) if recording.has_events else np.zeros(1, dtype=np.int64)
     rotations, transl = pose_at(recording.class_name, 1e-6 * t_us, performance.style)
-    _, joints = joint_transforms(load_body(), rotations, performance.betas, transl)
-    joints2d = project(performance.camera, joints[:, SMPL_TO_DHP19])
-    labels = Labels(
-        class_names=(recording.class_name,) * len(t_us),
-        t_us=t_us,
-        joints2d=joints2d.astype(np.float32),
-        visible=is_inside(joints2d, options.sensor_size),
-        joint_set=JOINT_SET,
+    labels = labels_in_camera(
+        rotations, transl, performance.betas, performance.camera, class_name=recording.class_name, t_us=t_us
     )
-    return check_labels(labels, recording.recording_id)
+    return check_labels(with_joints(labels, options.sensor_size, options.joint_set), recording.recording_id)
 
 
 def read_events(recording: Recording, options: Options) -> Events:
