@@ -7,15 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from ctlev_core.body.layer import joint_transforms, load_body
-from ctlev_core.body.rotations import matrix_from_axis_angle
+from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ctlev_core.camera import camera_from_intrinsics, is_inside, project
 from ctlev_core.skeletons import joint_indices
+from ctlev_core.virtual_camera import CameraRange, sample_camera
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
 from data_contracts.labels import Labels
 
 FOCAL_PER_SIDE = 1.4
 """Focal length over the smaller side of the sensor: a person of 1.7 m at 3 m fills eight tenths of it."""
+UPRIGHT = np.diag([1.0, -1.0, -1.0])
+"""Camera frame of a level camera to a world with y up, in which who faces the camera faces +z."""
 
 
 def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str) -> Labels:
@@ -54,6 +57,45 @@ def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str) -> Labe
     )
 
 
+def from_new_side(
+    labels: Labels, rng: np.random.Generator, sensor_size: SensorSize, ranges: CameraRange | None = None
+) -> Labels:
+    """The same bodies as another still camera sees them, drawn at random around the space they move in.
+
+    The camera that the labels come from is taken to stand upright and level: yaw and pitch of the new one count from
+    its view. A rigid motion X' = A X + a of the world turns the root to A R and moves SMPL's translation to
+    A (J + transl) + a - J, since SMPL turns a body about its own pelvis J.
+
+    Args:
+        labels: N rows with SMPL parameters, one or more.
+        rng: source of the randomness.
+        sensor_size: (width, height) px of the new camera.
+        ranges: what to draw from; see `ctlev_core.virtual_camera.sample_camera`.
+    Returns:
+        The same rows with SMPL parameters in the new camera's frame, and its intrinsics. Joints of the old view are
+        gone; `with_joints` gives those of the new one.
+    Raises:
+        DataError: the labels have no SMPL parameters, or no rows.
+    """
+    joints = smpl_joints(labels)
+    camera = sample_camera(rng, joints @ UPRIGHT.T, sensor_size, ranges)
+    turn = camera.R @ UPRIGHT
+    pose, _, transl = _bodies(labels)
+    root = turn @ matrix_from_axis_angle(pose[:, :3].astype(np.float64))
+    moved = joints[:, 0] @ turn.T + camera.translation - joints[:, 0]
+    pose = np.concatenate([axis_angle_from_matrix(root), pose[:, 3:]], axis=1)
+    return replace(
+        labels,
+        smpl_pose=pose.astype(np.float32),
+        smpl_transl=(transl + moved).astype(np.float32),
+        intrinsics=np.tile(camera.intrinsics.astype(np.float32), (len(labels), 1)),
+        joints2d=None,
+        visible=None,
+        joints3d=None,
+        joint_set="",
+    )
+
+
 def default_intrinsics(sensor_size: SensorSize) -> np.ndarray:
     """fx, fy, cx, cy [4] float32, px, of the virtual camera of labels that do not say what saw them."""
     width, height = sensor_size
@@ -67,12 +109,17 @@ def smpl_joints(labels: Labels) -> np.ndarray:
     Raises:
         DataError: the labels have none.
     """
+    pose, betas, transl = _bodies(labels)
+    rotations = matrix_from_axis_angle(pose.reshape(len(labels), 24, 3).astype(np.float64))
+    joints = np.empty((len(labels), 24, 3))
+    shapes, of_row = np.unique(betas, axis=0, return_inverse=True)
+    for number, shape in enumerate(shapes):
+        rows = of_row.reshape(-1) == number
+        _, joints[rows] = joint_transforms(load_body(), rotations[rows], shape, transl[rows])
+    return joints
+
+
+def _bodies(labels: Labels) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
         raise DataError("the recordings to sample poses from have neither joints nor SMPL parameters")
-    rotations = matrix_from_axis_angle(labels.smpl_pose.reshape(len(labels), 24, 3).astype(np.float64))
-    joints = np.empty((len(labels), 24, 3))
-    shapes, of_row = np.unique(labels.smpl_betas, axis=0, return_inverse=True)
-    for number, betas in enumerate(shapes):
-        rows = of_row.reshape(-1) == number
-        _, joints[rows] = joint_transforms(load_body(), rotations[rows], betas, labels.smpl_transl[rows])
-    return joints
+    return labels.smpl_pose, labels.smpl_betas, labels.smpl_transl

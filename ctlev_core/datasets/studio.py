@@ -172,7 +172,8 @@ def read_frames(recording: Recording, options: Options) -> tuple[np.ndarray, np.
 def _perform(recording: Recording, options: Options) -> _Performance:
     from ctlev_core.body.layer import joint_transforms, load_body
     from ctlev_core.body.motions import pose_at, sample_style
-    from ctlev_core.render.scene import sample_betas, sample_camera
+    from ctlev_core.render.scene import sample_betas
+    from ctlev_core.virtual_camera import sample_camera
 
     rng = np.random.default_rng(_entropy(recording, options))
     style = sample_style(recording.class_name, rng)

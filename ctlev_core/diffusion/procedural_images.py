@@ -22,9 +22,10 @@ from ctlev_core.body.motions import SEEN, UNSEEN, pose_at, sample_style
 from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.camera import is_inside, project
 from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object
-from ctlev_core.render.scene import CameraRange, render_person, sample_background, sample_camera, sample_subject
+from ctlev_core.render.scene import render_person, sample_background, sample_subject
 from ctlev_core.render.skeleton import draw_skeleton
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_TO_DHP19
+from ctlev_core.virtual_camera import CameraRange, sample_camera
 
 PEOPLE_SHARE = 0.5
 MOTION_SHARE = 0.55

@@ -1,5 +1,7 @@
 """Cameras against OpenCV, SciPy, and DHP19's own calibration."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from ctlev_core.camera import Camera, from_projection_matrix, orbit_rotation, pr
 from ctlev_core.dataset_files.dhp19_files import CHANNEL_OF_CAMERA, camera_of
 from ctlev_core.lens_distortion import distort, largest_radius
 
+CALIBRATION = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "dhp19_calib"
 K = np.array([[335.86, 0.0, 128.2], [0.0, 330.0, 120.0], [0.0, 0.0, 1.0]])
 SIZE = (256, 256)
 LENSES = {
@@ -88,7 +91,7 @@ def test_distortion_is_one_to_one_where_it_is_defined(lens):
     # nothing at the rim, so the rim is left out.
     away_from_rim = np.hypot(*grid.T) < 0.9 * min(largest_radius(lens), 3.0)
     grid, image = grid[away_from_rim], image[away_from_rim]
-    _, nearest = KDTree(image).query(image, k=2)
+    nearest = np.asarray(KDTree(image).query(image, k=2)[1])
     assert np.hypot(*(grid - grid[nearest[:, 1]]).T).max() < 0.25
 
 
@@ -127,13 +130,10 @@ def test_noisy_views_give_the_least_squares_of_the_image():
 
 
 @pytest.fixture
-def dhp19_matrices():
-    from tests.conftest import REAL_DATA
-
-    folder = REAL_DATA / "dhp19_calib"
-    if not folder.is_dir():
+def matrices():
+    if not CALIBRATION.is_dir():
         pytest.skip("DHP19's calibration is not beside this checkout")
-    return {number: np.load(folder / f"P{number}.npy") for number in (1, 2, 3, 4)}, folder
+    return {number: np.load(CALIBRATION / f"P{number}.npy") for number in (1, 2, 3, 4)}
 
 
 def people():
@@ -141,8 +141,7 @@ def people():
     return np.random.default_rng(4).uniform([-500, -500, 0], [500, 500, 1800], (40, 13, 3))
 
 
-def test_dhp19_joints_come_back_from_its_four_cameras(dhp19_matrices):
-    matrices, _ = dhp19_matrices
+def test_dhp19_joints_come_back_from_its_four_cameras(matrices):
     joints_mm = people()
     all_matrices = np.stack(list(matrices.values()))
     homogeneous = np.einsum("cij,nkj->cnki", all_matrices, np.insert(joints_mm, 3, 1, axis=-1))
@@ -156,9 +155,8 @@ def test_dhp19_joints_come_back_from_its_four_cameras(dhp19_matrices):
     assert np.abs(1000 * triangulate(cameras[1:3], pixels[1:3]) - joints_mm).max() < 1e-5
 
 
-def test_dhp19_cameras_are_upright_and_stand_where_the_authors_say(dhp19_matrices):
-    matrices, folder = dhp19_matrices
-    positions = np.load(folder / "camera_positions.npy").reshape(4, 3)
+def test_dhp19_cameras_are_upright_and_stand_where_the_authors_say(matrices):
+    positions = np.load(CALIBRATION / "camera_positions.npy").reshape(4, 3)
     # heatmap_generation_example.ipynb: channel 0 belongs to P4, 1 to P1, 2 to P3, 3 to P2.
     assert {channel: number for number, channel in CHANNEL_OF_CAMERA.items()} == {0: 4, 1: 1, 2: 3, 3: 2}
     for number, matrix in matrices.items():
@@ -169,8 +167,7 @@ def test_dhp19_cameras_are_upright_and_stand_where_the_authors_say(dhp19_matrice
         np.testing.assert_allclose(1000 * camera.centre, positions[number - 1], atol=1e-5)
 
 
-def test_splitting_a_matrix_is_dhp19s_camera(dhp19_matrices):
-    matrices, _ = dhp19_matrices
+def test_splitting_a_matrix_is_dhp19s_camera(matrices):
     for number, matrix in matrices.items():
         flipped = np.array([[1, 0, 0], [0, -1, 260], [0, 0, 1]]) @ matrix
         ours, theirs = from_projection_matrix(flipped, (346, 260), "test"), camera_of(matrix, f"P{number}")

@@ -7,8 +7,10 @@ import pytest
 
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle
-from ctlev_core.body.virtual_camera import FOCAL_PER_SIDE, with_joints
+from ctlev_core.body.virtual_camera import FOCAL_PER_SIDE, from_new_side, with_joints
+from ctlev_core.camera import is_inside, project
 from ctlev_core.skeletons import JOINT_SETS, SMPL_TO_DHP19
+from ctlev_core.virtual_camera import CameraRange, sample_camera
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_labels
 
@@ -90,3 +92,60 @@ def test_the_default_camera_is_told():
     again = with_joints(labels, SENSOR, "dhp19")
     assert again.joints2d is not None
     np.testing.assert_array_equal(again.joints2d, labels.joints2d)
+
+
+def test_new_sides_are_views_of_the_same_bodies():
+    random = np.random.default_rng(5)
+    pose, transl = random.normal(0, 0.3, (4, 72)), random.uniform(-0.3, 0.3, (4, 3)) + np.array([0.0, 0.0, 4.0])
+    labels = with_joints(labels_of(pose, transl, random.normal(0, 1, (4, 10))), SENSOR, "smpl")
+    turned = from_new_side(labels, np.random.default_rng(1), SENSOR)
+    assert turned.joints2d is None and turned.joint_set == ""
+    seen = check_labels(with_joints(turned, SENSOR, "smpl"), "test")
+    assert seen.joints3d is not None and labels.joints3d is not None and seen.visible is not None
+    assert seen.visible.mean() > 0.9
+    # One rigid motion takes all joints of all rows from one camera to the other (Kabsch).
+    before, after = labels.joints3d.reshape(-1, 3).astype(float), seen.joints3d.reshape(-1, 3).astype(float)
+    u, _, v = np.linalg.svd((before - before.mean(0)).T @ (after - after.mean(0)))
+    assert np.linalg.det(u @ v) > 0
+    np.testing.assert_allclose((before - before.mean(0)) @ u @ v + after.mean(0), after, atol=0.02)  # mm; float32
+
+
+def test_yaw_zero_sees_what_the_old_camera_saw():
+    ahead = CameraRange((3.0, 3.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (1.4, 1.4))
+    labels = labels_of(facing(), [[0.4, 0.3, 5.0]])
+    seen = with_joints(from_new_side(labels, np.random.default_rng(0), SENSOR, ahead), SENSOR, "dhp19")
+    expected = with_joints(labels, SENSOR, "dhp19")
+    assert seen.joints3d is not None and expected.joints3d is not None
+    moved = seen.joints3d - expected.joints3d
+    np.testing.assert_allclose(moved, np.broadcast_to(moved[:, :1], moved.shape), atol=0.02)
+    # From the side, the depths of the hands differ and the left one is far to neither side.
+    side = replace(ahead, yaw_rad=(np.pi / 2, np.pi / 2))
+    seen = with_joints(from_new_side(labels, np.random.default_rng(0), SENSOR, side), SENSOR, "dhp19")
+    assert seen.joints3d is not None
+    at = dict(zip(JOINT_SETS["dhp19"].joints, seen.joints3d[0], strict=True))
+    assert abs(at["left_hand"][2] - at["right_hand"][2]) > 1000
+    assert abs(at["left_hand"][0] - at["right_hand"][0]) < 100
+
+
+def test_a_new_side_needs_bodies():
+    with pytest.raises(DataError, match="finite joints"):
+        from_new_side(labels_of(facing(), [[0, 0, 3]]).take([]), np.random.default_rng(0), SENSOR)
+
+
+def test_cameras_look_at_the_person_from_within_the_ranges():
+    joints = np.random.default_rng(0).uniform([-0.4, 0, -0.4], [0.4, 1.8, 0.4], (5, 24, 3))
+    ranges = CameraRange((3.0, 3.5), (0.1, 0.4), (-1.0, 1.0), (0.2, 0.1), (1.2, 1.6))
+    middle = (joints.min(axis=(0, 1)) + joints.max(axis=(0, 1))) / 2
+    yaws = []
+    for seed in range(40):
+        camera = sample_camera(np.random.default_rng(seed), joints, SENSOR, ranges)
+        x, y, z = camera.R @ middle + camera.translation
+        assert abs(x) <= 0.2 and abs(y) <= 0.1 and 3.0 <= z <= 3.5
+        assert 0.1 <= np.arcsin(-camera.R[2, 1]) <= 0.4
+        yaws.append(np.arctan2(-camera.R[2, 0], -camera.R[2, 2]))
+        focal, _, cx, cy = camera.intrinsics
+        assert 1.2 * 260 <= focal <= 1.6 * 260 and (cx, cy) == (173, 130)
+        assert is_inside(project(camera, joints), SENSOR).mean() > 0.7
+    assert -1.0 <= min(yaws) < -0.5 and 0.5 < max(yaws) <= 1.0
+    with pytest.raises(DataError, match="finite joints"):
+        sample_camera(np.random.default_rng(0), np.full((1, 3), np.nan), SENSOR)
