@@ -72,6 +72,13 @@ def check_inside(events: Events, outside: int) -> None:
         )
 
 
+def check_encoded(histogram: np.ndarray, num_channels: int, dtype: type) -> None:
+    """Raise `ValueError` unless `histogram` is [N, num_channels, H, W] of `dtype`, as an encoding returns it."""
+    if histogram.ndim != 4 or histogram.shape[1] != num_channels or histogram.dtype != dtype:
+        expected = f"[N, {num_channels}, H, W] {np.dtype(dtype).name}"
+        raise ValueError(f"histogram must be {expected}, got {histogram.shape} {histogram.dtype}")
+
+
 def _scale_and_offset(sensor_size: SensorSize, options: ImageFit) -> tuple[tuple[Fraction, Fraction], ...]:
     """Of x and of y: image px = scale * sensor px + offset. Exact, or rounding would decide about a pixel."""
     sizes = image_size(sensor_size, options)

@@ -141,8 +141,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     Source: SensorsINI/DHP19, normalizeImage3Sigma.m. There one channel holds both polarities.
     """
     channels = 2 if options.polarity else 1
-    if histogram.ndim != 4 or histogram.shape[1] != channels or histogram.dtype != np.uint16:
-        raise ValueError(f"histogram must be [N, {channels}, H, W] uint16, got {histogram.shape} {histogram.dtype}")
+    image_geometry.check_encoded(histogram, channels, np.uint16)
     from ctlev_core import histogram as kernels
 
     histogram = np.ascontiguousarray(histogram)

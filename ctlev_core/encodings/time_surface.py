@@ -81,8 +81,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
         ValueError: the shape or dtype is not that of surfaces encoded with these options.
     """
     channels = 2 if options.polarity else 1
-    if histogram.ndim != 4 or histogram.shape[1] != channels or histogram.dtype != np.float32:
-        raise ValueError(f"histogram must be [N, {channels}, H, W] float32, got {histogram.shape} {histogram.dtype}")
+    image_geometry.check_encoded(histogram, channels, np.float32)
     values = np.floor(255.0 * histogram).astype(np.uint8)
     images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
     images[..., 0], images[..., 2] = values[:, 0], values[:, -1]

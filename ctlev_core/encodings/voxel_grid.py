@@ -125,8 +125,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
         ValueError: the shape or dtype is not that of grids encoded with these options.
     """
     channels = options.num_bins * (2 if options.polarity == "separate" else 1)
-    if histogram.ndim != 4 or histogram.shape[1] != channels or histogram.dtype != np.float32:
-        raise ValueError(f"histogram must be [N, {channels}, H, W] float32, got {histogram.shape} {histogram.dtype}")
+    image_geometry.check_encoded(histogram, channels, np.float32)
     images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
     for grid, image in zip(histogram, images, strict=True):
         if options.polarity == "separate":
