@@ -24,7 +24,7 @@ def poses(count=3, joint_set="dhp19"):
 @pytest.mark.parametrize("joint_set", sorted(JOINT_SETS))
 def test_a_shift_counts_in_the_camera_frame_alone(joint_set):
     target = poses(joint_set=joint_set)
-    scores = mpjpe3d.compute({"joints3d": target + [30, 40, 0]}, labels(target, joint_set), mpjpe3d.Options())
+    scores = mpjpe3d.compute({"joints3d": target + np.array([30, 40, 0])}, labels(target, joint_set), mpjpe3d.Options())
     assert list(scores) == ["mpjpe3d_pelvis_mm", "mpjpe3d_pa_mm", "mpjpe3d_mm"]
     # float32 labels at 3 m are good to 0.1 um.
     assert scores["mpjpe3d_mm"] == pytest.approx(50, abs=1e-3)
@@ -43,7 +43,7 @@ def test_one_wrong_joint_of_thirteen():
     wrong = target.copy()
     wrong[0, 0, 2] += 130
     options = mpjpe3d.Options(alignment="none")
-    assert list(mpjpe3d.compute({"joints3d": wrong}, labels(target), options))[0] == "mpjpe3d_mm"
+    assert next(iter(mpjpe3d.compute({"joints3d": wrong}, labels(target), options))) == "mpjpe3d_mm"
     np.testing.assert_allclose(mpjpe3d.compute_rows({"joints3d": wrong}, labels(target), options), [10], atol=1e-4)
 
 
@@ -51,7 +51,7 @@ def test_unknown_joints_do_not_count_and_unknown_hips_leave_no_pelvis():
     target = poses(2)
     target[0, 3] = np.nan
     target[1, 5] = np.nan  # a hip
-    predicted = {"joints3d": np.nan_to_num(target) + [0, 0, 10]}
+    predicted = {"joints3d": np.nan_to_num(target) + np.array([0, 0, 10])}
     rows = mpjpe3d.compute_rows(predicted, labels(target), mpjpe3d.Options())
     assert rows[0] < 1e-3 and np.isnan(rows[1])
     rows = mpjpe3d.compute_rows(predicted, labels(target), mpjpe3d.Options(alignment="none"))
