@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from ctlev_core.intervals import MIN_RECORDINGS, bootstrap_interval
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.report.contact_sheet import contact_sheet_sections
-from ctlev_core.report.html import Curves, ImageGrid, Section, Table, render_report
+from ctlev_core.report.html import Animation, Curves, ImageGrid, Section, Table, render_report
 from ctlev_core.report.realism import realism_sections
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
 from data_contracts import tables
@@ -23,6 +23,9 @@ from data_contracts.manifest import RUN_FILE, Manifest, ManifestRef
 from tasks.stage import Output, stage
 
 GRID_COLUMNS = 10
+FEWEST_MOVING = 8
+"""Frames in the order of time that are worth an animation."""
+MAX_CLIPS = 6
 _TABLES = ("scores", "realism", "recordings")
 
 
@@ -51,6 +54,7 @@ def report(
     sections: list[Section] = [
         headline,
         _grid("Asked for, and sampled", conditions, synthetic),
+        *_motion(conditions, synthetic),
         _real_grid(frames),
         *details,
         *contact_sheet_sections(frames, frame_conditions, conditions),
@@ -189,6 +193,36 @@ def _grid(title: str, conditions: Manifest, synthetic: Manifest) -> ImageGrid:
     rows.append(("synthetic", [synthetic.array("frames")[row] for row in chosen]))
     captions = [synthetic.column("class_name")[row] for row in chosen]
     return ImageGrid(title, rows, column_labels=captions, caption="One column a sample, none chosen by eye.")
+
+
+def _motion(conditions: Manifest, synthetic: Manifest) -> list[Section]:
+    """Conditions beside the frames sampled for them, as they follow in time, where they do."""
+    if "images.npy" not in conditions.files:
+        return []
+    runs = [run for run in _runs(synthetic.column("source_id")) if len(run[1]) >= FEWEST_MOVING][:MAX_CLIPS]
+    if not runs:
+        return []
+    clips = []
+    for _, rows, _ in runs:
+        pictures = [np.asarray(array[rows]) for array in (conditions.array("images"), synthetic.array("frames"))]
+        clips.append((synthetic.column("class_name")[rows[0]], np.concatenate(pictures, axis=2)))
+    step_us = float(np.median([step for _, _, step in runs]))
+    caption = "Left the condition, right the frame sampled for it; every frame is sampled on its own."
+    return [Animation("In motion", clips, 1e6 / step_us, caption)]
+
+
+def _runs(source_ids: list[str]) -> list[tuple[str, np.ndarray, float]]:
+    """Rows that follow one another in the time of one recording: its name, the rows, the median step in us."""
+    found: list[tuple[str, list[int], list[int]]] = []
+    for row, source_id in enumerate(source_ids):
+        name, _, time = source_id.rpartition(":")
+        t_us = int(time) if time.isdecimal() else -1
+        if found and found[-1][0] == name and 0 <= found[-1][2][-1] < t_us:
+            found[-1][1].append(row)
+            found[-1][2].append(t_us)
+        else:
+            found.append((name, [row], [t_us]))
+    return [(name, np.array(rows), float(np.median(np.diff(times)))) for name, rows, times in found if len(rows) > 1]
 
 
 def _real_grid(frames: Manifest) -> ImageGrid:

@@ -57,6 +57,37 @@ def image_grid_png(rows: Sequence[Sequence[np.ndarray]], min_cell_px: int = 128,
     return data.tobytes()
 
 
+def animation_webp(frames: np.ndarray, rate_hz: float, min_side_px: int = 192) -> bytes:
+    """An endless animation, enlarged without smoothing.
+
+    Args:
+        frames: [T, H, W, 3] uint8 RGB.
+        rate_hz: frames a second; viewers round times to milliseconds.
+        min_side_px: frames are enlarged by the smallest whole factor that makes their shorter side at least this.
+    Returns:
+        The WebP file.
+    Raises:
+        ValueError: no frames, another shape or dtype, or a rate that is not positive.
+    """
+    import cv2
+
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or 0 in frames.shape:
+        raise ValueError(f"frames must be [T, H, W, 3] uint8 with something in them, got {frames.shape} {frames.dtype}")
+    if not 0 < rate_hz < math.inf:
+        raise ValueError(f"rate_hz must be positive, got {rate_hz}")
+    factor = max(1, math.ceil(min_side_px / min(frames.shape[1:3])))
+    animation = cv2.Animation()
+    animation.frames = [
+        cv2.cvtColor(frame.repeat(factor, axis=0).repeat(factor, axis=1), cv2.COLOR_RGB2BGRA) for frame in frames
+    ]
+    animation.durations = [max(1, round(1000 / rate_hz))] * len(frames)
+    # A quality above 100 is lossless.
+    encoded, data = cv2.imencodeanimation(".webp", animation, [cv2.IMWRITE_WEBP_QUALITY, 101])
+    if not encoded:
+        raise ValueError(f"{len(frames)} frames of {frames.shape[2]} x {frames.shape[1]} px do not fit into a WebP")
+    return data.tobytes()
+
+
 def _to_rgb(image: np.ndarray) -> np.ndarray:
     image = np.asarray(image)
     is_grey, is_rgb = image.ndim == 2, image.ndim == 3 and image.shape[-1] == 3

@@ -93,7 +93,24 @@ class Curves:
     caption: str = ""
 
 
-Section = Text | Table | ImageGrid | Curves
+@dataclass(frozen=True)
+class Animation:
+    """Moving pictures side by side, played for ever.
+
+    Attributes:
+        title: heading of the section.
+        clips: (label, frames [T, H, W, 3] uint8) of each.
+        rate_hz: frames a second.
+        caption: what the reader sees.
+    """
+
+    title: str
+    clips: Sequence[tuple[str, np.ndarray]]
+    rate_hz: float
+    caption: str = ""
+
+
+Section = Text | Table | ImageGrid | Curves | Animation
 
 
 def render_report(*, title: str, lead: str, verdict: str, sections: Sequence[Section], footer: str = "") -> str:
@@ -155,6 +172,8 @@ def _section(section: Section) -> str:
         return _table(section)
     if isinstance(section, ImageGrid):
         return _image_grid(section)
+    if isinstance(section, Animation):
+        return _animation(section)
     return _curves(section)
 
 
@@ -268,6 +287,17 @@ def _image_grid(grid: ImageGrid) -> str:
         f'<div class="heads">{heads}</div><div class="labels">{labels}</div>'
         f'<img alt="{description}" src="data:image/png;base64,{png}"></div></div>'
     )
+
+
+def _animation(animation: Animation) -> str:
+    if not animation.clips:
+        return _caption(animation.caption) + '<p class="empty">No pictures.</p>'
+    parts = []
+    for label, frames in animation.clips:
+        webp = base64.b64encode(figures.animation_webp(frames, animation.rate_hz)).decode("ascii")
+        source = f'<img alt="{html.escape(label)}" src="data:image/webp;base64,{webp}">'
+        parts.append(f"<figure>{source}<figcaption>{_inline(label)}</figcaption></figure>")
+    return f'{_caption(animation.caption)}<div class="clips">{"".join(parts)}</div>'
 
 
 def _curves(curves: Curves) -> str:

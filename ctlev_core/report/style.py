@@ -50,6 +50,10 @@ th[aria-sort=descending] button::after { content: " \\25be"; color: var(--accent
 .grid .labels { display: grid; grid-template-rows: repeat(var(--rows), 1fr); max-width: 9rem; }
 .grid .labels span { font-size: .85rem; line-height: 1.25; color: var(--soft); align-self: center; }
 .grid img { display: block; width: 100%; height: auto; }
+.clips { display: flex; flex-wrap: wrap; gap: 1rem 1.4rem; }
+.clips figure { margin: 0; }
+.clips figcaption { font-size: .85rem; line-height: 1.3; color: var(--soft); max-width: 24rem; margin-top: .25rem; }
+.clips img { display: block; max-width: 100%; height: auto; }
 svg { display: block; width: 100%; max-width: 660px; min-width: 430px; height: auto; color: var(--ink); }
 svg text { font-family: inherit !important; }
 .legend { display: flex; flex-wrap: wrap; gap: .2rem 1.3rem; margin: .4rem 0 0; padding: 0; list-style: none;

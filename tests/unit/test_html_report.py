@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.report.figures import curves_svg, image_grid_png, series_style
-from ctlev_core.report.html import Curves, ImageGrid, Table, Text, format_column, render_report
+from ctlev_core.report.figures import animation_webp, curves_svg, image_grid_png, series_style
+from ctlev_core.report.html import Animation, Curves, ImageGrid, Table, Text, format_column, render_report
 
 HOSTILE = "<script>alert(\"1\")</script> & 'x' http://example.org"
 VOID = {"meta", "img", "br"}
@@ -194,3 +194,43 @@ def test_wrong_sections_are_named():
         render(ImageGrid("G", [("r", [np.zeros((4, 4), np.uint8)] * 2)], column_labels=["a"]))
     with pytest.raises(ValueError, match="series 'a': x and y must have the same length"):
         render(Curves("C", {"a": ([1, 2], [1.0])}, "x", "y"))
+
+
+def moving_square(count=5, side=16):
+    frames = np.zeros((count, side, side, 3), np.uint8)
+    for index, frame in enumerate(frames):
+        frame[2:6, index : index + 4] = 255, 40 * index, 0
+    return frames
+
+
+def test_an_animation_plays_every_frame_in_its_time():
+    frames = moving_square()
+    encoded = np.frombuffer(animation_webp(frames, 12.5, min_side_px=32), np.uint8)
+    read, animation = cv2.imdecodeanimation(encoded)
+    assert read and len(animation.frames) == 5 and list(animation.durations) == [80] * 5
+    for frame, shown in zip(frames, animation.frames, strict=True):
+        colours = cv2.cvtColor(shown, cv2.COLOR_BGRA2RGB)
+        np.testing.assert_array_equal(colours, frame.repeat(2, axis=0).repeat(2, axis=1))
+
+
+def test_animations_stand_in_the_page_with_their_labels():
+    page = render_report(
+        title="t", lead="", verdict="", sections=[Animation("In motion", [("a <b>", moving_square())], 10.0)]
+    )
+    assert page.count("data:image/webp;base64,") == 1 and "a &lt;b&gt;" in page
+    empty = render_report(title="t", lead="", verdict="", sections=[Animation("In motion", [], 10.0)])
+    assert "No pictures." in empty
+
+
+@pytest.mark.parametrize(
+    ("frames", "rate_hz"),
+    [
+        (np.zeros((0, 4, 4, 3), np.uint8), 10),
+        (np.zeros((2, 4, 4, 3)), 10),
+        (moving_square(), 0),
+        (moving_square(), np.nan),
+    ],
+)
+def test_what_is_no_animation_is_refused(frames, rate_hz):
+    with pytest.raises(ValueError, match="must be"):
+        animation_webp(frames, rate_hz)
