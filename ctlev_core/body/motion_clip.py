@@ -26,6 +26,9 @@ Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 Y_UP_TO_Z_UP = Z_UP_TO_Y_UP.T.copy()
 """The way back, for tools that expect z up."""
 
+LARGEST = 1e6
+"""rad, m and s: no motion goes there, and not far beyond it squares of numbers overflow."""
+
 _SAME_MOMENT = 1e-6
 """In frames: a time this close to a frame's means that frame, for times are sums of rounded numbers."""
 
@@ -53,7 +56,7 @@ class MotionClip:
 
 
 def check_clip(clip: MotionClip, where: str) -> MotionClip:
-    """Raise `DataError` unless shapes agree, there is a frame, times rise and every number is finite."""
+    """Raise `DataError` unless shapes agree, there is a frame, times rise and every number is finite and sensible."""
     count = len(clip)
     expected = {"pose": (count, 72), "betas": (10,), "transl": (count, 3), "time_s": (count,)}
     for name, shape in expected.items():
@@ -63,9 +66,11 @@ def check_clip(clip: MotionClip, where: str) -> MotionClip:
     if count == 0:
         raise DataError(f"{where}: expected a motion, got one of zero frames")
     for name in ("pose", "transl", "time_s"):
-        wrong = ~np.isfinite(getattr(clip, name).reshape(count, -1)).all(axis=1)
-        if wrong.any():
-            raise DataError(f"{where}: {name} of frame {int(np.argmax(wrong))} is not finite")
+        values = getattr(clip, name).reshape(count, -1)
+        for what, is_right in (("not finite", np.isfinite(values)), (f"beyond {LARGEST:g}", np.abs(values) <= LARGEST)):
+            wrong = ~is_right.all(axis=1)
+            if wrong.any():
+                raise DataError(f"{where}: {name} of frame {int(np.argmax(wrong))} is {what}")
     if not np.isfinite(clip.betas).all():
         raise DataError(f"{where}: betas are not finite: {clip.betas.tolist()}")
     late = np.flatnonzero(np.diff(clip.time_s) <= 0)

@@ -158,6 +158,7 @@ def test_times_that_cannot_be(times):
         ({"pose": np.zeros((0, 72)), "transl": np.zeros((0, 3)), "time_s": np.zeros(0)}, "zero frames"),
         ({"pose": np.full((5, 72), np.nan)}, "pose of frame 0 is not finite"),
         ({"transl": np.array([[0, 0, 0]] * 3 + [[0, np.inf, 0]] + [[0, 0, 0]])}, "transl of frame 3 is not finite"),
+        ({"pose": np.full((5, 72), 1e200)}, "pose of frame 0 is beyond 1e"),
         ({"betas": np.full(10, np.nan)}, "betas are not finite"),
         ({"betas": np.zeros(16)}, r"betas must be \[10\], got \[16\]"),
         ({"transl": np.zeros((4, 3))}, r"transl must be \[5, 3\], got \[4, 3\]"),
