@@ -3,6 +3,7 @@
 A pickle is a program. Here it may build dicts, lists, tuples, sets, numbers, strings, bytes, None, and NumPy arrays
 and scalars of plain types (bool, int, float, complex, bytes, str). The globals a file names are never imported:
 stand-ins of the few that such data needs take their place. Every other global, instruction or state is a `DataError`.
+A caller may name classes of which it wants the state: a `StandIn` then holds that, itself plain data.
 Arrays are built from checked shapes and sizes, because NumPy itself trusts the state a file gives, and nothing is
 allocated for bytes that a file claims but does not hold.
 
@@ -15,7 +16,8 @@ import math
 import pickle
 import re
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -34,6 +36,27 @@ class Marker:
 
 
 NDARRAY = Marker()
+_OBJECT = Marker()
+
+
+@dataclass(eq=False)
+class StandIn:
+    """In the place of an object whose class was named as wanted: what the file says about it, and none of its code.
+
+    Attributes:
+        name: of the class, as `module.Class`.
+        state: what the class would have got to restore itself from; None where the file gives none.
+    """
+
+    name: str
+    state: Any = None
+
+
+class _StandInClass(Marker):
+    """A class in whose place `StandIn`s are made."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
 
 
 class _Dtype:
@@ -132,6 +155,7 @@ class PlainUnpickler(_BaseUnpickler):
     Args:
         reader: the bytes of the file.
         max_bytes: limit of the bytes of all arrays together.
+        stand_ins: classes, as `module.Class`, of which a `StandIn` is made; none of them is imported.
     """
 
     GLOBALS: ClassVar[dict[str, Any]] = {
@@ -152,7 +176,7 @@ class PlainUnpickler(_BaseUnpickler):
     }
     dispatch: ClassVar[dict[int, Callable]] = dict(_BaseUnpickler.dispatch)
 
-    def __init__(self, reader: BoundedReader, max_bytes: int) -> None:
+    def __init__(self, reader: BoundedReader, max_bytes: int, stand_ins: Collection[str] = ()) -> None:
         super().__init__(reader, encoding="latin1")
         self.reader = reader
         self._array_bytes_left = self._max_bytes = max_bytes
@@ -163,6 +187,13 @@ class PlainUnpickler(_BaseUnpickler):
             for name, method in self.ARRAY_MAKERS.items()
         }
         self._globals = {**self.GLOBALS, **makers}
+        if stand_ins:
+            for module in ("copyreg", "copy_reg"):
+                self._globals[f"{module}._reconstructor"] = _reconstruct_stand_in
+            for module in ("builtins", "__builtin__"):
+                self._globals[f"{module}.object"] = _OBJECT
+            self._globals.update((name, _StandInClass(name)) for name in stand_ins)
+        self._stand_ins = stand_ins
 
     def load(self) -> Any:
         """The object.
@@ -180,7 +211,8 @@ class PlainUnpickler(_BaseUnpickler):
         """What stands in for a global."""
         meaning = self._globals.get(f"{module}.{name}")
         if meaning is None:
-            raise DataError(f"refused: it names {module}.{name}, and only plain data and NumPy arrays are read")
+            wanted = ", ".join(["plain data", *sorted(self._stand_ins)])
+            raise DataError(f"refused: it names {module}.{name}, and only {wanted} and NumPy arrays are read")
         return meaning
 
     def load_reduce(self) -> None:
@@ -198,10 +230,19 @@ class PlainUnpickler(_BaseUnpickler):
         target = self.stack[-1]
         if isinstance(target, _Dtype):
             target.set_state(state)
+        elif isinstance(target, StandIn) and target.state is None:
+            target.state = state
         elif id(target) in self._unfilled:
             self._fill(self._unfilled.pop(id(target)), state)
         else:
             raise DataError(f"refused: it sets the state of {type(target).__name__}")
+
+    def load_newobj(self) -> None:
+        """How protocols 2 and later make an object: here a stand-in, of the classes that were named as wanted."""
+        arguments = self.stack.pop()
+        if not isinstance(self.stack[-1], _StandInClass) or arguments != ():
+            self.refuse()
+        self.stack[-1] = StandIn(self.stack[-1].name)
 
     def load_bytearray8(self) -> None:
         """A bytearray; pickle's own allocates it before it looks whether the bytes are there."""
@@ -238,13 +279,14 @@ class PlainUnpickler(_BaseUnpickler):
 
     dispatch[pickle.REDUCE[0]] = load_reduce
     dispatch[pickle.BUILD[0]] = load_build
+    dispatch[pickle.NEWOBJ[0]] = load_newobj
     dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8
     dispatch[pickle.SETITEM[0]] = load_setitem
     dispatch[pickle.SETITEMS[0]] = load_setitems
     dispatch[pickle.DICT[0]] = load_dict
     dispatch[pickle.ADDITEMS[0]] = load_additems
     dispatch[pickle.FROZENSET[0]] = load_frozenset
-    for _opcode in ("INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4"):
+    for _opcode in ("INST", "OBJ", "NEWOBJ_EX", "PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4"):
         dispatch[getattr(pickle, _opcode)[0]] = refuse
     for _opcode in ("NEXT_BUFFER", "READONLY_BUFFER"):
         dispatch[getattr(pickle, _opcode)[0]] = refuse
@@ -291,14 +333,24 @@ class PlainUnpickler(_BaseUnpickler):
         return array_of(dtype_of(kind), self._content(shape, kind, raw), shape, order)
 
 
+def _reconstruct_stand_in(kind: object, base: object, state: object) -> StandIn:
+    """How protocols 0 and 1 make an object."""
+    if not isinstance(kind, _StandInClass) or base is not _OBJECT or state is not None:
+        raise DataError("refused: it makes an object that is not plain data")
+    return StandIn(kind.name)
+
+
 def _check_plain(loaded: object) -> None:
-    """Raise `DataError` where a stand-in was left in the result."""
+    """Raise `DataError` where the result holds anything but plain data, arrays and the stand-ins that were asked for."""
     waiting, seen = [loaded], set()
     while waiting:
         value = waiting.pop()
         if isinstance(value, np.ndarray | np.generic) or id(value) in seen:
             continue
-        if not isinstance(value, _PLAIN_TYPES):
+        if isinstance(value, StandIn):
+            seen.add(id(value))
+            waiting.append(value.state)
+        elif not isinstance(value, _PLAIN_TYPES):
             raise DataError(f"refused: it holds something that is no plain data ({type(value).__name__})")
         if isinstance(value, dict | list | tuple | set | frozenset):
             seen.add(id(value))

@@ -15,7 +15,7 @@ import gzip
 import lzma
 import pickle
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
@@ -32,18 +32,21 @@ _PIECE = 2**20
 _OBJECT = Marker()
 
 
-def load(path: Path, max_bytes: int = MAX_BYTES) -> Any:
+def load(path: Path, max_bytes: int = MAX_BYTES, stand_ins: Collection[str] = ()) -> Any:
     """The object of a pickle file, protocols 0 to 5.
 
     Args:
         path: the file; what follows the first pickle in it is not read.
         max_bytes: more than this, in the file or in the arrays made from it, is refused.
+        stand_ins: classes, as `module.Class`, that the file may name besides: in the place of such an object comes a
+            `plain_unpickler.StandIn` with its state, which is plain data again. No code of the class runs.
     Raises:
         DataError: no such file, damaged, too large, or it holds anything but plain data; a function or class it names
             is told by name, and was not called.
     """
     with _open(path, max_bytes) as file:
-        return _load(path, lambda: PlainUnpickler(BoundedReader(file, path.stat().st_size), max_bytes).load())
+        reader = BoundedReader(file, path.stat().st_size)
+        return _load(path, lambda: PlainUnpickler(reader, max_bytes, stand_ins).load())
 
 
 def load_joblib(path: Path, max_bytes: int = MAX_BYTES) -> Any:
