@@ -1,7 +1,7 @@
 """Procedural motions: key poses, interpolated smoothly, varied at random, and set on the ground.
 
 SEEN motions are in the training recordings of `studio`, UNSEEN ones are there as conditions to sample from, HELD_OUT
-ones are in tests only.
+ones are in tests only; EVERYDAY_MOTIONS have no part in it.
 """
 
 from __future__ import annotations
@@ -12,13 +12,17 @@ from functools import cache
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+from ctlev_core.body.everyday_motions import EVERYDAY_MOTIONS
 from ctlev_core.body.keyframes import HELD_OUT, MOTIONS, SEEN, STANDING, UNSEEN, Motion, Pose
 from ctlev_core.body.layer import NUM_JOINTS, joint_transforms, load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle, matrix_from_euler, slerp
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
-__all__ = ["HELD_OUT", "MOTIONS", "SEEN", "UNSEEN", "MotionStyle", "pose_at", "sample_pose", "sample_style"]
+__all__ = [
+    "EVERYDAY_MOTIONS", "HELD_OUT", "MOTIONS", "SEEN", "UNSEEN", "MotionStyle", "channels_at_phase", "find_motion",
+    "pose_at", "rotations_from_channels", "sample_pose", "sample_style",
+]  # fmt: skip
 
 TRUNK_CHANNELS = ("pitch", "yaw", "roll", "bend", "twist", "lean", "nod", "look", "jump")
 SIDE_CHANNELS = ("arm", "abduct", "turn", "elbow", "hip", "spread", "toes", "knee", "ankle")
@@ -57,7 +61,7 @@ class MotionStyle:
 
 def sample_style(name: str, rng: np.random.Generator, habit_rad: float = 0.07) -> MotionStyle:
     """A random way to perform the motion `name`; `habit_rad` is the standard deviation of the joint offsets."""
-    motion = _motion(name)
+    motion = find_motion(name)
     habits = habit_rad * rng.normal(size=(2, NUM_JOINTS, 3))
     habits[:, 0] = 0.0
     return MotionStyle(
@@ -79,7 +83,7 @@ def pose_at(name: str, time_s: np.ndarray, style: MotionStyle) -> tuple[np.ndarr
     """The poses of a motion at given times.
 
     Args:
-        name: a key of `MOTIONS`.
+        name: a key of `MOTIONS` or `EVERYDAY_MOTIONS`.
         time_s: [T], at least 0; any order.
         style: how it is performed.
     Returns:
@@ -92,21 +96,27 @@ def pose_at(name: str, time_s: np.ndarray, style: MotionStyle) -> tuple[np.ndarr
     if time_s.ndim != 1 or not (np.isfinite(time_s).all() and (time_s >= 0).all()):
         raise DataError(f"motion {name!r}: time_s must be [T], finite and not negative")
     channels = _channels_at(name, time_s, style)
-    rotations = _rotations(channels, time_s, style)
+    rotations = rotations_from_channels(channels, time_s, style)
     # Contact with the ground has a history, so it is followed on a grid that does not depend on the times asked for.
     last = int(np.ceil(time_s.max(initial=0.0) / GROUND_STEP_S)) + 1
     grid_s = GROUND_STEP_S * np.arange(last + 1)
     grid_channels = _channels_at(name, grid_s, style)
-    ground = _walk_on_ground(_rotations(grid_channels, grid_s, style))
+    ground = _walk_on_ground(rotations_from_channels(grid_channels, grid_s, style))
     transl = np.stack([np.interp(time_s, grid_s, ground[:, axis]) for axis in range(3)], axis=1)
     transl[:, 1] += np.maximum(channels[:, COLUMN["jump"]], 0.0)
     return rotations, transl
 
 
-def _motion(name: str) -> Motion:
-    if name not in MOTIONS:
-        raise DataError(f"unknown motion {name!r}; known: {', '.join(MOTIONS)}")
-    return MOTIONS[name]
+def find_motion(name: str) -> Motion:
+    """The key poses of a motion.
+
+    Raises:
+        DataError: neither `MOTIONS` nor `EVERYDAY_MOTIONS` has it.
+    """
+    motion = MOTIONS.get(name) or EVERYDAY_MOTIONS.get(name)
+    if motion is None:
+        raise DataError(f"unknown motion {name!r}; known: {', '.join([*MOTIONS, *EVERYDAY_MOTIONS])}")
+    return motion
 
 
 def _vector(*poses: Pose) -> np.ndarray:
@@ -130,7 +140,7 @@ def _mirror(channels: np.ndarray) -> np.ndarray:
 @cache
 def _track(name: str) -> tuple[CubicSpline | PchipInterpolator, np.ndarray]:
     """Channels as a smooth function of the phase, and their mean [C]."""
-    motion = _motion(name)
+    motion = find_motion(name)
     phases = [phase for phase, _ in motion.keys]
     poses = [_vector(STANDING, motion.base, pose) for _, pose in motion.keys]
     if motion.symmetric:
@@ -144,22 +154,38 @@ def _track(name: str) -> tuple[CubicSpline | PchipInterpolator, np.ndarray]:
 
 def _channels_at(name: str, time_s: np.ndarray, style: MotionStyle) -> np.ndarray:
     """[T, C]: degrees, and metres for `jump`."""
-    motion = _motion(name)
+    phase = style.start + style.speed * time_s / find_motion(name).duration_s
+    return channels_at_phase(name, phase, style.amplitude, style.mirrored)
+
+
+def channels_at_phase(name: str, phase: np.ndarray, amplitude: float, mirrored: bool) -> np.ndarray:
+    """The channels of a motion at given phases.
+
+    Args:
+        name: of the motion.
+        phase: [T]; a cyclic motion goes round with each whole number, another one holds its ends outside of [0, 1].
+        amplitude: factor on the deviation from the mean pose.
+        mirrored: left and right exchanged.
+    Returns:
+        [T, C] in the order of `CHANNELS`: degrees, and metres for `jump`.
+    Raises:
+        DataError: unknown motion.
+    """
+    motion = find_motion(name)
     track, mean = _track(name)
-    phase = style.start + style.speed * time_s / motion.duration_s
     turns = motion.turn_deg * phase
     phase = phase % 1.0 if motion.cyclic else np.clip(phase, 0.0, 1.0)
-    factor = np.array([1.0 if channel in ORIENTATION_CHANNELS else style.amplitude for channel in CHANNELS])
+    factor = np.array([1.0 if channel in ORIENTATION_CHANNELS else amplitude for channel in CHANNELS])
     channels = mean + factor * (track(phase) - mean)
     channels[:, COLUMN["yaw"]] += turns
     # Knees and elbows do not bend backwards, whatever the amplitude.
     for hinge in ("l_knee", "r_knee", "l_elbow", "r_elbow"):
         channels[:, COLUMN[hinge]] = np.clip(channels[:, COLUMN[hinge]], 0.0, 150.0)
-    return _mirror(channels) if style.mirrored else channels
+    return _mirror(channels) if mirrored else channels
 
 
-def _rotations(channels: np.ndarray, time_s: np.ndarray, style: MotionStyle) -> np.ndarray:
-    """[T, 24, 3, 3] from channels [T, C], with the habits of the style on top."""
+def rotations_from_channels(channels: np.ndarray, time_s: np.ndarray, style: MotionStyle) -> np.ndarray:
+    """Rotations [T, 24, 3, 3] relative to the parent from channels [T, C], the habits of the style at [T] s on top."""
     value = {name: channels[:, column] for name, column in COLUMN.items()}
     zero = np.zeros(len(channels))
     rotations = np.tile(np.eye(3), (len(channels), NUM_JOINTS, 1, 1))

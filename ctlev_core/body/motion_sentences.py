@@ -1,0 +1,333 @@
+"""Sentences about one person's motion, taken apart into actions: a small grammar, in which every word must be known.
+
+    sentence   = clause { ("," | "then" | "and" | "before" | ...) clause }
+    clause     = action [ ("while" | "as") action ]
+    action     = a verb or noun of `motion_words.WORDS`, and beside it, in any order: how often, how long, how fast, how
+                 far out, with which limb, in which direction
+
+A word that is not known is an error and never passed over, because a motion that leaves out what the sentence says is
+a wrong label.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cache
+
+from ctlev_core.body import motion_words as words
+from ctlev_core.body.motion_words import MotionWord
+from data_contracts.errors import DataError
+
+MAX_COUNT, MAX_DURATION_S = words.MAX_COUNT, words.MAX_DURATION_S
+
+_TOKEN = re.compile(r"[a-z]+(?:'s)?|\d+(?:\.\d+)?|,")
+
+
+@dataclass(frozen=True)
+class Action:
+    """One thing that the person does.
+
+    Attributes:
+        word: what.
+        verb: as the vocabulary has it.
+        count: how often, or how many steps; None = not said.
+        duration_s: None = not said.
+        speed: 1 = ordinary.
+        amplitude: 1 = ordinary.
+        limbs: "left", "right", "both", or "" for not said.
+        directions: keys of a set of `motion_words.DIRECTIONS`' values.
+        angle_deg: of a turn; None = not said.
+        meanwhile: what the arms and head, or the heading, do at the same time.
+    """
+
+    word: MotionWord
+    verb: str
+    count: int | None = None
+    duration_s: float | None = None
+    speed: float = 1.0
+    amplitude: float = 1.0
+    limbs: str = ""
+    directions: frozenset[str] = frozenset()
+    angle_deg: float | None = None
+    meanwhile: Action | None = None
+
+
+@dataclass
+class _Clause:
+    """What the words of a clause said so far."""
+
+    word: MotionWord | None = None
+    verb: str = ""
+    values: dict[str, float] = field(default_factory=dict)
+    limbs: set[str] = field(default_factory=set)
+    limb_kind: str = ""
+    directions: set[str] = field(default_factory=set)
+    simultaneous: bool = False
+    number: float | None = None
+    exponent: float = 1.0
+
+
+def parse_sentence(sentence: str) -> tuple[Action, ...]:
+    """The actions of a sentence, in the order in which they are done.
+
+    Raises:
+        DataError: an unknown word (it is named, with the nearest known ones), no action, two actions without a word
+            between, or a detail that does not fit to its action.
+    """
+    where = f"sentence {sentence!r}"
+    if not isinstance(sentence, str) or not sentence.strip():
+        raise DataError(f"{where}: expected words")
+    try:
+        clauses = [(link, _read_clause(tokens)) for link, tokens in _split(_tokens(sentence))]
+        actions = _join(clauses)
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from None
+    if not actions:
+        raise DataError(f"{where}: names no action; known: {', '.join(known_verbs())}")
+    return tuple(actions)
+
+
+def known_verbs() -> list[str]:
+    """Every verb and noun of the vocabulary, uninflected, sorted."""
+    return sorted(" ".join(phrase) for phrase in _phrases())
+
+
+@cache
+def _phrases() -> dict[tuple[str, ...], MotionWord]:
+    return {tuple(phrase.split()): word for word in words.WORDS for phrase in word.phrases}
+
+
+@cache
+def _lemmas() -> dict[str, str]:
+    """Base form of each inflected word of a phrase, and of each light verb."""
+    bases = {part for phrase in _phrases() for part in phrase} | set(words.LIGHT_VERBS)
+    lemmas = {form: base for base in sorted(bases) for form in words.forms_of(base)}
+    # "lay" is a verb of its own and a form of "lie": what is a base form stays one.
+    return {**lemmas, **{base: base for base in bases}}
+
+
+@cache
+def _known_words() -> tuple[str, ...]:
+    tables = (words.SPEEDS, words.AMPLITUDES, words.INTENSIFIERS, words.DIRECTIONS, words.LIMBS, words.NUMBERS)
+    known = set(_lemmas()).union(words.COUNTS, words.SEQUENCE_WORDS, words.WHILE_WORDS, *tables)
+    return tuple(sorted(known))
+
+
+def _tokens(sentence: str) -> list[str]:
+    text = re.sub(r"[.;!:]+(?!\d)", ",", sentence.lower().replace("\N{RIGHT SINGLE QUOTATION MARK}", "'"))
+    text = re.sub(r"at the same time|simultaneously", " simultaneously ", text.replace("-", " "))
+    rest = _TOKEN.sub(" ", text).split()
+    if rest:
+        raise DataError(f"{rest[0]!r} is neither a word nor a number")
+    tokens = [token.removesuffix("'s") for token in _TOKEN.findall(text)]
+    # Before the phrases are looked for, so that "throws a punch" and "shakes his head" are found.
+    tokens = [token for token in tokens if token not in words.FILLERS or token == "both"]
+    following = [*tokens[1:], ""]
+    return [token for token, after in zip(tokens, following, strict=True) if token != "both" or after in words.LIMBS]
+
+
+def _split(tokens: list[str]) -> Iterator[tuple[str, list[str]]]:
+    """Clauses, and the kind of word before each: "then" or "while"."""
+    link, clause = "then", []
+    for token in tokens:
+        if token not in words.SEQUENCE_WORDS + words.WHILE_WORDS:
+            clause.append(token)
+            continue
+        if (token == "after" and clause) or (token == "before" and not clause and link == "then"):
+            raise DataError(f"{token!r} here turns the order round; say it in the order in which it is done")
+        if clause:
+            yield link, clause
+            link, clause = "then", []
+        if token in words.WHILE_WORDS:
+            link = "while"
+    if clause:
+        yield link, clause
+
+
+def _read_clause(tokens: list[str]) -> _Clause:
+    clause, at = _Clause(), 0
+    while at < len(tokens):
+        token, following = tokens[at], tokens[at + 1] if at + 1 < len(tokens) else ""
+        phrase = () if _is_unit(clause, token) else _match_phrase(tokens[at:])
+        if phrase:
+            _take_verb(clause, phrase, token)
+        elif not (
+            _take_measure(clause, token) or _take_manner(clause, token) or _take_place(clause, token, following)
+        ) and (_lemmas().get(token) not in words.LIGHT_VERBS):
+            raise DataError(_unknown(token))
+        at += max(1, len(phrase))
+    if clause.number is not None:
+        _set(clause, "count", clause.number, MAX_COUNT)
+    return clause
+
+
+def _is_unit(clause: _Clause, token: str) -> bool:
+    """A step is the unit of a gait in "walks three steps", and an action elsewhere."""
+    gait = clause.word is not None and clause.word.kind == "gait"
+    return clause.number is not None and (token in words.UNITS or (gait and token in ("step", "steps")))
+
+
+def _take_measure(clause: _Clause, token: str) -> bool:
+    """Numbers, and what they count."""
+    if token in words.NUMBERS or token[0].isdigit():
+        clause.number = float(words.NUMBERS.get(token, 0) or token)
+    elif token in words.COUNTS:
+        _set(clause, "count", words.COUNTS[token], MAX_COUNT)
+    elif clause.number is not None and _is_unit(clause, token):
+        name, largest = words.UNITS.get(token, ("steps", MAX_COUNT))
+        _set(clause, name, clause.number, largest)
+        clause.number = None
+    else:
+        return False
+    return True
+
+
+def _take_manner(clause: _Clause, token: str) -> bool:
+    """How fast, how far out, and what else is done."""
+    for name, table in (("speed", words.SPEEDS), ("amplitude", words.AMPLITUDES)):
+        if token in table:
+            clause.values[name] = clause.values.get(name, 1.0) * table[token] ** clause.exponent
+            clause.exponent = 1.0
+            return True
+    if token in words.INTENSIFIERS:
+        clause.exponent *= words.INTENSIFIERS[token]
+    elif token == "simultaneously":
+        clause.simultaneous = True
+    else:
+        return False
+    return True
+
+
+def _take_place(clause: _Clause, token: str, following: str) -> bool:
+    """Limbs and directions; "left" is one or the other."""
+    if token in ("left", "right", "both") and following in words.LIMBS:
+        clause.limbs.add(token)
+    elif token in words.LIMBS:
+        clause.limb_kind = words.LIMBS[token].rstrip("s")
+        if words.LIMBS[token].endswith("s") and not clause.limbs:
+            clause.limbs.add("both")
+        # "One hand" and "two hands" are no counts of the action.
+        clause.number = None if clause.number in (1, 2) else clause.number
+    elif token in words.DIRECTIONS:
+        clause.directions.add(words.DIRECTIONS[token])
+    else:
+        return False
+    return True
+
+
+def _match_phrase(tokens: list[str]) -> tuple[str, ...]:
+    """The longest phrase of the vocabulary that the tokens begin with."""
+    lemmas = tuple(_lemmas().get(token, token) for token in tokens[:3])
+    return next((lemmas[:n] for n in range(len(lemmas), 0, -1) if lemmas[:n] in _phrases()), ())
+
+
+def _take_verb(clause: _Clause, phrase: tuple[str, ...], token: str) -> None:
+    verb = " ".join(phrase)
+    if clause.word is not None:
+        raise DataError(f"{token!r} follows {clause.verb!r} without 'then', 'and' or 'while' between")
+    clause.word, clause.verb = _phrases()[phrase], verb
+    clause.values["speed"] = clause.values.get("speed", 1.0) * words.SPEED_OF_VERB.get(verb, 1.0)
+
+
+def _set(clause: _Clause, name: str, value: float, largest: float) -> None:
+    if not 0 < value <= largest or (name in ("count", "steps") and value != int(value)):
+        whole = "a whole number, " if name in ("count", "steps") else ""
+        raise DataError(f"{value:g} {name.partition('_')[0]}: expected {whole}more than 0 and at most {largest:g}")
+    clause.values[name] = value
+
+
+def _unknown(token: str) -> str:
+    near = difflib.get_close_matches(token, _known_words(), n=3, cutoff=0.6)
+    nearest = f" (nearest known: {', '.join(near)})" if near else ""
+    return f"unknown word {token!r}{nearest}; known actions: {', '.join(known_verbs())}"
+
+
+def _join(clauses: list[tuple[str, _Clause]]) -> list[Action]:
+    """Clauses without a verb go to the one before ("looks left and right"), or after at the start."""
+    joined: list[tuple[str, _Clause]] = []
+    waiting: _Clause | None = None
+    for link, clause in clauses:
+        if clause.word is None and joined:
+            _merge(joined[-1][1], clause)
+        elif clause.word is None:
+            waiting = _merge(waiting, clause) if waiting else clause
+        else:
+            joined.append((link, _merge(clause, waiting) if waiting else clause))
+            waiting = None
+    actions: list[Action] = []
+    for position, (link, clause) in enumerate(joined):
+        action = _action(clause)
+        if link == "while" and not actions:
+            raise DataError("'while' at the start; say first what is done, then what is done meanwhile")
+        if (link == "while" or clause.simultaneous) and actions:
+            actions[-1] = _combine(actions[-1], action)
+        elif clause.simultaneous and position == 0 and len(joined) == 1:
+            raise DataError("at the same time as what?")
+        else:
+            actions.append(action)
+    return actions
+
+
+def _merge(clause: _Clause, more: _Clause) -> _Clause:
+    clause.values.update(more.values)
+    clause.limbs |= more.limbs
+    clause.limb_kind = clause.limb_kind or more.limb_kind
+    clause.directions |= more.directions
+    clause.simultaneous |= more.simultaneous
+    return clause
+
+
+def _action(clause: _Clause) -> Action:
+    """The action of a clause, its details checked."""
+    word, verb = clause.word, clause.verb
+    assert word is not None  # `_join` keeps clauses with a verb alone
+    if word.motion == "raise_arm" and clause.limb_kind != "arm":
+        raise DataError(f"{verb!r} needs an arm, a hand, or both")
+    if clause.limb_kind and clause.limb_kind != word.limb:
+        raise DataError(f"{verb!r} does not know what to do with {clause.limb_kind}s")
+    wrong = sorted(clause.directions - set(word.directions))
+    if wrong:
+        raise DataError(f"{verb!r} cannot go {wrong[0]!r}; possible: {', '.join(word.directions) or 'no direction'}")
+    if clause.directions >= {"forward", "backward"} or (
+        clause.directions >= {"left", "right"} and word.motion != "look"
+    ):
+        raise DataError(f"{verb!r} cannot go {' and '.join(sorted(clause.directions))} at once")
+    if "angle_deg" in clause.values and word.kind != "turn":
+        raise DataError(f"{verb!r} does not know what to do with degrees")
+    values = clause.values
+    if "count" in values and word.kind == "gait":
+        raise DataError(f"{verb!r} is not done so many times; say for how many steps or seconds")
+    count = values.get("count", values.get("steps"))
+    if count is not None and word.kind in ("posture", "rise", "stand"):
+        raise DataError(f"{verb!r} cannot be counted; say for how long")
+    if count is not None and "duration_s" in values:
+        raise DataError(f"{verb!r} has a count and a duration; expected one of them")
+    return Action(
+        word=word,
+        verb=verb,
+        count=None if count is None else int(count),
+        duration_s=values.get("duration_s"),
+        speed=values.get("speed", 1.0),
+        amplitude=values.get("amplitude", 1.0),
+        limbs="both" if len(clause.limbs) > 1 else next(iter(clause.limbs), ""),
+        directions=frozenset(clause.directions),
+        angle_deg=values.get("angle_deg"),
+    )
+
+
+def _combine(base: Action, added: Action) -> Action:
+    """Two actions at the same time: legs from one, arms and head or the heading from the other."""
+    if base.word.kind == "arms" and added.word.kind != "arms":
+        base, added = added, base
+    if base.meanwhile is not None:
+        raise DataError(f"{added.verb!r} would be the third thing at the same time; two are possible")
+    turning = added.word.kind == "turn" and base.word.kind == "gait"
+    if turning or (added.word.kind == "arms" and base.word.kind in ("gait", "step", "stand", "turn", "posture")):
+        return replace(base, meanwhile=added)
+    raise DataError(
+        f"{base.verb!r} and {added.verb!r} cannot be done at the same time; possible is a gait, standing, sitting or "
+        f"turning with something that the arms or the head do, or a gait with a turn"
+    )

@@ -1,0 +1,251 @@
+"""Text to motion: a sentence about one person to a motion of procedural clips, joined smoothly and set on the ground.
+
+A small and honest stand-in for learned models such as MDM (Tevet et al., ICLR 2023): it knows a few dozen verbs
+(`motion_words.py`), and refuses what it does not understand. Whatever has the type `TextToMotion` takes its place; what
+such a model wrote into files comes in through `ctlev_core.motions`.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from ctlev_core.body.ground_contact import stand_on_ground
+from ctlev_core.body.layer import NUM_BETAS, NUM_JOINTS, joint_transforms, load_body
+from ctlev_core.body.motion_clip import MotionClip, check_clip
+from ctlev_core.body.motion_plan import Piece, plan_pieces
+from ctlev_core.body.motion_sentences import parse_sentence
+from ctlev_core.body.motions import (
+    COLUMN,
+    SIDE_CHANNELS,
+    MotionStyle,
+    channels_at_phase,
+    find_motion,
+    rotations_from_channels,
+)
+from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_euler, slerp
+from ctlev_core.skeletons import SMPL_JOINTS
+from data_contracts.errors import DataError
+
+GRID_S = 0.01
+"""Contact with the ground has a history; it is followed at these steps, whatever the rate that is asked for."""
+BLEND_S = 0.4
+BLEND_S_PER_HALF_TURN = 0.9
+"""More where the trunk has to turn far, from standing to the ground say."""
+HABIT_RAD = 0.035
+TEXT_STREAM = 31
+
+ARMS_CHANNELS = (
+    "bend", "twist", "lean", "nod", "look", "l_arm", "l_abduct", "l_turn", "l_elbow", "r_arm", "r_abduct", "r_turn",
+    "r_elbow",
+)  # fmt: skip
+STEP_M = 0.08
+"""Feet that must move so far against one another between two poses make a step, not a slide."""
+STEP_LIFT: dict[str, float] = {"hip": 22.0, "knee": 44.0}
+
+
+class TextToMotion(Protocol):
+    """Anything that makes a motion from a sentence."""
+
+    def __call__(self, sentence: str, *, seed: int = 0, rate_hz: float = 60.0) -> MotionClip:
+        """The motion: y up, metres, the ground at y = 0; at time 0 above the origin, facing +z.
+
+        Equal arguments give equal motions, bit for bit; other seeds other performances. The clip's caption is the
+        sentence.
+        """
+        ...
+
+
+def generate_motion(sentence: str, *, seed: int = 0, rate_hz: float = 60.0) -> MotionClip:
+    """A motion of procedural clips; the default `TextToMotion`.
+
+    Each clip begins where the one before ended, and faces as that ended. Between two clips, every joint goes the
+    shortest way on SO(3) with an eased pace, while both go on; a foot that must be elsewhere is lifted there. After
+    that the body is set on the ground and sticks to it, so no foot slides that did not slide in the clips.
+
+    Args:
+        sentence: such as "a person walks, then jumps twice"; see `motion_sentences.parse_sentence`.
+        seed: of the performance: pace, reach, habits, and sides that the sentence leaves open.
+        rate_hz: frames a second.
+    Returns:
+        T frames of the mean shape.
+    Raises:
+        DataError: the sentence is not understood; the message says which word.
+        ValueError: the rate is not positive and finite, or the seed is negative.
+    """
+    if not 0 < rate_hz < np.inf:
+        raise ValueError(f"rate_hz must be positive and finite, got {rate_hz}")
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}")
+    rng = np.random.default_rng([seed, TEXT_STREAM, *sentence.encode()])
+    actions = parse_sentence(sentence)
+    try:
+        performance = _Performance(plan_pieces(actions, rng), rng)
+    except DataError as error:
+        raise DataError(f"sentence {sentence!r}: {error}") from None
+    time_s = np.arange(int(performance.duration_s * rate_hz + 1e-6) + 1) / rate_hz
+    rotations, transl = performance.sample(time_s)
+    pose = axis_angle_from_matrix(rotations).reshape(len(time_s), 3 * NUM_JOINTS)
+    return check_clip(MotionClip(pose, np.zeros(NUM_BETAS), transl, time_s, sentence), f"sentence {sentence!r}")
+
+
+class _Performance:
+    """Pieces on a common time axis.
+
+    Attributes:
+        duration_s: of all pieces.
+    """
+
+    def __init__(self, pieces: list[Piece], rng: np.random.Generator) -> None:
+        habits = HABIT_RAD * rng.normal(size=(2, NUM_JOINTS, 3))
+        # The pelvis carries the body; hips and feet that are off make it float or slide.
+        habits[:, [SMPL_JOINTS.index(name) for name in ("pelvis", "left_ankle", "right_ankle")]] = 0.0
+        self._style = MotionStyle(0.0, 1.0, 1.0, False, habits[0], habits[1])
+        self._pieces = pieces
+        self._starts_s = np.concatenate([[0.0], np.cumsum([piece.duration_s for piece in pieces])])
+        self.duration_s = float(self._starts_s[-1])
+        headings = [0.0]
+        for piece in pieces:
+            first, last = _channels(piece, np.array([0.0, piece.duration_s]))
+            headings.append(headings[-1] + piece.turn_deg + last[COLUMN["yaw"]] - first[COLUMN["yaw"]])
+        # Clips whose first pose looks aside begin in the direction of the heading, all the same.
+        self._headings_deg = headings
+        self._joins = [self._join(number) for number in range(1, len(pieces))]
+
+    def sample(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations [T, 24, 3, 3] and translations [T, 3] m."""
+        rotations, jump, _ = self._pose(time_s)
+        grid_s = GRID_S * np.arange(int(np.ceil(self.duration_s / GRID_S)) + 2)
+        on_grid, _, velocity = self._pose(grid_s)
+        ground = stand_on_ground(on_grid)
+        ground[1:] += GRID_S * np.cumsum((velocity[1:] + velocity[:-1]) / 2, axis=0)
+        transl = np.stack([np.interp(time_s, grid_s, ground[:, axis]) for axis in range(3)], axis=1)
+        transl[:, 1] += jump
+        return rotations, transl
+
+    def _pose(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rotations [T, 24, 3, 3], height of jumps [T] m and velocity in the air [T, 3] m/s; any times, any order."""
+        rotations = np.empty((len(time_s), NUM_JOINTS, 3, 3))
+        jump, velocity = np.zeros(len(time_s)), np.zeros((len(time_s), 3))
+        for number in range(len(self._pieces)):
+            begin, blend_begin = self._joins[number - 1][:2] if number else (-1.0, -1.0)
+            end = self._joins[number][1] if number < len(self._joins) else np.inf
+            rows = np.flatnonzero((time_s >= begin) & (time_s < end))
+            if not len(rows):
+                continue
+            own, own_jump, own_velocity = self._piece(number, time_s[rows])
+            weight = _ease((time_s[rows] - begin) / (blend_begin - begin)) if number else np.ones(len(rows))
+            mixed = np.flatnonzero(weight < 1)
+            own[mixed] = slerp(rotations[rows[mixed]], own[mixed], weight[mixed, None])
+            rotations[rows] = own
+            jump[rows] = (1 - weight) * jump[rows] + weight * own_jump
+            velocity[rows] = (1 - weight[:, None]) * velocity[rows] + weight[:, None] * own_velocity
+        return rotations, jump, velocity
+
+    def _piece(self, number: int, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        piece, passed_s = self._pieces[number], time_s - self._starts_s[number]
+        channels = _channels(piece, passed_s)
+        for join in (number - 1, number):
+            if 0 <= join < len(self._joins):
+                self._lift_foot(channels, time_s, join)
+        turned = piece.turn_deg * _ease_turn(passed_s / piece.turn_s)
+        channels[:, COLUMN["yaw"]] += self._headings_deg[number] + turned
+        rotations = rotations_from_channels(channels, time_s, self._style)
+        jump = piece.jump_scale * np.maximum(channels[:, COLUMN["jump"]], 0.0)
+        facing = matrix_from_euler("Y", channels[:, COLUMN["yaw"], None])[:, :, 2]
+        airborne = np.clip(jump / 0.04, 0.0, 1.0)
+        return rotations, jump, piece.jump_speed_m_s * airborne[:, None] * facing
+
+    def _join(self, number: int) -> tuple[float, float, str]:
+        """Begin and end in s of the way from the piece before to piece `number`, and the side of a foot to lift."""
+        before, after = self._pieces[number - 1], self._pieces[number]
+        poses = np.concatenate([_channels(before, np.array([before.duration_s])), _channels(after, np.zeros(1))])
+        turn = np.abs(np.diff(poses[:, [COLUMN["pitch"], COLUMN["roll"]]] % 360, axis=0))
+        turn = np.minimum(turn, 360 - turn).max()
+        wanted = BLEND_S + BLEND_S_PER_HALF_TURN * turn / 180
+        half = min(wanted, 0.9 * before.duration_s, 0.9 * after.duration_s) / 2
+        return self._starts_s[number] - half, self._starts_s[number] + half, _stepping_side(poses)
+
+    def _lift_foot(self, channels: np.ndarray, time_s: np.ndarray, join: int) -> None:
+        begin, end, side = self._joins[join]
+        if side:
+            lift = np.sin(np.pi * np.clip((time_s - begin) / (end - begin), 0.0, 1.0)) ** 2
+            for name, degrees in STEP_LIFT.items():
+                channels[:, COLUMN[f"{side}_{name}"]] += lift * degrees
+
+
+def _channels(piece: Piece, passed_s: np.ndarray) -> np.ndarray:
+    """Channels [T, C] of a piece, `passed_s` [T] after its start; before and after it as `Piece.flows` says."""
+    phase = piece.start + (piece.end - piece.start) * passed_s / piece.duration_s
+    if not piece.flows:
+        phase = np.clip(phase, min(piece.start, piece.end), max(piece.start, piece.end))
+    channels = channels_at_phase(piece.motion, phase, piece.amplitude, piece.mirrored)
+    if piece.arms is None:
+        return channels
+    arms = piece.arms
+    return _lay_over(channels, arms, passed_s)
+
+
+def _lay_over(channels: np.ndarray, arms: Piece, passed_s: np.ndarray) -> np.ndarray:
+    """Channels with those of arms and head that the motion `arms` names in their place, eased in and out."""
+    motion = find_motion(arms.motion)
+    cycle_s = min(motion.duration_s, arms.duration_s / arms.end) if motion.cyclic else motion.duration_s
+    left_s = arms.duration_s - passed_s
+    if motion.cyclic:
+        phase = np.clip(passed_s / arms.duration_s, 0.0, 1.0) * arms.end
+    elif arms.end == 1 and arms.duration_s > cycle_s:
+        # Held in the middle for as long as there is time.
+        phase = np.where(passed_s < left_s, np.minimum(passed_s / cycle_s, 0.5), np.maximum(1 - left_s / cycle_s, 0.5))
+    else:
+        rounds = np.clip(passed_s / arms.duration_s, 0.0, 1.0) * arms.end
+        phase = np.where(rounds < arms.end, rounds % 1.0, 1.0)
+    own = channels_at_phase(arms.motion, np.clip(phase, 0.0, None), 1.0, arms.mirrored)
+    columns = _named_columns(arms)
+    ramp_s = min(BLEND_S, arms.duration_s / 3)
+    weight = _ease(np.minimum(passed_s, left_s) / ramp_s) if motion.cyclic else np.ones(len(passed_s))
+    laid = channels.copy()
+    laid[:, columns] += weight[:, None] * (own[:, columns] - channels[:, columns])
+    return laid
+
+
+def _named_columns(arms: Piece) -> list[int]:
+    """Columns of arms and head that the key poses name, on the side where they are performed."""
+    motion = find_motion(arms.motion)
+    names = {name for _, pose in motion.keys for name in pose} | set(motion.base)
+    sides = {f"{side}_{name}" for name in names & set(SIDE_CHANNELS) for side in "lr"}
+    names = (names | sides) & set(ARMS_CHANNELS)
+    if arms.mirrored:
+        swapped = {"l_": "r_", "r_": "l_"}
+        names = {swapped.get(name[:2], name[:2]) + name[2:] for name in names}
+    return [COLUMN[name] for name in sorted(names)]
+
+
+def _stepping_side(poses: np.ndarray) -> str:
+    """`l` or `r`: the foot to lift on the way between two poses [2, C]; empty where none has to move, or one is up."""
+    style = MotionStyle(0.0, 1.0, 1.0, False, np.zeros((NUM_JOINTS, 3)), np.zeros((NUM_JOINTS, 3)))
+    rotations = rotations_from_channels(poses, np.zeros(2), style)
+    rotations[:, 0] = matrix_from_euler("XZ", poses[:, [COLUMN["pitch"], COLUMN["roll"]]])
+    _, joints = joint_transforms(load_body(), rotations, np.zeros(NUM_BETAS), np.zeros((2, 3)))
+    feet = joints[:, [SMPL_JOINTS.index("left_foot"), SMPL_JOINTS.index("right_foot")]]
+    apart = feet[:, 0] - feet[:, 1]
+    moved = np.linalg.norm(np.diff(apart[:, ::2], axis=0))
+    lowest = joints[:, :, 1].min(axis=1, keepdims=True)
+    stand = (feet[..., 1] - lowest < 0.08).all()
+    if moved < STEP_M or not stand:
+        return ""
+    hips = np.abs(np.diff(poses[:, [COLUMN["l_hip"], COLUMN["r_hip"]]], axis=0))[0]
+    return "l" if hips[0] >= hips[1] else "r"
+
+
+def _ease(fraction: np.ndarray) -> np.ndarray:
+    """From 0 to 1 with neither speed nor acceleration at the ends."""
+    u = np.clip(fraction, 0.0, 1.0)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def _ease_turn(fraction: np.ndarray) -> np.ndarray:
+    """From 0 to 1 at a constant pace, but for a tenth at each end."""
+    u, ramp = np.clip(fraction, 0.0, 1.0), 0.1
+    start, end = u**2 / (2 * ramp), 1 - ramp - (1 - u) ** 2 / (2 * ramp)
+    return np.where(u < ramp, start, np.where(u > 1 - ramp, end, u - ramp / 2)) / (1 - ramp)
