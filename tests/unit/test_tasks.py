@@ -3,12 +3,13 @@
 from collections import Counter
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
-from tasks.condition import balanced_choice
+from tasks.condition import _choose, balanced_choice
 
 
 @given(st.lists(st.sampled_from("abc"), min_size=1, max_size=30), st.integers(1, 60), st.integers(0, 1000))
@@ -26,6 +27,14 @@ def test_balanced_choice_takes_turns_and_uses_every_row_before_any_twice(names, 
 def test_balanced_choice_of_more_rows_starts_with_the_same_rows():
     names = ("a", "b") * 10
     np.testing.assert_array_equal(balanced_choice(names, 6, 3), balanced_choice(names, 12, 3)[:6])
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"), [(3, [1, 3, 5]), (6, [0, 1, 2, 3, 4, 5]), (8, [0, 0, 1, 1, 2, 3, 4, 5])]
+)
+def test_in_time_moments_keep_their_order_and_are_evenly_spread(count, expected):
+    moments = pa.table({"class_name": list("abacbc"), "t_us": [0, 10, 20, 0, 10, 20]})
+    assert _choose(moments, count, "in_time", seed=0).equals(moments.take(expected))
 
 
 def row(setting, value, metric="mpjpe2d_px"):
