@@ -3,6 +3,8 @@
 OpenCV camera frame (x right, y down, z forward, m); pixel (row, column) samples the point (column + 0.5, row + 0.5).
 Depth is kept as 1 / z: linear on the screen, so interpolating it is exact, and 0 means "nothing here".
 Edges that two triangles share are covered without gaps: their edge functions are exact negatives of each other.
+Whether a pixel of a small triangle's box is covered is anyone's guess, also the processor's, so nothing branches on it:
+each pixel of the box is written to a queue that grows only at a covered one (a third faster than a branch).
 
 Source: Pineda, A parallel algorithm for polygon rasterization, SIGGRAPH 1988.
 """
@@ -15,6 +17,8 @@ import numpy as np
 from data_contracts.errors import DataError
 
 NEAR_M = 0.05
+QUEUE_LENGTH = 1024
+"""Fragments between the test of coverage and that of depth: 32 kB."""
 
 
 def render_attributes(
@@ -80,34 +84,26 @@ def render_attributes(
 @numba.njit(cache=True, nogil=True)
 def rasterise(vertices, faces, attributes, K, near, cull_back, image, depth_inverse):
     """The kernel behind `render_attributes`, without checks: draws over `image` and `depth_inverse`."""
-    screen = _project(vertices, K, near)
-    _fill(screen, faces, attributes, cull_back, image, depth_inverse)
-    crossing = _count_crossing(screen, faces)
-    if crossing > 0:
-        points, values, pieces = _clip_near(vertices, faces, attributes, screen, near, crossing)
-        # A corner cut off exactly on the plane must count as in front of it: hence half.
-        _fill(_project(points, K, 0.5 * near), pieces, values, cull_back, image, depth_inverse)
+    _draw(vertices, faces, attributes, K, near, cull_back, False, image, depth_inverse)
 
 
 @numba.njit(cache=True, nogil=True)
 def rasterise_normals(vertices, faces, intrinsics, near, normals, depth_inverse):
-    """Unit normals of a mesh in several poses, without checks: draws over `normals` and `depth_inverse`.
+    """Unit normals of the faces that look at the camera, for a mesh in several poses, without checks.
 
     Args:
         vertices: [N, V, 3] float, m, camera frame.
         faces: [F, 3] int32.
         intrinsics: [N, 4] float64, (fx, fy, cx, cy) px.
         near: m.
-        normals: [N, H, W, 3], interpolated with perspective from the vertex normals, then normalised.
-        depth_inverse: [N, H, W].
+        normals: [N, H, W, 3], drawn over; vertex normals interpolated with perspective, then normalised.
+        depth_inverse: [N, H, W], 1 / m, drawn over.
     """
-    corner_normals = np.empty(vertices.shape[1:], vertices.dtype)
-    K = np.zeros((3, 3))
+    K, corners = np.zeros((3, 3)), np.empty(vertices.shape[1:], vertices.dtype)
     for i in range(vertices.shape[0]):
         K[0, 0], K[1, 1], K[0, 2], K[1, 2] = intrinsics[i, 0], intrinsics[i, 1], intrinsics[i, 2], intrinsics[i, 3]
-        _sum_face_normals(vertices[i], faces, corner_normals)
-        rasterise(vertices[i], faces, corner_normals, K, near, True, normals[i], depth_inverse[i])
-        _normalise_covered(normals[i], depth_inverse[i])
+        _average_normals(vertices[i], faces, corners)
+        _draw(vertices[i], faces, corners, K, near, True, True, normals[i], depth_inverse[i])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -121,19 +117,61 @@ def vertex_normals(vertices, faces):
         faces: [F, 3] int32.
     """
     normals = np.empty_like(vertices)
-    _sum_face_normals(vertices, faces, normals)
+    _average_normals(vertices, faces, normals)
     return normals
 
 
 # The helpers take whole arrays rather than one triangle each: numba counts references at every call, with atomic
 # operations, and that would cost more than the triangle (measured: 0.55 ms against 0.08 ms for 13,600 faces at 128 px).
+# Indices are made unsigned where they are used often: numba looks at the sign of others, to count from the end.
 
 
 @numba.njit(cache=True, nogil=True)
-def _project(points, K, near):
-    """Screen position and 1 / z [V, 3] of each point; 1 / z is -1 up to `near`, behind the camera, and at NaN."""
+def _average_normals(vertices, faces, normals):
+    """What `vertex_normals` returns, into `normals`."""
+    normals[:] = 0.0
+    for f in range(faces.shape[0]):
+        a, b, c = np.uint32(faces[f, 0]), np.uint32(faces[f, 1]), np.uint32(faces[f, 2])
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        wx, wy, wz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+        if not np.isfinite(nx + ny + nz):
+            continue
+        for vertex in (a, b, c):
+            normals[vertex, 0] += nx
+            normals[vertex, 1] += ny
+            normals[vertex, 2] += nz
+    for i in range(vertices.shape[0]):
+        length = np.sqrt(normals[i, 0] ** 2 + normals[i, 1] ** 2 + normals[i, 2] ** 2)
+        if length > 0.0:
+            normals[i, 0] /= length
+            normals[i, 1] /= length
+            normals[i, 2] /= length
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw(vertices, faces, attributes, K, near, cull_back, unit_length, image, depth_inverse):
+    """Project, fill, and fill again what is left of the triangles across the near plane."""
+    screen = np.empty((vertices.shape[0], 3))
+    all_in_front = _project(vertices, K, near, screen)
+    _fill(screen, faces, attributes, cull_back, unit_length, image, depth_inverse)
+    crossing = 0 if all_in_front else _count_crossing(screen, faces)
+    if crossing > 0:
+        points, values, pieces = _clip_near(vertices, faces, attributes, screen, near, crossing)
+        screen = np.empty((points.shape[0], 3))
+        # A corner cut off exactly on the plane must count as in front of it: hence half.
+        _project(points, K, 0.5 * near, screen)
+        _fill(screen, pieces, values, cull_back, unit_length, image, depth_inverse)
+
+
+@numba.njit(cache=True, nogil=True)
+def _project(points, K, near, screen):
+    """Screen position and 1 / z of each point, into `screen` [V, 3]; 1 / z is -1 up to `near`, behind, and at NaN.
+
+    Returns whether all are in front.
+    """
     focal_x, focal_y, centre_x, centre_y = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    screen = np.empty((points.shape[0], 3))
+    all_in_front = True
     for i in range(points.shape[0]):
         z = points[i, 2]
         if z > near:
@@ -143,7 +181,8 @@ def _project(points, K, near):
             screen[i, 2] = inverse
         else:
             screen[i, 2] = -1.0
-    return screen
+            all_in_front = False
+    return all_in_front
 
 
 @numba.njit(cache=True, nogil=True)
@@ -194,13 +233,13 @@ def _interpolate(rows, start, end, fraction, out, out_row):
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(screen, faces, attributes, cull_back, image, depth_inverse):
+def _fill(screen, faces, attributes, cull_back, unit_length, image, depth_inverse):
     """Draw all triangles whose corners are in front of the camera."""
     height, width = depth_inverse.shape
+    weights, places, queued = np.empty((QUEUE_LENGTH + 1, 3)), np.empty((QUEUE_LENGTH + 1, 3), np.int32), 0
     for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        za, zb, zc = screen[a, 2], screen[b, 2], screen[c, 2]
-        if not (za > 0.0 and zb > 0.0 and zc > 0.0):
+        a, b, c = np.uint32(faces[f, 0]), np.uint32(faces[f, 1]), np.uint32(faces[f, 2])
+        if not (screen[a, 2] > 0.0 and screen[b, 2] > 0.0 and screen[c, 2] > 0.0):
             continue
         ax, ay, bx, by, cx, cy = screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1]
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
@@ -208,64 +247,66 @@ def _fill(screen, faces, attributes, cull_back, image, depth_inverse):
         if not (-np.inf < area < 0.0 or (0.0 < area < np.inf and not cull_back)):
             continue
         # Clamped before the cast: far outside the image a position need not fit an integer.
-        left = int(np.ceil(min(max(min(ax, bx, cx), 0.0), float(width)) - 0.5))
-        right = int(np.floor(max(min(max(ax, bx, cx), float(width)), 0.0) - 0.5))
-        top = int(np.ceil(min(max(min(ay, by, cy), 0.0), float(height)) - 0.5))
-        bottom = int(np.floor(max(min(max(ay, by, cy), float(height)), 0.0) - 0.5))
+        left = max(int(np.ceil(min(max(min(ax, bx, cx), 0.0), float(width)) - 0.5)), 0)
+        right = min(int(np.floor(max(min(max(ax, bx, cx), float(width)), 0.0) - 0.5)), width - 1)
+        top = max(int(np.ceil(min(max(min(ay, by, cy), 0.0), float(height)) - 0.5)), 0)
+        bottom = min(int(np.floor(max(min(max(ay, by, cy), float(height)), 0.0) - 0.5)), height - 1)
         sign = 1.0 if area > 0.0 else -1.0
-        for row in range(max(top, 0), min(bottom, height - 1) + 1):
+        for row in range(top, bottom + 1):
             y = row + 0.5
-            for column in range(max(left, 0), min(right, width - 1) + 1):
-                x = column + 0.5
-                wa = sign * ((bx - x) * (cy - y) - (by - y) * (cx - x))
-                wb = sign * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
-                wc = sign * ((ax - x) * (by - y) - (ay - y) * (bx - x))
-                if wa < 0.0 or wb < 0.0 or wc < 0.0:
-                    continue
-                total = wa + wb + wc
-                inverse = (wa * za + wb * zb + wc * zc) / total
-                if inverse > depth_inverse[row, column]:
-                    depth_inverse[row, column] = inverse
-                    scale = 1.0 / (inverse * total)
-                    wa, wb, wc = wa * za * scale, wb * zb * scale, wc * zc * scale
-                    for k in range(attributes.shape[1]):
-                        image[row, column, k] = wa * attributes[a, k] + wb * attributes[b, k] + wc * attributes[c, k]
+            for start in range(left, right + 1, QUEUE_LENGTH):
+                stop = min(start + QUEUE_LENGTH, right + 1)
+                if queued + stop - start > QUEUE_LENGTH:
+                    _resolve(weights, places, queued, screen, faces, attributes, unit_length, image, depth_inverse)
+                    queued = 0
+                for column in range(start, stop):
+                    x = column + 0.5
+                    wa = sign * ((bx - x) * (cy - y) - (by - y) * (cx - x))
+                    wb = sign * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
+                    wc = sign * ((ax - x) * (by - y) - (ay - y) * (bx - x))
+                    weights[queued, 0], weights[queued, 1], weights[queued, 2] = wa, wb, wc
+                    places[queued, 0], places[queued, 1], places[queued, 2] = f, row, column
+                    queued += int(min(wa, wb, wc) >= 0.0)
+    _resolve(weights, places, queued, screen, faces, attributes, unit_length, image, depth_inverse)
 
 
 @numba.njit(cache=True, nogil=True)
-def _sum_face_normals(vertices, faces, normals):
-    """Unit vertex normals, into `normals`."""
-    normals[:] = 0.0
-    for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-        wx, wy, wz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
-        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
-        if not np.isfinite(nx + ny + nz):
+def _resolve(weights, places, queued, screen, faces, attributes, unit_length, image, depth_inverse):
+    """Give each pixel in the queue the attributes of its triangle if that is the nearest so far.
+
+    Args:
+        weights: [>= queued, 3], the edge functions at each pixel.
+        places: [>= queued, 3] int32, triangle, row and column.
+        queued: how many there are.
+        screen: [V, 3].
+        faces: [F, 3].
+        attributes: [V, C].
+        unit_length: attributes are normals, C = 3: normalise them; towards the camera where they cancel.
+        image: [H, W, C].
+        depth_inverse: [H, W].
+    """
+    for i in range(queued):
+        f, row, column = np.uint32(places[i, 0]), np.uint32(places[i, 1]), np.uint32(places[i, 2])
+        a, b, c = np.uint32(faces[f, 0]), np.uint32(faces[f, 1]), np.uint32(faces[f, 2])
+        wa, wb, wc = weights[i, 0], weights[i, 1], weights[i, 2]
+        za, zb, zc = screen[a, 2], screen[b, 2], screen[c, 2]
+        total = wa + wb + wc
+        inverse = (wa * za + wb * zb + wc * zc) / total
+        if not inverse > depth_inverse[row, column]:
             continue
-        for vertex in (a, b, c):
-            normals[vertex, 0] += nx
-            normals[vertex, 1] += ny
-            normals[vertex, 2] += nz
-    for i in range(vertices.shape[0]):
-        length = np.sqrt(normals[i, 0] ** 2 + normals[i, 1] ** 2 + normals[i, 2] ** 2)
-        if length > 0.0:
-            normals[i, 0] /= length
-            normals[i, 1] /= length
-            normals[i, 2] /= length
-
-
-@numba.njit(cache=True, nogil=True)
-def _normalise_covered(normals, depth_inverse):
-    """Unit length where there is a surface; towards the camera where normals of opposite faces have cancelled."""
-    for row in range(depth_inverse.shape[0]):
-        for column in range(depth_inverse.shape[1]):
-            if depth_inverse[row, column] > 0.0:
-                x, y, z = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-                length = np.sqrt(x * x + y * y + z * z)
-                if length > 0.0:
-                    normals[row, column, 0] = x / length
-                    normals[row, column, 1] = y / length
-                    normals[row, column, 2] = z / length
-                else:
-                    normals[row, column, 2] = -1.0
+        depth_inverse[row, column] = inverse
+        if unit_length:
+            wa, wb, wc = wa * za, wb * zb, wc * zc
+            nx = wa * attributes[a, 0] + wb * attributes[b, 0] + wc * attributes[c, 0]
+            ny = wa * attributes[a, 1] + wb * attributes[b, 1] + wc * attributes[c, 1]
+            nz = wa * attributes[a, 2] + wb * attributes[b, 2] + wc * attributes[c, 2]
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if length == 0.0:
+                nz, length = -1.0, 1.0
+            scale = 1.0 / length
+            image[row, column, 0], image[row, column, 1], image[row, column, 2] = nx * scale, ny * scale, nz * scale
+        else:
+            scale = 1.0 / (inverse * total)
+            wa, wb, wc = wa * za * scale, wb * zb * scale, wc * zc * scale
+            for k in range(attributes.shape[1]):
+                image[row, column, k] = wa * attributes[a, k] + wb * attributes[b, k] + wc * attributes[c, k]
