@@ -341,7 +341,7 @@ def _reconstruct_stand_in(kind: object, base: object, state: object) -> StandIn:
 
 
 def _check_plain(loaded: object) -> None:
-    """Raise `DataError` where the result holds anything but plain data, arrays and the stand-ins that were asked for."""
+    """Raise `DataError` where the result holds more than plain data, arrays and stand-ins that were asked for."""
     waiting, seen = [loaded], set()
     while waiting:
         value = waiting.pop()
