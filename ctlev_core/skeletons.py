@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 from data_contracts.errors import DataError
 
@@ -55,6 +56,15 @@ JOINT_SETS = {
         "left_foot", "right_foot",
     ),
     "smpl": _joint_set(*SMPL_JOINTS),
+    # OpenPose's 18 joints (Cao et al., CVPR 2017), the order of ControlNet's skeleton maps.
+    "openpose": _joint_set(
+        "nose", "neck",
+        "right_shoulder", "right_elbow", "right_wrist",
+        "left_shoulder", "left_elbow", "left_wrist",
+        "right_hip", "right_knee", "right_ankle",
+        "left_hip", "left_knee", "left_ankle",
+        "right_eye", "left_eye", "right_ear", "left_ear",
+    ),
 }  # fmt: skip
 
 # The SMPL joint behind each DHP19 joint; a hand of DHP19 is a marker at the wrist, a foot one at the ankle.
@@ -87,3 +97,32 @@ def joint_indices(source: str, target: str) -> list[int]:
     if missing:
         raise DataError(f"joint set {source!r} lacks joints of {target!r}: {', '.join(missing)}")
     return [known.index(name) for name in names]
+
+
+@cache
+def openpose_sources(joint_set: str) -> tuple[tuple[int, ...], ...]:
+    """Which joints of a set each of OpenPose's 18 joints is the mean of; none where the set has nothing like it.
+
+    Of the marker sets, hand and foot are OpenPose's wrist and ankle; of SMPL, its own wrist and ankle. OpenPose's neck
+    is the middle of the shoulders, also for SMPL, whose neck joint lies 6 cm higher. The head stands in for the nose,
+    which is approximate: the markers of DHP19 and CDEHP are on the head, SMPL's joint is inside the skull between the
+    ears. Only OpenPose has eyes and ears.
+
+    Raises:
+        DataError: an unknown joint set.
+    """
+    if joint_set not in JOINT_SETS:
+        raise DataError(f"unknown joint set {joint_set!r}; known: {', '.join(JOINT_SETS)}")
+    names = JOINT_SETS[joint_set].joints
+    if joint_set == "openpose":
+        return tuple((index,) for index in range(len(names)))
+    sources: list[tuple[int, ...]] = []
+    for wanted in JOINT_SETS["openpose"].joints:
+        if wanted == "neck":
+            stand_ins = [("right_shoulder", "left_shoulder")]
+        else:
+            marker = wanted.replace("wrist", "hand").replace("ankle", "foot").replace("nose", "head")
+            stand_ins = [(wanted,), (marker,)]
+        found = [parts for parts in stand_ins if set(parts) <= set(names)]
+        sources.append(tuple(names.index(part) for part in found[0]) if found else ())
+    return tuple(sources)

@@ -1,26 +1,43 @@
 """2D skeletons: a coloured drawing of the joints on black, and one fixed prompt.
 
-Source: ControlEvents, the human-pose experiments; drawing as in `ctlev_core/render/skeleton.py`.
+Source: ControlEvents, the human-pose experiments, which start from ControlNet v1.0's openpose checkpoint; the drawings
+are in `ctlev_core/render/skeleton.py`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, Labels
 
-VERSION = 1
+VERSION = 2
 
 
 class Options(Frozen):
     """Options of the skeleton condition."""
 
     prompt: str = Field(default="A moving human", description="The same prompt for every image, as in the paper.")
+    drawing: Literal["smooth", "openpose"] = Field(
+        default="smooth",
+        description="anti-aliased, what the bundled prior knows; or ControlNet v1.0's, for its published checkpoints",
+    )
+    stick_width_px: int | None = Field(
+        default=None,
+        ge=1,
+        description="of openpose, half the width of limbs; null scales ControlNet's 4 px of 512 to the image",
+    )
+
+    @model_validator(mode="after")
+    def _width_belongs_to_openpose(self) -> Options:
+        if self.stick_width_px is not None and self.drawing != "openpose":
+            raise ValueError("stick_width_px is of drawing 'openpose'; 'smooth' has widths of its own")
+        return self
 
 
 def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds: Sequence[int]) -> Conditions:
@@ -29,7 +46,7 @@ def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds:
     Args:
         labels: N rows with joints in pixels of an image of `image_size`.
         image_size: (width, height) px.
-        options: the prompt.
+        options: the prompt and the drawing.
         seeds: N integers, unused.
     Returns:
         N conditions with images [N, H, W, 3] uint8.
@@ -45,5 +62,7 @@ def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds:
     width, height = image_size
     images = np.empty((len(labels), height, width, 3), dtype=np.uint8)
     for row, (joints2d, visible) in enumerate(zip(labels.joints2d, labels.visible, strict=True)):
-        images[row] = draw_skeleton(joints2d, visible, labels.joint_set, image_size)
+        images[row] = draw_skeleton(
+            joints2d, visible, labels.joint_set, image_size, options.drawing, options.stick_width_px
+        )
     return Conditions((options.prompt,) * len(labels), images)

@@ -63,10 +63,16 @@ def prompts(module):
     return [np.frombuffer(text.encode(), np.uint8)]
 
 
+def skeletons(module):
+    choices = module.Options(), module.Options(drawing="openpose"), module.Options(drawing="openpose", stick_width_px=4)
+    return [module.render(fixed_labels(), (64, 64), options, [1, 2, 3]).images for options in choices]
+
+
 CASES = {
     ("encodings", "event_histogram"): lambda module, _: histogram_counts(module),
     ("formats", "evt2"): written_bytes,
     ("formats", "evt3"): written_bytes,
+    ("conditions", "skeleton"): lambda module, _: skeletons(module),
     ("conditions", "text"): lambda module, _: prompts(module),
 }
 

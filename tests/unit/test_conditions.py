@@ -34,6 +34,33 @@ def test_skeleton_draws_each_row_and_repeats_the_prompt():
     np.testing.assert_array_equal(one.images[0], conditions.images[1])
 
 
+def test_skeletons_are_drawn_as_asked():
+    labels = pose_labels()
+    assert labels.joints2d is not None and labels.visible is not None
+    for options, arguments in (
+        (skeleton.Options(drawing="openpose"), ("openpose", None)),
+        (skeleton.Options(drawing="openpose", stick_width_px=3), ("openpose", 3)),
+    ):
+        images = skeleton.render(labels, (48, 40), options, [0, 1, 2]).images
+        assert images is not None
+        expected = draw_skeleton(labels.joints2d[2], labels.visible[2], "dhp19", (48, 40), *arguments)
+        np.testing.assert_array_equal(images[2], expected)
+        assert (images[2] != draw_skeleton(labels.joints2d[2], labels.visible[2], "dhp19", (48, 40))).any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"drawing": "stick"}, "'smooth' or 'openpose'"),
+        ({"drawing": "openpose", "stick_width_px": 0}, "greater than or equal to 1"),
+        ({"stick_width_px": 4}, "of drawing 'openpose'"),
+    ],
+)
+def test_wrong_skeleton_options_are_named_before_anything_runs(options, message):
+    with pytest.raises(PluginError, match=message):
+        load_options(ConditionChoice(name="skeleton", options=options))
+
+
 def test_skeleton_of_no_rows():
     conditions = skeleton.render(pose_labels().take([]), (48, 40), skeleton.Options(), [])
     assert len(conditions) == 0 and conditions.images.shape == (0, 40, 48, 3)
