@@ -40,9 +40,12 @@ def find_format(path: Path) -> ModuleType | None:
     return None
 
 
-def read_motion(path: Path) -> MotionClip:
+def read_motion(path: Path, rate_hz: float | None = None) -> MotionClip:
     """The motion in a file of any known format, every frame, checked: metres, y up, SMPL's 24 joints.
 
+    Args:
+        path: the file.
+        rate_hz: frames a second of a file that does not say; None = what its format assumes.
     Raises:
         DataError: see `find_format` and the format's own `read`; or no format recognises the file, then the message
             lists the known ones.
@@ -53,4 +56,6 @@ def read_motion(path: Path) -> MotionClip:
         raise DataError(
             f"{path}: not a motion file of a known format ({path.stat().st_size} bytes); known formats: {known}"
         )
+    if rate_hz is not None and hasattr(module, "RATE_HZ"):
+        return module.read(path, rate_hz)
     return module.read(path)

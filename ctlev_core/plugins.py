@@ -141,6 +141,16 @@ class MotionFormat(Protocol):
         ...
 
 
+class MotionFormatWithoutRate(MotionFormat, Protocol):
+    """A motion format whose files need not say how fast they are; `RATE_HZ` is what it assumes."""
+
+    RATE_HZ: float
+
+    def read(self, path: Path, rate_hz: float = ...) -> MotionClip:
+        """As `MotionFormat.read`, at `rate_hz` frames a second where the file does not say."""
+        ...
+
+
 class Encoding(Protocol):
     """Events to arrays, arrays to images and back."""
 

@@ -24,7 +24,7 @@ from data_contracts.errors import DataError
 VERSION = 1
 SUFFIXES = (".pkl",)
 
-RATE_HZ = 60.0
+FRAMES_PER_SECOND = 60.0
 
 
 def sniff(path: Path) -> bool:
@@ -56,7 +56,7 @@ def read(path: Path) -> MotionClip:
         raise DataError(f"{path}: smpl_poses must be [T, 72], got {list(poses.shape)}")
     if scaling.size != 1 or not 0 < float(scaling.reshape(())) < np.inf:
         raise DataError(f"{path}: smpl_scaling must be one positive number, got {scaling.tolist()}")
-    time_s = np.arange(len(poses)) / RATE_HZ
+    time_s = np.arange(len(poses)) / FRAMES_PER_SECOND
     return check_clip(MotionClip(poses, np.zeros(10), transl / float(scaling.reshape(())), time_s), str(path))
 
 

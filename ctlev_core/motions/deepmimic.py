@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,8 @@ def read(path: Path) -> MotionClip:
     """
     motion = read_skeleton_motion(path)
     landmarks = {name: number for number, (name, *_) in enumerate(_JOINTS) if name.startswith(("left", "right"))}
-    return retarget(motion, {**landmarks, "head": 2}, str(path))
+    clip = retarget(motion, {**landmarks, "head": 2}, str(path))
+    return replace(clip, caption=path.stem.removeprefix("humanoid3d_").replace("_", " "))
 
 
 def read_skeleton_motion(path: Path) -> SkeletonMotion:
