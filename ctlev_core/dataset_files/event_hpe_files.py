@@ -20,7 +20,7 @@ PADDING = (PADDED_SIZE - RAW_SIZE[0]) // 2
 POSE_IMAGE_SIZE = 256
 """joints2d of a pose file are px of the square image at this size."""
 FOCAL_LENGTH, CENTRE = 1679.3, 641.0
-"""px of the padded square, both axes alike; distortion is not modelled in the authors' training code."""
+"""px of the padded square, both axes alike, from the authors' dataloader.py; it gives no distortion."""
 NUM_JOINTS = 24
 MAX_BAD_ROWS = 0.01
 """A file with a larger part of its rows incomplete or outside the sensor is refused."""

@@ -35,7 +35,7 @@ from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_lab
 if TYPE_CHECKING:
     from ctlev_core.camera import Camera
 
-VERSION = 1
+VERSION = 2
 JOINT_SET = "smpl"
 
 EXPECTED_TREE = """expected the preprocessed download of EventHPE (layout `preprocessed`):
@@ -117,7 +117,7 @@ def read_windows(recording: Recording, options: Options) -> np.ndarray:
 
 
 def read_labels(recording: Recording, options: Options) -> Labels:
-    """One row a pose, in px of the recording's own pictures: joints in 2D and 3D, SMPL parameters.
+    """One row a pose, in px of the recording's own pictures: joints in 2D and 3D, SMPL parameters, intrinsics.
 
     A joint is visible where it lies in the picture and in front of the camera. The authors' pixel coordinates are
     taken as they are, with the origin at the outer corner; their own scaling (nearest neighbour) is off by up to half
@@ -151,6 +151,7 @@ def read_labels(recording: Recording, options: Options) -> Labels:
         smpl_pose=np.stack([pose.theta for pose in poses]).astype(np.float32),
         smpl_betas=np.stack([pose.betas for pose in poses]).astype(np.float32),
         smpl_transl=np.stack([pose.transl for pose in poses]).astype(np.float32),
+        intrinsics=np.tile(read_camera(recording, options).intrinsics.astype(np.float32), (len(poses), 1)),
     )
     return check_labels(labels, f"Event-HPE {recording.recording_id}")
 
@@ -182,7 +183,11 @@ def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:
 
 
 def read_camera(recording: Recording, options: Options) -> Camera:
-    """The camera of the recording's pictures, which is also its world frame."""
+    """The camera of the recording's pictures, which is also its world frame.
+
+    Without distortion, as the authors' loader, losses and viewer project. Their `projection` also knows OpenCV's
+    rational model (k1 .. k6, p1, p2), but no file of their repository gives its coefficients.
+    """
     from ctlev_core.camera import Camera
 
     f, c = files.FOCAL_LENGTH, files.CENTRE

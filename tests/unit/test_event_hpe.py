@@ -155,6 +155,8 @@ def test_labels_are_smpl_parameters_and_joints_in_mm_and_px(root):
     camera = event_hpe.read_camera(recording, options)
     np.testing.assert_allclose([camera.K[0, 0], camera.K[0, 2]], [335.86, 128.2])
     np.testing.assert_allclose(project(camera, joints3d), labels.joints2d[2], rtol=1e-5)
+    np.testing.assert_allclose(labels.intrinsics, [[335.86, 335.86, 128.2, 128.2]] * 4, rtol=1e-6)
+    assert camera.distortion is None
 
 
 def test_joints_outside_behind_and_unknown_are_not_visible(root):
@@ -239,6 +241,7 @@ def test_raw_windows_are_files_and_end_at_their_label(raw):
         np.testing.assert_allclose(matched.smpl_transl[row], tran[0], rtol=1e-6)
         pixels = project(event_hpe.read_camera(recording, options), joints3d)
         np.testing.assert_allclose(matched.joints2d[row], pixels, rtol=1e-4, atol=1e-2)
+    np.testing.assert_allclose(labels.intrinsics, [[1679.3, 1679.3, 401, 641]] * 4)
     pictures = event_hpe.read_intensity_frames(recording, options)
     assert pictures.images.shape == (4, 1280, 800) and pictures.t_us.tolist() == labels.t_us.tolist()
 
