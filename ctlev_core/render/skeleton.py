@@ -49,7 +49,15 @@ STICK_WIDTH_PX = 4
 """ControlNet v1.0: half the width of a limb, and the radius of a joint, at its 512 px."""
 CONTROLNET_SIDE_PX = 512
 
+NOWHERE_PX = 1e12
+"""A coordinate as large as this, or NaN, is no position: sums of such lose all digits or overflow."""
+CORNER_BITS = 16
+LARGEST_BAR_PX = 1600
+"""Image size up to which the corners of limbs, with ends that are `FAR_AWAY`, are 32-bit numbers."""
+
 Point = tuple[float, float]
+Pixel = tuple[int, int]
+Colour = tuple[int, int, int]
 
 
 def draw_skeleton(
@@ -62,7 +70,7 @@ def draw_skeleton(
 ) -> np.ndarray:
     """Draw one person on black.
 
-    A joint is drawn where it is visible and finite, a limb where both of its ends are.
+    A joint is drawn where it is visible and finite (and within 1e12 px), a limb where both of its ends are.
 
     `openpose` works in whole pixels, as the peaks of OpenPose's heat maps are: a joint is the pixel in which it lies,
     floor(x), whose centre is at floor(x) + 0.5 here and at floor(x) in OpenCV. Joints outside the image are left out,
@@ -104,7 +112,7 @@ def _openpose_joints(joints2d: np.ndarray, visible: np.ndarray, joint_set: str) 
         raise DataError(f"joint set {joint_set!r} needs joints2d [{count}, 2] and visible [{count}], got {shapes}")
     # Python's numbers: calls on arrays of two would take longer than the drawing.
     known: list[Point | None] = [
-        (x, y) if seen and math.isfinite(x) and math.isfinite(y) else None
+        (x, y) if seen and abs(x) < NOWHERE_PX and abs(y) < NOWHERE_PX else None
         for (x, y), seen in zip(
             np.asarray(joints2d, dtype=np.float64).tolist(), np.asarray(visible).tolist(), strict=True
         )
@@ -123,7 +131,7 @@ def _mean(points: Sequence[Point | None]) -> Point | None:
 def _draw_smooth(joints: Sequence[Point | None], image_size: tuple[int, int]) -> np.ndarray:
     """Drawn on a canvas four times as fine, which covers the skeleton alone, and averaged."""
     width, height = image_size
-    segments: list[tuple[tuple[int, int, int], Point, Point]] = []
+    segments: list[tuple[Colour, Point, Point]] = []
     for colour, (start, end) in zip(COLOURS, LIMBS, strict=False):
         first, last = joints[start], joints[end]
         ends = None if first is None or last is None else _clip_segment(first, last, image_size)
@@ -149,17 +157,43 @@ def _draw_smooth(joints: Sequence[Point | None], image_size: tuple[int, int]) ->
     unit = 1 << SUBPIXEL_BITS
     shift_x, shift_y = unit * OVERSAMPLING * left, unit * OVERSAMPLING * top
 
-    def fixed_point(point: Point) -> tuple[int, int]:
+    def fixed_point(point: Point) -> Pixel:
         """Position on the canvas in cv2's fixed point, whose pixel centres lie at integers."""
         x, y = point
         return round((x * OVERSAMPLING - 0.5) * unit) - shift_x, round((y * OVERSAMPLING - 0.5) * unit) - shift_y
 
+    # Round ends lie under the discs, where these are wider by some px of the canvas.
+    ends_are_hidden = radius / unit - thickness / 2 >= 3.0 and max(image_size) <= LARGEST_BAR_PX
+    draw_limb = _draw_bar if ends_are_hidden else _draw_round_bar
     for colour, start, end in segments:
-        cv2.line(canvas, fixed_point(start), fixed_point(end), colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+        draw_limb(canvas, fixed_point(start), fixed_point(end), colour, thickness)
     for colour, joint in dots:
         cv2.circle(canvas, fixed_point(joint), radius, colour, -1, cv2.LINE_AA, SUBPIXEL_BITS)
     _average_blocks(canvas.reshape(len(canvas), -1), image[top:bottom, left:right])
     return image
+
+
+def _draw_round_bar(canvas: np.ndarray, start: Pixel, end: Pixel, colour: Colour, thickness: int) -> None:
+    cv2.line(canvas, start, end, colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def _draw_bar(canvas: np.ndarray, start: Pixel, end: Pixel, colour: Colour, thickness: int) -> None:
+    """The line of `_draw_round_bar` without its round ends, which take OpenCV about as long as the rest.
+
+    Its corners are rounded to 1 / 65,536 px as `cv2.line` rounds them; so the pixels are the same, too.
+    """
+    finer = CORNER_BITS - SUBPIXEL_BITS
+    x0, y0, x1, y1 = start[0] << finer, start[1] << finer, end[0] << finer, end[1] << finer
+    length = math.hypot(x1 - x0, y1 - y0)
+    if length == 0.0:
+        return
+    half_width = (thickness << (CORNER_BITS - 1)) + (thickness & 1) * (1 << (CORNER_BITS - 1))
+    across_x, across_y = round((y1 - y0) * half_width / length), round((x0 - x1) * half_width / length)
+    corners = (
+        (x0 + across_x, y0 + across_y), (x0 - across_x, y0 - across_y),
+        (x1 - across_x, y1 - across_y), (x1 + across_x, y1 + across_y),
+    )  # fmt: skip
+    cv2.fillConvexPoly(canvas, np.array(corners, np.int32), colour, cv2.LINE_AA, CORNER_BITS)
 
 
 def _draw_openpose(joints: Sequence[Point | None], image_size: tuple[int, int], stick_width: int) -> np.ndarray:
@@ -170,7 +204,7 @@ def _draw_openpose(joints: Sequence[Point | None], image_size: tuple[int, int], 
     """
     width, height = image_size
     image = np.zeros((height, width, 3), np.uint8)
-    pixels: list[tuple[int, int] | None] = [
+    pixels: list[Pixel | None] = [
         (math.floor(joint[0]), math.floor(joint[1]))
         if joint is not None and 0 <= joint[0] < width and 0 <= joint[1] < height
         else None

@@ -297,7 +297,14 @@ def test_joints_that_stand_for_openposes():
 @pytest.mark.parametrize("drawing", skeleton.DRAWINGS)
 def test_hopeless_joints_give_a_black_picture(drawing):
     far = np.full((13, 2), 1e9)
-    for joints, visible in ((far, SEEN), (-far, SEEN), (np.full((13, 2), np.nan), SEEN), (JOINTS, ~SEEN)):
+    opposite = np.where(np.arange(13)[:, None] % 2, 1.7e308, -1.7e308) * np.ones(2)
+    for joints, visible in (
+        (far, SEEN),
+        (-far, SEEN),
+        (opposite, SEEN),
+        (np.full((13, 2), np.nan), SEEN),
+        (JOINTS, ~SEEN),
+    ):
         image = draw_skeleton(joints, visible, "dhp19", SIZE, drawing)
         assert image.shape == (64, 64, 3) and not image.any()
     tiny = draw_skeleton(np.full((13, 2), 0.5), SEEN, "dhp19", (1, 1), drawing)
