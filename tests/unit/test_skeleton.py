@@ -196,7 +196,7 @@ def random_pose(seed, joint_set, size, spread):
 
 
 @pytest.mark.parametrize("joint_set", JOINT_SETS)
-@pytest.mark.parametrize("size", [(64, 64), (256, 256), (346, 260), (61, 200), (5, 3), (1, 1)])
+@pytest.mark.parametrize("size", [(64, 64), (96, 95), (256, 256), (346, 260), (1601, 120), (61, 200), (5, 3), (1, 1)])
 def test_the_smooth_drawing_is_that_of_the_whole_canvas(joint_set, size):
     for seed in range(6):
         joints, visible = random_pose(seed, joint_set, size, (0.15, 0.3, 0.8)[seed % 3])
