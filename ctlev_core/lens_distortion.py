@@ -21,6 +21,7 @@ NUM_COEFFICIENTS = 8
 """k1, k2, p1, p2, k3, k4, k5, k6: OpenCV's order."""
 MAX_NEWTON_STEPS = 100
 MAX_HALVINGS = 30
+ROUNDING = 4 * np.finfo(np.float64).eps
 TOLERANCE = 1e-12
 """Largest error of the inverse, in normalised units, over 1 + the point's radius: 2e-9 px at a focal length of 1679."""
 
@@ -49,27 +50,40 @@ def undistort(points: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """
     targets = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     radius = largest_radius(coefficients)
+    scale = 1.0 + np.hypot(*targets.T)
     with np.errstate(all="ignore"):
         found = np.where(_is_one_to_one(targets, _map(targets, coefficients)[1], radius)[:, None], targets, 0.0)
-        image, jacobian = _map(found, coefficients)
-        error = np.hypot(*(image - targets).T)
+        error = np.hypot(*(_map(found, coefficients)[0] - targets).T)
+        moving = error > ROUNDING * scale
         for _ in range(MAX_NEWTON_STEPS):
-            step = _solve_symmetric(jacobian, image - targets)
-            improved = np.zeros(len(targets), np.bool_)
-            for halving in range(MAX_HALVINGS):
-                trial = found - 0.5**halving * step
-                trial_image, trial_jacobian = _map(trial, coefficients)
-                trial_error = np.hypot(*(trial_image - targets).T)
-                better = ~improved & (trial_error < error) & _is_one_to_one(trial, trial_jacobian, radius)
-                found[better], image[better], error[better] = trial[better], trial_image[better], trial_error[better]
-                jacobian[:, better] = trial_jacobian[:, better]
-                improved |= better
-                if (improved | ~(error > 0.0)).all():
-                    break
-            if not improved.any():
+            rows = np.flatnonzero(moving)
+            if len(rows) == 0:
                 break
-        solved = error <= TOLERANCE * (1.0 + np.hypot(*targets.T))
+            found[rows], reached = _newton_step(found[rows], targets[rows], error[rows], coefficients, radius)
+            moving[rows] = (reached < error[rows]) & (reached > ROUNDING * scale[rows])
+            error[rows] = reached
+        solved = error <= TOLERANCE * scale
     return np.where(solved[:, None], found, np.nan).reshape(np.shape(points))
+
+
+def _newton_step(
+    points: np.ndarray, targets: np.ndarray, error: np.ndarray, coefficients: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 2] whose images are nearer to the targets, and how near [N]; unchanged where there is none."""
+    image, jacobian = _map(points, coefficients)
+    step = _solve_symmetric(jacobian, image - targets)
+    better_points, better_error = points.copy(), error.copy()
+    rows = np.arange(len(points))
+    for halving in range(MAX_HALVINGS):
+        trial = points[rows] - 0.5**halving * step[rows]
+        image, jacobian = _map(trial, coefficients)
+        trial_error = np.hypot(*(image - targets[rows]).T)
+        better = (trial_error < error[rows]) & _is_one_to_one(trial, jacobian, radius)
+        better_points[rows[better]], better_error[rows[better]] = trial[better], trial_error[better]
+        rows = rows[~better]
+        if len(rows) == 0:
+            break
+    return better_points, better_error
 
 
 def largest_radius(coefficients: np.ndarray) -> float:
