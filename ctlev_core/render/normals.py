@@ -1,20 +1,29 @@
 """Normal maps of posed meshes: one function over two renderers, and the pictures ControlNets are conditioned on.
 
-Normals are rendered without light or colour. They come from the posed faces, weighted by area, are interpolated with
-perspective and normalised in each pixel. OpenCV camera frame: x right, y down, z forward, pixel centres at
-integer + 0.5; the normal of a surface that faces the camera has z < 0.
+Normals are rendered without light or colour. They come from the posed faces, are interpolated with perspective and
+normalised in each pixel. Faces count by their area: on the body, against the normals of its surface subdivided without
+end (Loop), that is 0.61 degrees off in the mean; by angle 0.76, by the weights of Max (1999), exact on spheres, 1.7.
+OpenCV camera frame: x right, y down, z forward, pixel centres at integer + 0.5; the normal of a surface that faces the
+camera has z < 0.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import numpy as np
 
+from ctlev_core.render.rasteriser import NEAR_M, rasterise_normals
 from data_contracts.errors import DataError
 
 RENDERERS = ("numba", "pyrender")
 CONVENTIONS = ("controlnet", "rgb")
+_COLOURS = {
+    "controlnet": ((2, 1, 0), (-127.5, -127.5, -127.5), 127.5, (255, 127, 127)),
+    "rgb": ((0, 1, 2), (127.5, -127.5, -127.5), 128.0, (0, 0, 0)),
+}
+"""Component behind each channel, factors, offset (half a unit more rounds what is then cut), background."""
 FRAMES_AT_A_TIME = 8
 """What one thread renders before it takes more: small enough to share, large enough not to wait for Python."""
 
@@ -84,24 +93,38 @@ def normal_map(normals: np.ndarray, convention: str) -> np.ndarray:
     Returns:
         [N, H, W, 3] uint8, channels in the order in which the network takes them.
     Raises:
+        DataError: another shape.
         ValueError: unknown convention.
     Source: lllyasviel/ControlNet, annotator/midas/__init__.py and gradio_normal2image.py.
     """
     if convention not in CONVENTIONS:
         raise ValueError(f"unknown convention {convention!r}; known: {', '.join(CONVENTIONS)}")
-    empty = ~normals.any(axis=-1, keepdims=True)
-    if convention == "controlnet":
-        towards_camera = np.where(empty, np.array([0.0, 0.0, 1.0], normals.dtype), -normals)
-        return (towards_camera * 127.5 + 127.5).clip(0.0, 255.0).astype(np.uint8)[..., ::-1].copy()
-    colours = np.rint(normals * np.array([127.5, -127.5, -127.5], normals.dtype) + 127.5)
-    return np.where(empty, 0, colours.clip(0.0, 255.0)).astype(np.uint8)
+    if normals.ndim != 4 or normals.shape[3] != 3:
+        raise DataError(f"normals must be [N, H, W, 3], got {normals.shape}")
+    colours = np.empty(normals.shape, np.uint8)
+    _colour(normals, *_COLOURS[convention], colours)
+    return colours
+
+
+@numba.njit(cache=True, nogil=True)
+def _colour(normals, axes, factors, offset, background, colours):
+    """Channel k of `colours` is factors[k] * component axes[k] + offset, cut to whole numbers in 0 .. 255."""
+    for i in range(normals.shape[0]):
+        for row in range(normals.shape[1]):
+            for column in range(normals.shape[2]):
+                normal = normals[i, row, column, 0], normals[i, row, column, 1], normals[i, row, column, 2]
+                if normal[0] == 0.0 and normal[1] == 0.0 and normal[2] == 0.0:
+                    for k in range(3):
+                        colours[i, row, column, k] = background[k]
+                else:
+                    for k in range(3):
+                        colour = factors[k] * normal[axes[k]] + offset
+                        colours[i, row, column, k] = np.uint8(min(max(colour, 0.0), 255.0))
 
 
 def _render_numba(
     vertices: np.ndarray, faces: np.ndarray, intrinsics: np.ndarray, image_size: tuple[int, int], workers: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    from ctlev_core.render.rasteriser import NEAR_M, rasterise_normals
-
     width, height = image_size
     normals = np.zeros((len(vertices), height, width, 3), np.float32)
     depth_inverse = np.zeros((len(vertices), height, width), np.float32)
