@@ -1,9 +1,10 @@
-"""The bundled body: round cones -> smooth union -> marching cubes -> skin weights, shape directions, joint regressor.
+"""The bundled body: tubes and cones -> smooth union -> marching cubes -> skin weights, shape directions, regressor.
 
 It has SMPL's interface and none of its data. `python -m ctlev_core.body.procedural` writes `procedural_body.npz` anew.
+The left half is built; the right half is its mirror image, vertex by vertex.
 
-Source: round cones and smooth union after Inigo Quilez; diffusion weights after Baran and Popovic, Pinocchio,
-SIGGRAPH 2007, with the mesh Laplacian; joint positions are those of an average adult.
+Source: diffusion weights after Baran and Popovic, Pinocchio, SIGGRAPH 2007, with the mesh Laplacian and a width that
+varies over the body; the shape itself is in `body_shape`, the distance fields in `implicit_surface`.
 """
 
 from __future__ import annotations
@@ -12,84 +13,38 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ctlev_core.body.body_shape import BORDER_M, GROIN_NORMAL, GROIN_POINT, LEFT_JOINTS, MIDDLE_JOINTS, Cone, Tube
+from ctlev_core.body.implicit_surface import MIRROR, PARTS, body_distance, magnify, part_distance
 from ctlev_core.body.layer import BONES_PER_VERTEX, BUNDLED_BODY, NUM_BETAS, NUM_JOINTS, BodyModel, make_body
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
+from ctlev_core.skeletons import JOINT_SETS, SMPL_JOINTS, SMPL_PARENTS
 
 INDEX = {name: joint for joint, name in enumerate(SMPL_JOINTS)}
+MIRROR_JOINT = list(JOINT_SETS["smpl"].mirror)
 LEG_JOINTS = ("hip", "knee", "ankle", "foot")
-
-# Rest joints, m; the right side mirrors the left.
-MIDDLE_JOINTS = {
-    "pelvis": (0, -0.223, 0.025),
-    "spine1": (0, -0.114, 0.0),
-    "spine2": (0, 0.021, 0.0),
-    "spine3": (0, 0.074, 0.022),
-    "neck": (0, 0.288, -0.015),
-    "head": (0, 0.353, 0.035),
-}
-LEFT_JOINTS = {
-    "hip": (0.069, -0.314, 0.022),
-    "knee": (0.104, -0.693, 0.016),
-    "ankle": (0.090, -1.091, -0.027),
-    "foot": (0.116, -1.143, 0.094),
-    "collar": (0.080, 0.194, -0.008),
-    "shoulder": (0.174, 0.226, -0.017),
-    "elbow": (0.431, 0.213, -0.042),
-    "wrist": (0.683, 0.221, -0.045),
-    "hand": (0.767, 0.214, -0.058),
-}
-
-ROUND = (1.0, 1.0, 1.0)
-# (owner, start joint, offset, end joint, offset, radius at start, radius at end, stretch of the axes), m
-MIDDLE_CONES = (
-    ("pelvis", "pelvis", (-0.062, -0.055, -0.020), "pelvis", (0.062, -0.055, -0.020), 0.118, 0.118, (1, 1.05, 1.02)),
-    ("spine1", "spine1", (-0.048, 0.0, 0.006), "spine1", (0.048, 0.0, 0.006), 0.108, 0.108, (1, 1.35, 1.02)),
-    ("spine2", "spine2", (-0.054, 0.020, 0.002), "spine2", (0.054, 0.020, 0.002), 0.107, 0.107, (1, 1.5, 1)),
-    ("spine3", "spine3", (-0.075, 0.085, -0.018), "spine3", (0.075, 0.085, -0.018), 0.105, 0.105, ROUND),
-    ("neck", "neck", (0, -0.060, -0.002), "neck", (0, 0.070, 0.020), 0.060, 0.053, ROUND),
-    ("head", "head", (0, 0.115, 0.008), "head", (0, 0.135, -0.012), 0.092, 0.094, (0.86, 1.12, 1.05)),  # skull
-    ("head", "head", (0, 0.035, 0.045), "head", (0, 0.070, 0.050), 0.052, 0.060, (0.92, 1, 1)),  # jaw
-    ("head", "head", (0, 0.072, 0.115), "head", (0, 0.055, 0.122), 0.010, 0.014, ROUND),  # nose
-)
-LEFT_CONES = (
-    ("spine3", "spine3", (0.075, 0.045, 0.058), "spine3", (0.050, 0.055, 0.055), 0.062, 0.062, ROUND),  # chest
-    ("pelvis", "pelvis", (0.062, -0.090, -0.075), "hip", (0, -0.050, -0.055), 0.085, 0.078, ROUND),  # gluteus
-    ("collar", "collar", (-0.030, 0.050, -0.010), "shoulder", (-0.005, 0.005, 0), 0.056, 0.060, ROUND),
-    ("shoulder", "shoulder", (0.010, -0.004, 0), "elbow", (0, 0, 0), 0.060, 0.041, ROUND),
-    ("shoulder", "shoulder", (0.070, 0, 0.008), "elbow", (-0.090, 0, 0.012), 0.049, 0.042, ROUND),  # biceps
-    ("elbow", "elbow", (0.020, 0, 0), "elbow", (0.080, 0, 0), 0.040, 0.043, ROUND),
-    ("elbow", "elbow", (0.080, 0, 0), "wrist", (0, 0, 0), 0.043, 0.027, ROUND),
-    ("wrist", "wrist", (0, 0, 0), "hand", (-0.010, 0, 0.010), 0.028, 0.034, (1, 0.62, 1.15)),
-    ("hand", "hand", (0.010, 0, 0.012), "hand", (0.085, -0.008, 0.012), 0.030, 0.016, (1, 0.62, 1.6)),
-    ("wrist", "wrist", (0.030, -0.005, 0.020), "hand", (0, -0.012, 0.066), 0.016, 0.012, ROUND),  # thumb
-    ("hip", "hip", (0.018, -0.020, -0.008), "knee", (-0.002, 0.030, 0), 0.093, 0.056, ROUND),
-    ("hip", "hip", (0.020, -0.080, 0.020), "knee", (0, 0.120, 0.012), 0.076, 0.056, ROUND),  # quadriceps
-    ("knee", "knee", (0, 0, 0.003), "ankle", (0, 0.020, 0), 0.053, 0.036, ROUND),
-    ("knee", "knee", (0.004, -0.070, -0.022), "knee", (0, -0.190, -0.030), 0.050, 0.044, ROUND),  # calf
-    ("ankle", "ankle", (0, -0.010, -0.018), "ankle", (0, -0.045, -0.030), 0.040, 0.036, ROUND),  # heel
-    ("ankle", "ankle", (0, -0.020, 0.010), "foot", (-0.005, 0.012, -0.010), 0.040, 0.032, (1.05, 1, 1)),
-    ("foot", "foot", (-0.008, 0.004, -0.010), "foot", (0.005, -0.006, 0.070), 0.036, 0.022, (1.35, 0.9, 1)),
-)
-
-BLEND_M = 0.012
-SIDE_BLEND_M = 0.006
-"""Between the two legs the union is sharper, so that the thighs do not grow together."""
-WEIGHT_DIFFUSION = 2.2
-"""Width of the soft border between two bones, in squared mesh edges."""
+GRID_LOW, GRID_HIGH = (0.0, -1.34, -0.37), (1.38, 0.83, 0.38)
+"""Box of the left half in the space of `magnify`, m."""
 SHAPE_NAMES = ("height", "legs", "arms", "torso", "shoulders", "hips", "girth", "limb_girth", "belly", "head")
 
 
 @dataclass(frozen=True, eq=False)
-class RoundCone:
-    """A cone with spherical ends, squeezed along the axes; `limb` is 0 above the legs, 1 left leg, 2 right leg."""
+class SymmetricMesh:
+    """A mesh whose vertices come in mirrored pairs.
 
-    owner: int
-    start: np.ndarray
-    end: np.ndarray
-    radius_start: float
-    radius_end: float
-    stretch: np.ndarray
-    limb: int
+    Attributes:
+        half: [H, 3] vertices with x >= 0, in the space of `magnify`; they are the first vertices of the mesh.
+        seam: [H] bool, those on the plane x = 0, which are their own partners.
+        mirror: [V] index of each vertex's partner.
+        faces: [F, 3] counter-clockwise from outside.
+    """
+
+    half: np.ndarray
+    seam: np.ndarray
+    mirror: np.ndarray
+    faces: np.ndarray
+
+    def whole(self, half: np.ndarray) -> np.ndarray:
+        """[V, 3] from points [H, 3] of the left half."""
+        return np.concatenate([half, half[~self.seam] * MIRROR])
 
 
 def rest_joints() -> np.ndarray:
@@ -99,76 +54,28 @@ def rest_joints() -> np.ndarray:
         joints[INDEX[name]] = position
     for name, position in LEFT_JOINTS.items():
         joints[INDEX[f"left_{name}"]] = position
-        joints[INDEX[f"right_{name}"]] = np.multiply(position, (-1, 1, 1))
+        joints[INDEX[f"right_{name}"]] = np.multiply(position, MIRROR)
     return joints
 
 
-def round_cones() -> list[RoundCone]:
-    """All cones of both sides."""
-    joints = rest_joints()
-
-    def cone(row: tuple, side: str) -> RoundCone:
-        owner, start, start_offset, end, end_offset, radius_start, radius_end, stretch = row
-        flip = np.array([-1.0 if side == "right_" else 1.0, 1.0, 1.0])
-
-        def joint(name: str) -> int:
-            return INDEX[name if name in INDEX else side + name]
-
-        limb = 0 if owner not in LEG_JOINTS else 1 if side == "left_" else 2
-        ends = joints[joint(start)] + flip * start_offset, joints[joint(end)] + flip * end_offset
-        return RoundCone(joint(owner), *ends, radius_start, radius_end, np.array(stretch, dtype=np.float64), limb)
-
-    cones = [cone(row, "") for row in MIDDLE_CONES]
-    return cones + [cone(row, side) for side in ("left_", "right_") for row in LEFT_CONES]
-
-
-def cone_distances(points: np.ndarray, cones: list[RoundCone]) -> np.ndarray:
-    """Approximate signed distance [len(cones), N], m, of points [N, 3] to each cone; negative inside."""
-    distances = np.empty((len(cones), len(points)))
-    for row, cone in enumerate(cones):
-        middle = (cone.start + cone.end) / 2
-        start, axis = (cone.start - middle) / cone.stretch, (cone.end - cone.start) / cone.stretch
-        local = (points - middle) / cone.stretch - start
-        along = np.clip(local @ axis / (axis @ axis), 0.0, 1.0)
-        radius = cone.radius_start + (cone.radius_end - cone.radius_start) * along
-        distances[row] = (np.linalg.norm(local - along[:, None] * axis, axis=1) - radius) * np.sqrt(cone.stretch.min())
-    return distances
-
-
-def body_distance(points: np.ndarray, cones: list[RoundCone]) -> np.ndarray:
-    """Signed distance [N], m, to the smooth union; each leg joins the trunk apart from the other leg."""
-    distances = cone_distances(points, cones)
-    limbs = np.array([cone.limb for cone in cones])
-    trunk, left, right = (_smooth_union(distances[limbs == limb], BLEND_M) for limb in range(3))
-    sides = [_smooth_union(np.stack([trunk, leg]), BLEND_M) for leg in (left, right)]
-    return _smooth_union(np.stack(sides), SIDE_BLEND_M)
-
-
-def _smooth_union(distances: np.ndarray, blend_m: float) -> np.ndarray:
-    return -blend_m * np.logaddexp.reduce(-distances / blend_m, axis=0)
-
-
-def _gradient(points: np.ndarray, cones: list[RoundCone], step_m: float = 1e-4) -> np.ndarray:
-    steps = step_m * np.eye(3)
-    return np.stack(
-        [(body_distance(points + d, cones) - body_distance(points - d, cones)) / (2 * step_m) for d in steps], axis=1
-    )
-
-
-def _extract_surface(cones: list[RoundCone], voxel_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces [F, 3] of the zero level, counter-clockwise from outside."""
+def _extract_surface(voxel_m: float) -> SymmetricMesh:
+    """The zero level of the body's left half, closed by its mirror image."""
     from skimage.measure import marching_cubes
 
-    low, high = np.array([-0.95, -1.24, -0.22]), np.array([0.95, 0.66, 0.30])
-    axes = [np.arange(a, b + voxel_m, voxel_m) for a, b in zip(low, high, strict=True)]
+    axes = [np.arange(low, high + voxel_m, voxel_m) for low, high in zip(GRID_LOW, GRID_HIGH, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    blocks = np.array_split(grid, 16)
-    field = np.concatenate([body_distance(block, cones) for block in blocks]).reshape([len(axis) for axis in axes])
-    vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(voxel_m,) * 3)
-    vertices, faces = vertices + low, faces.astype(np.int64)
-    corners = vertices[faces]
-    volume = np.einsum("fa,fa->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    return vertices, faces if volume > 0 else faces[:, ::-1].copy()
+    blocks = np.array_split(grid, max(1, len(grid) // 50_000))
+    field = np.concatenate([body_distance(magnify(block)) for block in blocks]).reshape([len(axis) for axis in axes])
+    half, faces, _, _ = marching_cubes(field, 0.0, spacing=(voxel_m,) * 3, allow_degenerate=False)
+    half, faces = half + GRID_LOW, faces.astype(np.int64)
+    corners = half[faces]
+    if np.einsum("fa,fa->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
+        faces = faces[:, ::-1]
+    seam = half[:, 0] < 1e-6 * voxel_m
+    partner = np.arange(len(half))
+    partner[~seam] = len(half) + np.arange(np.count_nonzero(~seam))
+    mirror = np.concatenate([partner, np.flatnonzero(~seam)])
+    return SymmetricMesh(half, seam, mirror, np.concatenate([faces, partner[faces][:, ::-1]]))
 
 
 def _neighbours(faces: np.ndarray, count: int):
@@ -180,36 +87,86 @@ def _neighbours(faces: np.ndarray, count: int):
     return ((matrix + matrix.T) > 0).astype(np.float64)
 
 
-def _relax(vertices: np.ndarray, adjacency, cones: list[RoundCone], rounds: int = 8) -> np.ndarray:
-    """Even out the triangles along the surface, then project back onto it (one Newton step a round)."""
+def _relax(mesh: SymmetricMesh, adjacency, rounds: int = 12) -> np.ndarray:
+    """Left half [H, 3] with even triangles: slide along the surface, then back onto it (a Newton step a round).
+
+    All in the space of `magnify`, where all triangles have the same size.
+    """
+    count = len(mesh.half)
     degree = np.asarray(adjacency.sum(axis=1))
+    half = mesh.half
+    steps = 1e-4 * np.eye(3)
     for _ in range(rounds):
-        gradient = _gradient(vertices, cones)
+        whole = mesh.whole(half)
+        move = (adjacency @ whole / degree - whole)[:count]
+        gradient = np.stack([_field(half + step) - _field(half - step) for step in steps], axis=1) / 2e-4
         length = np.linalg.norm(gradient, axis=1, keepdims=True)
         normals = gradient / length
-        move = adjacency @ vertices / degree - vertices
-        vertices = vertices + 0.5 * (move - np.sum(move * normals, axis=1, keepdims=True) * normals)
-        distance = body_distance(vertices, cones)[:, None] / length
-        vertices = vertices - np.clip(distance, -0.01, 0.01) * normals
-    return vertices
+        half = half + 0.5 * (move - np.sum(move * normals, axis=1, keepdims=True) * normals)
+        half = half - np.clip(_field(half)[:, None] / length, -0.01, 0.01) * normals
+        half[mesh.seam, 0] = 0.0
+    return half
 
 
-def _skin_weights(vertices: np.ndarray, adjacency, cones: list[RoundCone]) -> np.ndarray:
-    """[V, 24]: the owner of the nearest cone, diffused over the mesh.
+def _field(points: np.ndarray) -> np.ndarray:
+    """`body_distance` in the space of `magnify`, for points on either side."""
+    return body_distance(magnify(np.column_stack([np.abs(points[:, 0]), points[:, 1:]])))
 
-    (I + c L) w = onehot has an M-matrix, so weights cannot turn negative and rows sum to 1.
+
+def _owners(half: np.ndarray) -> np.ndarray:
+    """The bone [H] each vertex of the left half belongs to: that of the nearest part, and the leg below the groin."""
+    distances = np.stack([part_distance(half, part) for part in PARTS])
+    distances[[isinstance(part, Cone) and part.carve for part in PARTS]] = np.inf
+    nearest = distances.argmin(axis=0)
+    owners = np.empty(len(half), dtype=np.int64)
+    for row, part in enumerate(PARTS):
+        rows = np.flatnonzero(nearest == row)
+        if isinstance(part, Tube):
+            ends = [end for end, _ in part.owners]
+            bones = np.array([_bone(name) for _, name in part.owners])
+            owners[rows] = bones[np.searchsorted(ends, half[rows, part.axis])]
+        else:
+            owners[rows] = _bone(part.owner)
+    below = (half - GROIN_POINT) @ GROIN_NORMAL > 0
+    return np.where(
+        np.isin(owners, (INDEX["pelvis"], INDEX["left_hip"])), np.where(below, INDEX["left_hip"], 0), owners
+    )
+
+
+def _bone(name: str) -> int:
+    return INDEX[name if name in INDEX else f"left_{name}"]
+
+
+def _skin_weights(vertices: np.ndarray, mesh: SymmetricMesh, adjacency) -> np.ndarray:
+    """[V, 24]: the owner of each vertex, diffused twice over the surface.
+
+    (I + s^2 L) w = onehot with s >= 0 per vertex has an M-matrix, so weights cannot turn negative and rows sum to 1.
     """
     import scipy.sparse as sparse
     from scipy.sparse.linalg import splu
 
-    count = len(vertices)
-    owners = np.array([cone.owner for cone in cones])[cone_distances(vertices, cones).argmin(axis=0)]
-    onehot = np.zeros((count, NUM_JOINTS))
-    onehot[np.arange(count), owners] = 1.0
-    laplacian = sparse.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency
-    weights = splu((sparse.eye(count) + WEIGHT_DIFFUSION * laplacian).tocsc()).solve(onehot)
-    smallest = np.argsort(weights, axis=1)[:, :-BONES_PER_VERTEX]
-    np.put_along_axis(weights, smallest, 0.0, axis=1)
+    count, half = len(vertices), len(mesh.half)
+    weights = np.zeros((count, NUM_JOINTS))
+    owners = _owners(vertices[:half])
+    weights[np.arange(half), owners] = 1.0
+    weights[mesh.mirror[:half], np.array(MIRROR_JOINT)[owners]] = 1.0
+    seam = np.flatnonzero(mesh.seam)
+    weights[seam] = weights[seam] / weights[seam].sum(axis=1, keepdims=True)
+    edges = adjacency.tocoo()
+    # On an even triangle mesh 2/3 sum_j (f_j - f_i) / h^2 is the Laplacian.
+    stiffness = 2 / 3 / np.sum((vertices[edges.row] - vertices[edges.col]) ** 2, axis=1)
+    laplacian = sparse.coo_matrix((stiffness, (edges.row, edges.col)), (count, count)).tocsr()
+    laplacian = sparse.diags(np.asarray(laplacian.sum(axis=1)).ravel()) - laplacian
+    widths = np.array([BORDER_M[name.removeprefix("left_").removeprefix("right_")] for name in SMPL_JOINTS])
+    joints = rest_joints()
+    closeness = np.exp(-np.sum((vertices[:, None] - joints) ** 2, axis=2) / (2 * 0.05**2)) + 1e-12
+    border = closeness @ widths / closeness.sum(axis=1)
+    solve = splu((sparse.eye(count) + sparse.diags(border**2) @ laplacian).tocsc()).solve
+    weights = solve(solve(weights))
+    weights = (weights + weights[mesh.mirror][:, MIRROR_JOINT]) / 2
+    # Where left and right tie for the last place on the plane of symmetry, both go.
+    fifth = np.sort(weights, axis=1)[:, -BONES_PER_VERTEX - 1, None]
+    weights = np.where(weights > fifth * (1 + 1e-9), weights, 0.0)
     return weights / weights.sum(axis=1, keepdims=True)
 
 
@@ -251,8 +208,10 @@ def _shapedirs(
             along = np.clip(local @ axis / (axis @ axis), -0.3, 1.3)
             stretch = joint_shapedirs[children[0]] - joint_shapedirs[joint]
         thicken = np.zeros(NUM_BETAS)
-        thicken[0], thicken[6] = 0.04, 0.06
-        thicken[7] = 0.07 if name.startswith(("left_", "right_")) and not name.endswith("collar") else 0.0
+        # Flesh grows most, feet and hands less, the skull hardly.
+        fleshy = 0.2 if name in ("neck", "head") else 0.5 if name.endswith(("wrist", "hand", "ankle", "foot")) else 1.0
+        thicken[0], thicken[6] = 0.04, fleshy * 0.06
+        thicken[7] = fleshy * 0.07 if name.startswith(("left_", "right_")) and not name.endswith("collar") else 0.0
         radial = local - along[:, None] * axis
         move = joint_shapedirs[joint] + along[:, None, None] * stretch + radial[:, :, None] * thicken
         if name == "head":
@@ -281,19 +240,20 @@ def _joint_regressor(
     return regressor
 
 
-def build_arrays(voxel_m: float = 0.02) -> dict[str, np.ndarray]:
+def build_arrays(voxel_m: float = 0.024) -> dict[str, np.ndarray]:
     """The body as arrays under SMPL's key names, float64; see `make_body`."""
-    cones, joints = round_cones(), rest_joints()
-    vertices, faces = _extract_surface(cones, voxel_m)
-    adjacency = _neighbours(faces, len(vertices))
-    vertices = _relax(vertices, adjacency, cones)
-    weights = _skin_weights(vertices, adjacency, cones)
+    joints = rest_joints()
+    mesh = _extract_surface(voxel_m)
+    adjacency = _neighbours(mesh.faces, len(mesh.mirror))
+    vertices = mesh.whole(magnify(_relax(mesh, adjacency)))
+    weights = _skin_weights(vertices, mesh, adjacency)
     joint_shapedirs = _joint_shapedirs(joints)
     shapedirs = _shapedirs(vertices, weights, joints, joint_shapedirs)
     regressor = _joint_regressor(vertices, shapedirs, joints, joint_shapedirs)
+    regressor = (regressor + regressor[MIRROR_JOINT][:, mesh.mirror]) / 2
     return {
         "v_template": vertices,
-        "f": faces,
+        "f": mesh.faces,
         "weights": weights,
         "shapedirs": shapedirs,
         "J_regressor": regressor,
@@ -301,11 +261,11 @@ def build_arrays(voxel_m: float = 0.02) -> dict[str, np.ndarray]:
     }
 
 
-def build_body(voxel_m: float = 0.02) -> BodyModel:
+def build_body(voxel_m: float = 0.024) -> BodyModel:
     """Build the procedural body from nothing; needs scikit-image (in the `test` extra).
 
     Args:
-        voxel_m: edge of the marching-cubes grid; 0.02 gives about 6,800 vertices.
+        voxel_m: edge of the marching-cubes grid; 0.024 gives about 7,500 vertices.
     Raises:
         ValueError: the grid is too coarse to hold the fingers, or would need gigabytes.
     """
