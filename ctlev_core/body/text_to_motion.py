@@ -79,15 +79,24 @@ def generate_motion(sentence: str, *, seed: int = 0, rate_hz: float = 60.0) -> M
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
     rng = np.random.default_rng([seed, TEXT_STREAM, *sentence.encode()])
-    actions = parse_sentence(sentence)
-    try:
-        performance = _Performance(plan_pieces(actions, rng), rng)
-    except DataError as error:
-        raise DataError(f"sentence {sentence!r}: {error}") from None
+    performance = _Performance(_plan(sentence, rng), rng)
     time_s = np.arange(int(performance.duration_s * rate_hz + 1e-6) + 1) / rate_hz
     rotations, transl = performance.sample(time_s)
     pose = axis_angle_from_matrix(rotations).reshape(len(time_s), 3 * NUM_JOINTS)
     return check_clip(MotionClip(pose, np.zeros(NUM_BETAS), transl, time_s, sentence), f"sentence {sentence!r}")
+
+
+def check_sentence(sentence: str) -> None:
+    """Raise `DataError` where `generate_motion` would, without making the motion."""
+    _plan(sentence, np.random.default_rng(0))
+
+
+def _plan(sentence: str, rng: np.random.Generator) -> list[Piece]:
+    actions = parse_sentence(sentence)
+    try:
+        return plan_pieces(actions, rng)
+    except DataError as error:
+        raise DataError(f"sentence {sentence!r}: {error}") from None
 
 
 class _Performance:
