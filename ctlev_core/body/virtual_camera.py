@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ctlev_core.body.layer import joint_transforms, load_body
+from ctlev_core.body.layer import joint_transforms, load_body, pose_vertices
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ctlev_core.camera import camera_from_intrinsics, is_inside, project
 from ctlev_core.skeletons import joint_indices
@@ -17,28 +17,34 @@ from data_contracts.labels import Labels
 
 FOCAL_PER_SIDE = 1.4
 """Focal length over the smaller side of the sensor: a person of 1.7 m at 3 m fills eight tenths of it."""
+OCCLUSION_SIDE_PX = 256
+"""The larger side of the depth pictures, at most: a wrist is some pixels wide, and a picture takes a millisecond."""
+OCCLUSION_BATCH = 64
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 """Camera frame of a level camera to a world with y up, in which who faces the camera faces +z."""
 
 
-def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str) -> Labels:
+def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str, occlusion: bool = False) -> Labels:
     """Labels with the joints of their SMPL bodies in 2D and 3D.
 
     The body is the bundled one, shaped by the labels' coefficients. The camera is that of the labels' intrinsics; where
-    they have none, one with its principal point in the middle of the sensor and `FOCAL_PER_SIDE`. It has no distortion;
-    self-occlusion is not looked at.
+    they have none, one with its principal point in the middle of the sensor and `FOCAL_PER_SIDE`. It has no distortion.
 
     Args:
         labels: N rows with SMPL parameters in the camera frame (x right, y down, z forward).
         sensor_size: (width, height) px of the image which the intrinsics are of.
         joint_set: of the result, a key of `ctlev_core.skeletons.JOINT_SETS`.
+        occlusion: joints that the body itself hides are not visible either. This poses and renders each body, at
+            `OCCLUSION_SIDE_PX`. The data sets' own labels, from markers, call hidden joints visible.
     Returns:
         The same rows with the intrinsics used, joints2d [N, J, 2] px, visible where they lie on the sensor, and
         joints3d [N, J, 3] mm. A joint behind the camera is NaN in 2D.
     Raises:
         DataError: the labels have no SMPL parameters, or SMPL lacks a joint of the set.
     """
-    joints = smpl_joints(labels)[:, joint_indices("smpl", joint_set)]
+    chosen = joint_indices("smpl", joint_set)
+    all_joints = smpl_joints(labels)
+    joints = all_joints[:, chosen]
     intrinsics = labels.intrinsics
     if intrinsics is None:
         intrinsics = np.tile(default_intrinsics(sensor_size), (len(labels), 1))
@@ -47,10 +53,13 @@ def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str) -> Labe
     for number, camera in enumerate(cameras):
         rows = of_row.reshape(-1) == number
         joints2d[rows] = project(camera_from_intrinsics(camera, sensor_size), joints[rows])
+    visible = is_inside(joints2d, sensor_size)
+    if occlusion:
+        visible &= _in_sight(labels, all_joints, intrinsics, sensor_size)[:, chosen]
     return replace(
         labels,
         joints2d=joints2d.astype(np.float32),
-        visible=is_inside(joints2d, sensor_size),
+        visible=visible,
         joints3d=(1000 * joints).astype(np.float32),
         joint_set=joint_set,
         intrinsics=intrinsics,
@@ -111,12 +120,29 @@ def smpl_joints(labels: Labels) -> np.ndarray:
     """
     pose, betas, transl = _bodies(labels)
     rotations = matrix_from_axis_angle(pose.reshape(len(labels), 24, 3).astype(np.float64))
-    joints = np.empty((len(labels), 24, 3))
-    shapes, of_row = np.unique(betas, axis=0, return_inverse=True)
-    for number, shape in enumerate(shapes):
-        rows = of_row.reshape(-1) == number
-        _, joints[rows] = joint_transforms(load_body(), rotations[rows], shape, transl[rows])
-    return joints
+    return joint_transforms(load_body(), rotations, betas, transl)[1]
+
+
+def _in_sight(labels: Labels, joints: np.ndarray, intrinsics: np.ndarray, sensor_size: SensorSize) -> np.ndarray:
+    """Which of SMPL's joints [N, 24] lie on the sensor and are not behind another part of the body."""
+    from ctlev_core.render.normals import render_normals
+    from ctlev_core.render.visibility import SMPL_FLESH_M, joint_visibility
+
+    pose, betas, transl = _bodies(labels)
+    body = load_body()
+    width, height = sensor_size
+    shrink = min(1.0, OCCLUSION_SIDE_PX / max(sensor_size))
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    scaled = intrinsics * np.tile(np.divide(size, sensor_size), 2)
+    rotations = matrix_from_axis_angle(pose.reshape(len(labels), 24, 3).astype(np.float64))
+    visible = np.zeros(joints.shape[:2], np.bool_)
+    for start in range(0, len(labels), OCCLUSION_BATCH):
+        rows = slice(start, start + OCCLUSION_BATCH)
+        vertices, _ = pose_vertices(body, rotations[rows], betas[rows], transl[rows])
+        _, depth_inverse = render_normals(vertices, body.faces, scaled[rows], size)
+        for row, depth in enumerate(depth_inverse, start):
+            visible[row] = joint_visibility(joints[row], depth, scaled[row], SMPL_FLESH_M)
+    return visible
 
 
 def _bodies(labels: Labels) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

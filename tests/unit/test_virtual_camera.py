@@ -149,3 +149,33 @@ def test_cameras_look_at_the_person_from_within_the_ranges():
     assert -1.0 <= min(yaws) < -0.5 and 0.5 < max(yaws) <= 1.0
     with pytest.raises(DataError, match="finite joints"):
         sample_camera(np.random.default_rng(0), np.full((1, 3), np.nan), SENSOR)
+
+
+def test_joints_behind_the_body_are_hidden_where_asked():
+    """From the side, in a T pose: the far arm and leg lie behind the near ones."""
+    side = CameraRange((3.0, 3.0), (0.0, 0.0), (np.pi / 2, np.pi / 2), (0.0, 0.0), (1.4, 1.4))
+    labels = from_new_side(labels_of(facing(), [[0, 0, 3]]), np.random.default_rng(0), (640, 480), side)
+    plain = with_joints(labels, (640, 480), "dhp19")
+    seen = check_labels(with_joints(labels, (640, 480), "dhp19", occlusion=True), "test")
+    assert plain.visible is not None and plain.visible.all() and seen.visible is not None and seen.joints3d is not None
+    names = JOINT_SETS["dhp19"].joints
+    depth = dict(zip(names, seen.joints3d[0, :, 2], strict=True))
+    near, far = ("left", "right") if depth["left_hand"] < depth["right_hand"] else ("right", "left")
+    visible = dict(zip(names, seen.visible[0].tolist(), strict=True))
+    assert not any(visible[f"{far}_{name}"] for name in ("shoulder", "elbow", "hand", "knee", "foot"))
+    # The near wrist is behind the fingers, which point to the camera.
+    assert visible["head"] and all(visible[f"{near}_{name}"] for name in ("hip", "knee", "foot"))
+    np.testing.assert_array_equal(seen.joints2d, plain.joints2d)
+
+
+def test_nothing_hides_a_person_seen_from_the_front():
+    labels = labels_of(np.repeat(facing(), 70, axis=0), np.linspace([-0.4, 0, 3], [0.4, 0, 4], 70))
+    seen = with_joints(labels, SENSOR, "dhp19", occlusion=True)
+    np.testing.assert_array_equal(seen.visible, with_joints(labels, SENSOR, "dhp19").visible)
+    # Rows do not depend on the others, nor on how many are rendered at a time.
+    alone = with_joints(labels.take([66]), SENSOR, "dhp19", occlusion=True)
+    assert seen.visible is not None and alone.visible is not None
+    np.testing.assert_array_equal(alone.visible[0], seen.visible[66])
+    assert with_joints(labels.take([]), SENSOR, "smpl", occlusion=True).visible is not None
+    behind = with_joints(labels_of(facing(), [[0, 0, -3]]), SENSOR, "smpl", occlusion=True)
+    assert behind.visible is not None and not behind.visible.any()
