@@ -40,8 +40,10 @@ def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str, occlusi
         The same rows with the intrinsics used, joints2d [N, J, 2] px, visible where they lie on the sensor, and
         joints3d [N, J, 3] mm. A joint behind the camera is NaN in 2D.
     Raises:
-        DataError: the labels have no SMPL parameters, or SMPL lacks a joint of the set.
+        DataError: the labels have no SMPL parameters, SMPL lacks a joint of the set, or the sensor has no pixels.
     """
+    if min(sensor_size) < 1:
+        raise DataError(f"sensor_size must be (width, height) of 1 px or more, got {sensor_size}")
     chosen = joint_indices("smpl", joint_set)
     all_joints = smpl_joints(labels)
     joints = all_joints[:, chosen]

@@ -179,3 +179,12 @@ def test_nothing_hides_a_person_seen_from_the_front():
     assert with_joints(labels.take([]), SENSOR, "smpl", occlusion=True).visible is not None
     behind = with_joints(labels_of(facing(), [[0, 0, -3]]), SENSOR, "smpl", occlusion=True)
     assert behind.visible is not None and not behind.visible.any()
+
+
+def test_wrong_calls_are_named():
+    with pytest.raises(DataError, match="1 px or more"):
+        with_joints(labels_of(facing(), [[0, 0, 3]]), (0, 260), "dhp19")
+    with pytest.raises(DataError, match="'smpl' lacks joints of 'openpose': nose"):
+        with_joints(labels_of(facing(), [[0, 0, 3]]), SENSOR, "openpose")
+    with pytest.raises(DataError, match="finite"):
+        with_joints(labels_of(facing() * np.nan, [[0, 0, 3]]), SENSOR, "dhp19")
