@@ -41,12 +41,11 @@ def labels_in_camera(
     seen = rotations.copy()
     seen[:, 0] = camera.R @ rotations[:, 0]
     count = len(rotations)
-    intrinsics = np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]], dtype=np.float32)
     return Labels(
         class_names=(class_name,) * count,
         t_us=t_us,
         smpl_pose=axis_angle_from_matrix(seen).reshape(count, 72).astype(np.float32),
         smpl_betas=np.tile(np.asarray(betas, dtype=np.float32), (count, 1)),
         smpl_transl=((pelvis + transl) @ camera.R.T + camera.translation - pelvis).astype(np.float32),
-        intrinsics=np.tile(intrinsics, (count, 1)),
+        intrinsics=np.tile(camera.intrinsics.astype(np.float32), (count, 1)),
     )

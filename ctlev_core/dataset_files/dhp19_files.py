@@ -8,7 +8,7 @@ heatmap_generation_example.ipynb (which matrix belongs to which channel, project
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -221,20 +221,11 @@ def camera_of(matrix: np.ndarray, where: str) -> Camera:
     Raises:
         DataError: the matrix has no inverse camera (its left 3 x 3 block is singular).
     """
-    from ctlev_core.camera import Camera
+    from ctlev_core.camera import from_projection_matrix
 
     flipped = np.array([[1, 0, 0], [0, -1, SENSOR_SIZE[1]], [0, 0, 1]]) @ matrix
-    determinant = np.linalg.det(flipped[:, :3])
-    if not abs(determinant) > np.finfo(float).eps * np.linalg.norm(flipped[:, :3]) ** 3:
-        raise DataError(f"{where}: the left 3 x 3 block of the projection matrix is singular")
-    # A projection matrix is known up to scale; this sign makes R a rotation and the depth in front positive.
-    flipped = flipped * np.sign(determinant)
-    lower_q, lower_r = np.linalg.qr(flipped[::-1, :3].T)
-    K, R = lower_r.T[::-1, ::-1], lower_q.T[::-1]
-    signs = np.sign(np.diag(K))
-    K, R = K * signs, R * signs[:, None]
-    translation_mm = np.linalg.solve(K, flipped[:, 3])
-    return Camera(K / K[2, 2], R, translation_mm / 1000.0, SENSOR_SIZE)
+    camera = from_projection_matrix(flipped, SENSOR_SIZE, where)
+    return replace(camera, translation=camera.translation / 1000.0)
 
 
 def read_frame_labels(path: Path, frames_path: Path | None = None) -> np.ndarray:

@@ -186,7 +186,7 @@ def read_camera(recording: Recording, options: Options) -> Camera:
     """The camera of the recording's pictures, which is also its world frame.
 
     Without distortion, as the authors' loader, losses and viewer project. Their `projection` also knows OpenCV's
-    rational model (k1 .. k6, p1, p2), but no file of their repository gives its coefficients.
+    rational model (k1 .. k6, p1, p2); its coefficients are in none of the files of theirs that we know.
     """
     from ctlev_core.camera import Camera
 
