@@ -18,48 +18,26 @@ source's ground is at a height of 0, feet touch it but for what proportions diff
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from ctlev_core.body.landmarks import LANDMARKS
 from ctlev_core.body.motion_clip import MotionClip, check_clip, move_world
+from ctlev_core.body.source_skeleton import (
+    SIDES,
+    UP,
+    SkeletonMotion,
+    chain_between,
+    check_limbs,
+    common_ancestor,
+    leg_length,
+    moving_up,
+    on_its_feet,
+    rest_axes,
+)
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
-from data_contracts.errors import DataError
 
-SIDES = ("left", "right")
-MAX_TILT_DEG = 60.0
-"""Of thighs and shanks against the vertical, and of the trunk, in a rest pose: a person who stands."""
 MAX_FOOT_TURN_DEG = 60.0
-MAX_LEAN_DEG = 30.0
-"""Of trunk and legs while the source moves, where its world is to have another axis up than its rest pose."""
-HIP_HEIGHTS = (0.5, 1.5)
-"""Of people on their feet, in lengths of their legs."""
-UP = np.array([0.0, 1.0, 0.0])
-
-
-@dataclass(frozen=True, eq=False)
-class SkeletonMotion:
-    """T frames of a skeleton with J joints.
-
-    Attributes:
-        names: of the joints.
-        parents: J indices, each smaller than the joint's own; -1 for the root.
-        rest: [J, 3] float64, in any unit, where the joints are while nothing is turned: a person who stands.
-        tips: [J, 3] float64, the end of what hangs on each joint in the rest pose: of a foot, the toes.
-        orientation: [J, T, 3, 3] float64, from the rest pose to the world.
-        positions: [J, T, 3] float64, joints in the world, in the unit of `rest`.
-        time_s: [T] float64.
-    """
-
-    names: tuple[str, ...]
-    parents: tuple[int, ...]
-    rest: np.ndarray
-    tips: np.ndarray
-    orientation: np.ndarray
-    positions: np.ndarray
-    time_s: np.ndarray
 
 
 def retarget(motion: SkeletonMotion, landmarks: Mapping[str, int], where: str) -> MotionClip:
@@ -67,19 +45,20 @@ def retarget(motion: SkeletonMotion, landmarks: Mapping[str, int], where: str) -
 
     Args:
         motion: of the source.
-        landmarks: indices of the joints `LANDMARKS`, and of `head` where there is one.
+        landmarks: indices of the joints `landmarks.LANDMARKS`, and of `head` where there is one.
         where: names it in messages.
     Returns:
         Metres, y up, the mean shape; the body faces +z where the source faces as in its rest pose.
     Raises:
-        DataError: the joints do not hang on one another as limbs do, a limb has no length, the source's rest pose is
-            not that of a person who stands, or a number is not finite.
+        DataError: the joints do not hang on one another as limbs do, a limb has no length, the source's person does
+            not stand in the rest pose nor in any frame, or a number is not finite.
     """
     from ctlev_core.body.layer import load_body
     from ctlev_core.body.rotations import axis_angle_from_matrix
 
-    _check_limbs(motion, landmarks, where)
-    axes = _rest_axes(motion, landmarks, where)
+    check_limbs(motion, landmarks, where)
+    motion = on_its_feet(motion, landmarks, where)
+    axes = rest_axes(motion, landmarks, where)
     body: dict[str, np.ndarray] = dict(zip(SMPL_JOINTS, load_body().joints, strict=True))
     rest = {name: motion.rest[joint] @ axes for name, joint in landmarks.items()}
     source = _sources(motion, landmarks)
@@ -95,102 +74,25 @@ def retarget(motion: SkeletonMotion, landmarks: Mapping[str, int], where: str) -
     local[1:] = np.swapaxes(world[list(SMPL_PARENTS[1:])], -1, -2) @ world[1:]
     pose = np.swapaxes(axis_angle_from_matrix(local), 0, 1).reshape(-1, 72)
 
-    scale = _leg_length(body) / _leg_length(rest)
+    scale = leg_length(body) / leg_length(rest)
     hips = scale * (motion.positions[landmarks["left_hip"]] + motion.positions[landmarks["right_hip"]]) / 2 @ axes
     offset = (body["left_hip"] + body["right_hip"]) / 2 - body["pelvis"]
     transl = hips - world[0] @ offset - body["pelvis"]
     clip = check_clip(MotionClip(pose, np.zeros(10), transl, motion.time_s), where)
-    up = _moving_up(motion, landmarks, axes)
+    up = moving_up(motion, landmarks, axes)
     return clip if up[1] == 1.0 else move_world(clip, shortest_turn(up, UP), np.zeros(3))
-
-
-def _check_limbs(motion: SkeletonMotion, landmarks: Mapping[str, int], where: str) -> None:
-    for chain in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist")):
-        for side in SIDES:
-            for upper, lower in pairwise(chain):
-                joints = landmarks[f"{side}_{upper}"], landmarks[f"{side}_{lower}"]
-                names = " and ".join(motion.names[joint] for joint in joints)
-                if joints[0] not in _ancestors(motion.parents, joints[1])[1:]:
-                    raise DataError(f"{where}: {names} are no limb: the second does not hang on the first")
-                if np.linalg.norm(motion.rest[joints[1]] - motion.rest[joints[0]]) < 1e-9:
-                    raise DataError(f"{where}: {names} are at the same place in the rest pose")
-
-
-def _ancestors(parents: tuple[int, ...], joint: int) -> list[int]:
-    """The joint, its parent, and so on to the root."""
-    chain = [joint]
-    while parents[chain[-1]] >= 0:
-        chain.append(parents[chain[-1]])
-    return chain
-
-
-def _chain_between(parents: tuple[int, ...], start: int, end: int) -> list[int]:
-    """`start`, then the joints above `end` that are not above `start`, from the top to `end`."""
-    above = set(_ancestors(parents, start))
-    return [start, *[joint for joint in reversed(_ancestors(parents, end)) if joint not in above]]
-
-
-def _common_ancestor(parents: tuple[int, ...], one: int, other: int) -> int:
-    above = set(_ancestors(parents, other))
-    return next(joint for joint in _ancestors(parents, one) if joint in above)
-
-
-def _rest_axes(motion: SkeletonMotion, landmarks: Mapping[str, int], where: str) -> np.ndarray:
-    """The source's left, up and forward as columns [3, 3]; up is an axis of its world."""
-    rest = {name: motion.rest[landmarks[name]] for name in LANDMARKS}
-    trunk = sum((rest[f"{side}_shoulder"] - rest[f"{side}_hip"] for side in SIDES), np.zeros(3))
-    up = np.zeros(3)
-    axis = int(np.argmax(np.abs(trunk)))
-    up[axis] = np.sign(trunk[axis])
-    left = rest["left_hip"] - rest["right_hip"]
-    left = left - (left @ up) * up
-    bones = {"the trunk": trunk}
-    for side in SIDES:
-        bones[f"the {side} thigh"] = rest[f"{side}_hip"] - rest[f"{side}_knee"]
-        bones[f"the {side} shank"] = rest[f"{side}_knee"] - rest[f"{side}_ankle"]
-    for name, bone in bones.items():
-        if bone @ up < np.cos(np.deg2rad(MAX_TILT_DEG)) * np.linalg.norm(bone) or not bone.any():
-            raise DataError(
-                f"{where}: the rest pose must be that of a person who stands, got {name} along {bone.tolist()} where "
-                f"up is {up.tolist()}"
-            )
-    if np.linalg.norm(left) < 1e-6 * np.linalg.norm(trunk):
-        raise DataError(f"{where}: both hips are at the same place in the rest pose, so that left is not known")
-    left = left / np.linalg.norm(left)
-    return np.stack([left, up, np.cross(left, up)], axis=1)
-
-
-def _moving_up(motion: SkeletonMotion, landmarks: Mapping[str, int], axes: np.ndarray) -> np.ndarray:
-    """Which axis [3] of the rest pose's frame is up while the source moves: y, unless all speaks for another one.
-
-    Some files stand along y in their rest pose and along z in every frame. People may also lie, so that another axis
-    is taken only where trunk and legs are straight along it and hips as high above 0 as legs are long, and not so
-    along y.
-    """
-    at = {name: motion.positions[landmarks[name]] @ axes for name in LANDMARKS}
-    hips, shoulders, ankles = ((at[f"left_{part}"] + at[f"right_{part}"]) / 2 for part in ("hip", "shoulder", "ankle"))
-    trunk, legs = np.median(shoulders - hips, axis=0), np.median(hips - ankles, axis=0)
-    up = np.zeros(3)
-    axis = int(np.argmax(np.abs(trunk)))
-    up[axis] = np.sign(trunk[axis])
-    straight = np.cos(np.deg2rad(MAX_LEAN_DEG))
-    stands = all(part @ up > straight * np.linalg.norm(part) for part in (trunk, legs))
-    length = _leg_length({name: motion.rest[joint] for name, joint in landmarks.items()})
-    low, high = (limit * length for limit in HIP_HEIGHTS)
-    height = np.median(hips, axis=0)
-    return up if stands and low < height @ up < high and height @ UP < low else UP
 
 
 def _sources(motion: SkeletonMotion, landmarks: Mapping[str, int]) -> dict[str, tuple[list[int], float]]:
     """For each SMPL joint that the source moves, a chain of source joints and a place on it, in joints."""
     parents = motion.parents
-    pelvis = _common_ancestor(parents, landmarks["left_hip"], landmarks["right_hip"])
-    chest = _common_ancestor(parents, landmarks["left_shoulder"], landmarks["right_shoulder"])
-    spine = _chain_between(parents, pelvis, chest)
+    pelvis = common_ancestor(parents, landmarks["left_hip"], landmarks["right_hip"])
+    chest = common_ancestor(parents, landmarks["left_shoulder"], landmarks["right_shoulder"])
+    spine = chain_between(parents, pelvis, chest)
     # However many joints a source's spine has, SMPL's three share its bend evenly.
     found = {name: (spine, (len(spine) - 1) * i / 3) for i, name in enumerate(("pelvis", "spine1", "spine2", "spine3"))}
     if "head" in landmarks:
-        neck = _chain_between(parents, chest, landmarks["head"])
+        neck = chain_between(parents, chest, landmarks["head"])
         found |= {"neck": (neck, (len(neck) - 1) / 2), "head": (neck, len(neck) - 1.0)}
     for side in SIDES:
         shoulder = landmarks[f"{side}_shoulder"]
@@ -259,9 +161,3 @@ def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
         across = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
         axis, sine = (across / np.linalg.norm(across), 1.0) if cosine < 0 else (np.zeros(3), 1.0)
     return matrix_from_axis_angle(axis / sine * np.arctan2(np.linalg.norm(np.cross(start, end)), cosine))
-
-
-def _leg_length(joints: Mapping[str, np.ndarray]) -> float:
-    """Thigh and shank, mean of both sides."""
-    pairs = [(f"{side}_{a}", f"{side}_{b}") for side in SIDES for a, b in (("hip", "knee"), ("knee", "ankle"))]
-    return sum(float(np.linalg.norm(joints[b] - joints[a])) for a, b in pairs) / 2

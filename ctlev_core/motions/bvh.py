@@ -6,7 +6,8 @@ Position channels replace the OFFSET of their joint, axis by axis, which is how 
 
 No BVH says its unit: CMU's conversions have 0.45 inches, others centimetres or metres. None is needed, for the motion
 is scaled to the legs of the body (`ctlev_core.body.retargeting`). Up is the axis along which the rest pose stands, or
-the one along which the person stands while it moves, where that is plainly another one.
+the one along which the person stands while it moves, where that is plainly another one. A rest pose that is none, all
+bones along one axis as LAFAN1 has it, gives way to the frame in which the person stands straightest.
 
 Source: Meredith and Maddock, "Motion capture file formats explained", University of Sheffield, CS-01-11.
 """
@@ -21,7 +22,8 @@ import numpy as np
 
 from ctlev_core.body.landmarks import find_landmarks
 from ctlev_core.body.motion_clip import MotionClip
-from ctlev_core.body.retargeting import SkeletonMotion, retarget
+from ctlev_core.body.retargeting import retarget
+from ctlev_core.body.source_skeleton import SkeletonMotion
 from data_contracts.errors import DataError
 
 VERSION = 1

@@ -32,7 +32,6 @@ import numpy as np
 
 from ctlev_core.body.motion_clip import REST_PELVIS, MotionClip, check_clip
 from ctlev_core.dataset_files import numpy_files
-from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 VERSION = 1
@@ -57,7 +56,6 @@ _LAYOUTS = (
     "[25, 6, T] or [1, 25, 6, T] (6D)"
 )
 _LARGEST = 1e6
-_MAX_UNEVENNESS = 0.1
 
 
 def sniff(path: Path) -> bool:
@@ -67,7 +65,9 @@ def sniff(path: Path) -> bool:
         return not {*POSE_NAMES, "body_pose"}.isdisjoint(names)
     shape = numpy_files.read_shape(path)
     if shape is not None:
-        return _is_known(shape) and not (shape[1:] == (24, 3) and _are_positions(_read_array(path)))
+        from ctlev_core.body.inverse_kinematics import are_positions
+
+        return _is_known(shape) and not (shape[1:] == (24, 3) and are_positions(_read_array(path)))
     with path.open("rb") as file:
         if file.read(6) != b"\x93NUMPY":
             return False
@@ -235,27 +235,3 @@ def _one_shape(betas: np.ndarray, where: str) -> np.ndarray:
     if other.any():
         raise DataError(f"{where}: the shape changes in frame {int(np.argmax(other))}; expected one body")
     return rows[0, :10]
-
-
-def _are_positions(array: np.ndarray) -> bool:
-    """Do bones between joints [T, 24, 3] keep their lengths, alike left and right, and those of a body?"""
-    at = {name: array[:, joint] for joint, name in enumerate(SMPL_JOINTS)}
-    bones = {
-        "thigh": ("hip", "knee"),
-        "shank": ("knee", "ankle"),
-        "arm": ("shoulder", "elbow"),
-        "fore": ("elbow", "wrist"),
-    }
-    mean = {}
-    for bone, (upper, lower) in bones.items():
-        lengths = np.stack(
-            [np.linalg.norm(at[f"{side}_{lower}"] - at[f"{side}_{upper}"], axis=1) for side in ("left", "right")]
-        )
-        mean[bone] = lengths.mean()
-        if not np.abs(lengths - mean[bone]).max(initial=0) < _MAX_UNEVENNESS * mean[bone]:
-            return False
-    return (
-        0.6 < mean["shank"] / mean["thigh"] < 1.6
-        and 0.6 < mean["fore"] / mean["arm"] < 1.6
-        and mean["thigh"] > mean["arm"]
-    )
