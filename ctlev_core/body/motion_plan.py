@@ -14,6 +14,7 @@ from data_contracts.errors import DataError
 
 GAIT_SECONDS = 3.0
 STAND_SECONDS = 1.5
+STEP_HOLD_SECONDS = 0.5
 HOLD_SECONDS = 1.0
 """How long a posture is kept that nothing follows."""
 CIRCLE_SECONDS = {"walk": 6.0, "run": 4.0, "march": 7.0, "crawl": 10.0}
@@ -95,6 +96,11 @@ def plan_pieces(actions: tuple[Action, ...], rng: np.random.Generator) -> list[P
             pieces += _stay(action, posture, last, rng)
         else:
             pieces += _perform(action, posture, rng)
+    # Steps are counted from standing to standing; a gait may be under way already, and go on.
+    if actions[0].word.kind == "step":
+        pieces.insert(0, _hold("standing", STEP_HOLD_SECONDS, rng))
+    if actions[-1].word.kind == "step":
+        pieces.append(_hold("standing", STEP_HOLD_SECONDS, rng))
     total = sum(piece.duration_s for piece in pieces)
     if total > MAX_DURATION_S:
         raise DataError(f"the motion takes {total:.0f} s, more than the limit of {MAX_DURATION_S:.0f} s")

@@ -125,7 +125,7 @@ def _tokens(sentence: str) -> list[str]:
     tokens = [token.removesuffix("'s") for token in _TOKEN.findall(text)]
     # Before the phrases are looked for, so that "throws a punch" and "shakes his head" are found.
     tokens = [token for token in tokens if token not in words.FILLERS or token == "both"]
-    following = [*tokens[1:], ""]
+    following = [*tokens, ""][1:]
     return [token for token, after in zip(tokens, following, strict=True) if token != "both" or after in words.LIMBS]
 
 
@@ -257,17 +257,31 @@ def _join(clauses: list[tuple[str, _Clause]]) -> list[Action]:
         else:
             joined.append((link, _merge(clause, waiting) if waiting else clause))
             waiting = None
+    if waiting is not None:
+        raise DataError(f"names no action; known: {', '.join(known_verbs())}")
+    return _in_time(joined)
+
+
+def _in_time(clauses: list[tuple[str, _Clause]]) -> list[Action]:
+    """Actions one after the other; those that are done at the same time are combined."""
     actions: list[Action] = []
-    for position, (link, clause) in enumerate(joined):
+    at_once: Action | None = None
+    for link, clause in clauses:
         action = _action(clause)
         if link == "while" and not actions:
-            raise DataError("'while' at the start; say first what is done, then what is done meanwhile")
-        if (link == "while" or clause.simultaneous) and actions:
+            # "While walking, he waves."
+            at_once = action
+        elif at_once is not None:
+            actions.append(_combine(action, at_once))
+            at_once = None
+        elif actions and (link == "while" or clause.simultaneous):
             actions[-1] = _combine(actions[-1], action)
-        elif clause.simultaneous and position == 0 and len(joined) == 1:
+        elif clause.simultaneous and len(clauses) == 1:
             raise DataError("at the same time as what?")
         else:
             actions.append(action)
+    if at_once is not None:
+        raise DataError(f"'while' and {at_once.verb!r}, but nothing that is done meanwhile")
     return actions
 
 
