@@ -55,7 +55,8 @@ def read_numbers(file: IO[bytes], size: int, where: str) -> np.ndarray:
     if header.dtype.kind not in "fiu":
         raise DataError(f"{where} must be numbers, got {header.dtype}")
     items = array_files.read_items(file, header.dtype, math.prod(header.shape), where)
-    return items.reshape(header.shape, order="F" if header.fortran_order else "C").astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN; what it means is the caller's business
+        return items.reshape(header.shape, order="F" if header.fortran_order else "C").astype(np.float64)
 
 
 def list_npz(path: Path) -> list[str]:

@@ -149,17 +149,14 @@ def _split(array: np.ndarray, where: str) -> dict[str, Any]:
 
 
 def _matrices_of_rows(sixes: np.ndarray, where: str) -> np.ndarray:
-    """Rotation matrices [..., 3, 3] of their first two rows [..., 6], after Gram and Schmidt."""
-    first, second = sixes[..., :3], sixes[..., 3:]
-    lengths = np.linalg.norm(first, axis=-1, keepdims=True)
-    first = first / np.maximum(lengths, 1e-12)
-    second = second - (first * second).sum(axis=-1, keepdims=True) * first
-    across = np.linalg.norm(second, axis=-1, keepdims=True)
-    degenerate = ((lengths < 1e-6) | (across < 1e-6)).reshape(len(sixes), -1).any(axis=1)
-    if degenerate.any():
-        raise DataError(f"{where}: the 6D rotation of a joint in frame {int(np.argmax(degenerate))} is degenerate")
-    second = second / across
-    return np.stack([first, second, np.cross(first, second)], axis=-2)
+    """Rotation matrices [..., 3, 3] of their first two rows [..., 6]."""
+    from ctlev_core.body.rotations import matrix_from_rotation_6d
+
+    try:
+        # That function takes columns, as Zhou et al. have it.
+        return np.swapaxes(matrix_from_rotation_6d(sixes), -1, -2)
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from None
 
 
 def _check_rotations(matrices: np.ndarray, where: str) -> None:
@@ -205,7 +202,8 @@ def _first(arrays: dict[Any, Any], names: tuple[str, ...], where: str) -> np.nda
         raise DataError(f"{where}: {name} must be numbers, got {type(arrays[name]).__name__} {array.dtype}")
     if array.size == 0:
         raise DataError(f"{where}: {name} is empty: {list(array.shape)}")
-    return array.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN; it is refused later
+        return array.astype(np.float64)
 
 
 def _joined(root: np.ndarray, body: np.ndarray, where: str) -> np.ndarray:
