@@ -26,6 +26,10 @@ from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_labels
 
 CAMERA_STREAM = 20
+BODY_REACH_M = 0.9
+"""Of an upright body around its pelvis."""
+MAX_OFF_AXIS_M = 0.1
+"""A pelvis nearer than this to the axis of the camera asks for no more distance than was wished."""
 
 
 class PoseSourceOptions(Frozen):
@@ -41,7 +45,7 @@ class PoseSourceOptions(Frozen):
         description="one camera a recording, far enough to see all of the way; or, for single pictures, one that has "
         "the pelvis of each moment on its axis",
     )
-    distance_m: float = Field(default=3.0, gt=0, description="smallest depth of the pelvis")
+    distance_m: float = Field(default=3.0, gt=0, description="smallest depth of the pelvis; more where the way asks it")
     yaw_range_deg: tuple[float, float] = Field(
         default=(-180.0, 180.0), description="turn about the vertical; 0 = from the front in the rest pose"
     )
@@ -78,11 +82,10 @@ def labels_before_camera(clip: MotionClip, class_name: str, recording_id: str, o
     check_clip(clip, recording_id)
     rotation = _camera_rotation(recording_id, options)
     # Of the whole recording, so that the view does not depend on which moments are taken.
-    low, high = (ends(((REST_PELVIS + clip.transl) @ rotation.T), axis=0) for ends in (np.min, np.max))
+    way = (REST_PELVIS + clip.transl) @ rotation.T
     chosen = resample(clip, choose_times(clip, options))
     if options.camera == "still":
-        centre = (low + high) / 2
-        translation = np.array([-centre[0], -centre[1], options.distance_m - low[2]])
+        translation = _still_translation(way, options.distance_m)
     else:
         translation = np.array([0.0, 0.0, options.distance_m]) - (REST_PELVIS + chosen.transl) @ rotation.T
     seen = move_world(chosen, rotation, translation)
@@ -95,6 +98,19 @@ def labels_before_camera(clip: MotionClip, class_name: str, recording_id: str, o
         smpl_transl=seen.transl.astype(np.float32),
     )
     return check_labels(labels, recording_id)
+
+
+def _still_translation(way: np.ndarray, distance_m: float) -> np.ndarray:
+    """Where the world goes [3], m, so that a still camera sees a body along `way` [T, 3], m, axes of the camera."""
+    from ctlev_core.body.virtual_camera import FOCAL_PER_SIDE
+
+    low, high = way.min(axis=0), way.max(axis=0)
+    centre = (low + high) / 2
+    off_axis = np.abs(way - centre)[:, :2].max(axis=1)
+    # At depth z the picture reaches z / (2 FOCAL_PER_SIDE) to each side.
+    needed = 2 * FOCAL_PER_SIDE * (off_axis + BODY_REACH_M) - (way[:, 2] - low[2])
+    needed = np.where(off_axis > MAX_OFF_AXIS_M, needed, 0.0).max()
+    return np.array([-centre[0], -centre[1], max(distance_m, needed) - low[2]])
 
 
 def clip_of_labels(labels: Labels, where: str) -> MotionClip:
