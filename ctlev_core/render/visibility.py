@@ -8,13 +8,15 @@ from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 _FLESH_M = {
-    "pelvis": 0.20, "hip": 0.21, "knee": 0.09, "ankle": 0.07, "foot": 0.06, "spine1": 0.21, "spine2": 0.21,
-    "spine3": 0.20, "neck": 0.21, "collar": 0.19, "head": 0.13, "shoulder": 0.14, "elbow": 0.07, "wrist": 0.04,
-    "hand": 0.04,
+    "pelvis": 0.20, "hip": 0.21, "spine1": 0.21, "spine2": 0.21, "spine3": 0.20, "neck": 0.21, "collar": 0.19,
+    "head": 0.13, "shoulder": 0.14,
+    "knee": 0.15, "ankle": 0.09, "foot": 0.07, "elbow": 0.10, "wrist": 0.06, "hand": 0.08,
 }  # fmt: skip
 SMPL_FLESH_M = np.array([_FLESH_M[joint.removeprefix("left_").removeprefix("right_")] for joint in SMPL_JOINTS])
 """How much of its own body may lie before a joint, [24] m: from the joint of the bundled body at rest to its skin, in
-three of four directions. In the others one looks along a limb, and what lies before the joint is the limb's far end."""
+three of four directions for the trunk and nine of ten for limbs, along which one looks more often. In the rest one
+looks along the bone, and what lies before the joint is the far end of the limb. For the hand, whose joint lies at its
+back, as far as its palm."""
 
 
 def joint_visibility(

@@ -189,3 +189,48 @@ def test_scaled_camera_sees_the_same():
     points = np.random.default_rng(0).normal(size=(10, 3)) * 0.3
     np.testing.assert_allclose(project(camera.scaled(2), points), 2 * project(camera, points))
     assert camera.scaled(2).image_size == (48, 36)
+
+
+def test_triangles_wider_than_the_queue_and_many_small_ones():
+    """A wall of 3,000 x 2 px is longer than the queue of covered pixels; 2,000 triangles of a pixel or two fill it."""
+    wide = np.array([[300.0, 0, 1500.0], [0, 300.0, 1.0], [0, 0, 1]])
+    wall = np.array([[-6.0, -0.5, 1], [6, -0.5, 1], [6, 0.5, 1], [-6, 0.5, 1]])
+    _, depth_inverse = render_attributes(wall, np.array([[0, 2, 1], [0, 3, 2]]), wall, wide, (3000, 2))
+    np.testing.assert_array_equal(depth_inverse, np.ones((2, 3000)))
+    rng = np.random.default_rng(0)
+    corners = rng.uniform([-1, -0.8, 2], [1, 0.8, 2], (2000, 1, 3)) + rng.normal(0, 0.1, (2000, 3, 3)) * [1, 1, 0]
+    vertices = corners.reshape(-1, 3)
+    image, depth_inverse = render_attributes(
+        vertices, np.arange(6000).reshape(-1, 3), vertices, K, (24, 18), cull_back=False
+    )
+    rays = np.stack(np.meshgrid((np.arange(24) + 0.5 - 12.3) / 20, (np.arange(18) + 0.5 - 8.7) / 22), -1)
+    covered = np.zeros((18, 24), bool)
+    for a, b, c in corners[..., :2] / 2:
+        edges = ((a, b - a), (b, c - b), (c, a - c))
+        sides = [way[0] * (rays - start)[..., 1] - way[1] * (rays - start)[..., 0] for start, way in edges]
+        covered |= np.all(np.array(sides) >= 0, axis=0) | np.all(np.array(sides) <= 0, axis=0)
+    np.testing.assert_array_equal(depth_inverse > 0, covered)
+    np.testing.assert_allclose(image[covered][:, :2], 2 * rays[covered], atol=1e-9)
+
+
+@pytest.mark.parametrize("centre", [(127.5, 127.5), (128.0, 128.0), (100.25, 90.5)])
+def test_corners_on_pixel_centres_leave_no_holes(centre):
+    """The pole of a sphere on the optical axis projects exactly onto the middle of a pixel where the size is odd."""
+    mesh = trimesh.creation.uv_sphere(radius=0.7, count=(24, 24))
+    vertices = mesh.vertices + np.array([0, 0, 3])
+    camera_matrix = np.array([[300, 0, centre[0]], [0, 300, centre[1]], [0, 0, 1.0]])
+    _, depth_inverse = render_attributes(vertices, mesh.faces, vertices, camera_matrix, (255, 255))
+    rows, columns = np.mgrid[:255, :255] + 0.5
+    well_inside = np.hypot(columns - centre[0], rows - centre[1]) < 60
+    assert (depth_inverse[well_inside] > 0).all()
+
+
+def test_vertex_normals_leave_out_faces_that_are_not_finite():
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    vertices, faces = mesh.vertices.copy(), mesh.faces.astype(np.int32)
+    vertices[3] = np.nan, np.inf, 0
+    normals = vertex_normals(vertices, faces)
+    others = np.delete(np.arange(len(vertices)), 3)
+    expected = vertex_normals(mesh.vertices.copy(), faces[(faces != 3).all(axis=1)])
+    np.testing.assert_array_equal(normals[others], expected[others])
+    assert not normals[3].any()
