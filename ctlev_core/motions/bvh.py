@@ -9,6 +9,10 @@ is scaled to the legs of the body (`ctlev_core.body.retargeting`). Up is the axi
 the one along which the person stands while it moves, where that is plainly another one. A rest pose that is none, all
 bones along one axis as LAFAN1 has it, gives way to the frame in which the person stands straightest.
 
+Converters put the pose in which they calibrate, mostly a T, before the first frame (those of CMU's data do). It is no
+part of the motion and is left out: it is known by a joint that turns faster than any living one from it to the next
+frame, and never nearly as fast afterwards.
+
 Source: Meredith and Maddock, "Motion capture file formats explained", University of Sheffield, CS-01-11.
 """
 
@@ -21,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from ctlev_core.body.landmarks import find_landmarks
-from ctlev_core.body.motion_clip import MotionClip
+from ctlev_core.body.motion_clip import MotionClip, take
 from ctlev_core.body.retargeting import retarget
 from ctlev_core.body.source_skeleton import SkeletonMotion
 from data_contracts.errors import DataError
@@ -35,6 +39,10 @@ _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 _MOTION_LINE = re.compile(r"^\s*MOTION\s*$", re.MULTILINE)
 _TIMING = re.compile(r"\s*Frames\s*:\s*(\S+)\s+Frame\s+Time\s*:\s*(\S+)", re.IGNORECASE)
 _END_SITE = -2
+MAX_SPEED_DEG_S = 8000.0
+"""The fastest turn of a human joint is that of a pitcher's shoulder, about 7,000 (Fleisig et al., AJSM 1995)."""
+CALIBRATION_FACTOR = 3.0
+"""How much faster than all later turns the one after a calibration pose is."""
 
 
 @dataclass
@@ -54,14 +62,14 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path) -> MotionClip:
-    """The motion on SMPL's joints: metres, y up, every frame.
+    """The motion on SMPL's joints: metres, y up, every frame but a calibration pose at the start.
 
     Raises:
         DataError: the file cannot be read or is cut, a word is not where it belongs, a number is none or not finite,
             there are no frames, the joints have unknown names, or see `retarget`.
     """
     motion = read_skeleton_motion(path)
-    return retarget(motion, find_landmarks(motion.names, str(path)), str(path))
+    return _without_calibration(retarget(motion, find_landmarks(motion.names, str(path)), str(path)))
 
 
 def read_skeleton_motion(path: Path) -> SkeletonMotion:
@@ -82,6 +90,19 @@ def read_skeleton_motion(path: Path) -> SkeletonMotion:
     joints = _Hierarchy(parts[0], str(path)).joints
     time_s, values = _parse_motion(parts[1], sum(len(joint.channels) for joint in joints), str(path))
     return _solve(joints, time_s, values)
+
+
+def _without_calibration(clip: MotionClip) -> MotionClip:
+    from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+
+    if len(clip) < 3:
+        return clip
+    rotations = matrix_from_axis_angle(clip.pose.reshape(-1, 24, 3))
+    steps = axis_angle_from_matrix(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
+    speeds = np.rad2deg(np.linalg.norm(steps, axis=-1).max(axis=1)) / np.diff(clip.time_s)
+    if speeds[0] < max(MAX_SPEED_DEG_S, CALIBRATION_FACTOR * speeds[1:].max()):
+        return clip
+    return take(clip, np.arange(1, len(clip)))
 
 
 class _Hierarchy:

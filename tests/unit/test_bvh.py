@@ -66,14 +66,16 @@ def test_limbs_point_where_they_point_in_the_file(order, joints, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "world", "num_frames"), [("cmu_12_01_walk.bvh", np.eye(3), 524), ("pybvh_test3.bvh", Z_UP_TO_Y_UP, 100)]
+    ("name", "world", "start", "num_frames"),
+    [("cmu_12_01_walk.bvh", np.eye(3), 1, 523), ("pybvh_test3.bvh", Z_UP_TO_Y_UP, 0, 100)],
 )
-def test_limbs_of_real_files(name, world, num_frames):
-    """pybvh_test3 stands along y in its rest pose and along z in its frames."""
+def test_limbs_of_real_files(name, world, start, num_frames):
+    """pybvh_test3 stands along y in its rest pose and along z in its frames; the walk begins with a T."""
     file = real(name)
     clip = bvh.read(file)
     assert len(clip) == num_frames
-    assert limb_error_deg(clip, by_landmark(solve_bvh(file)), world) < LIMIT_DEG
+    source = {landmark: places[start:] for landmark, places in by_landmark(solve_bvh(file)).items()}
+    assert limb_error_deg(clip, source, world) < LIMIT_DEG
     joints = smpl_positions(clip)
     assert (joints["head"][:, 1] > joints["pelvis"][:, 1] + 0.5).all()
     lowest = min(joints[f"{side}_foot"][:, 1].min() for side in ("left", "right"))
@@ -361,6 +363,23 @@ def test_rest_poses_that_are_wrong(tmp_path):
     torn = [(n, "Hips" if n == "LeftFoot" else p, q) for n, p, q in T_POSE]
     with pytest.raises(DataError, match="LeftLeg and LeftFoot are no limb"):
         bvh.read(write_bvh(tmp_path / "a.bvh", *standing(), joints=torn))
+
+
+def test_a_calibration_pose_before_the_first_frame_is_left_out(tmp_path):
+    angles, root = standing(6)
+    angles[:, :, 0] = np.linspace(0, 3, 6)[:, None]
+    whole = bvh.read(write_bvh(tmp_path / "a.bvh", angles, root))
+    assert len(whole) == 6
+    angles[0, 8, 2] = 150
+    cut = bvh.read(write_bvh(tmp_path / "a.bvh", angles, root))
+    np.testing.assert_array_equal(cut.pose, whole.pose[1:])
+    np.testing.assert_array_equal(cut.time_s, whole.time_s[1:])
+    # A flick that comes again is a motion, and so is one that is slow enough.
+    angles[3, 8, 2] = 150
+    assert len(bvh.read(write_bvh(tmp_path / "a.bvh", angles, root))) == 6
+    angles[3, 8, 2] = 0
+    assert len(bvh.read(write_bvh(tmp_path / "a.bvh", angles, root, step_s=0.1))) == 6
+    assert len(bvh.read(write_bvh(tmp_path / "a.bvh", angles[:2], root[:2]))) == 2
 
 
 def test_one_frame_and_a_frame_time_of_zero(tmp_path):
