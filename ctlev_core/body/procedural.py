@@ -128,9 +128,8 @@ def _owners(half: np.ndarray) -> np.ndarray:
         else:
             owners[rows] = _bone(part.owner)
     below = (half - GROIN_POINT) @ GROIN_NORMAL > 0
-    return np.where(
-        np.isin(owners, (INDEX["pelvis"], INDEX["left_hip"])), np.where(below, INDEX["left_hip"], 0), owners
-    )
+    around_groin = np.isin(owners, (INDEX["pelvis"], INDEX["left_hip"]))
+    return np.where(around_groin, np.where(below, INDEX["left_hip"], INDEX["pelvis"]), owners)
 
 
 def _bone(name: str) -> int:
@@ -138,36 +137,45 @@ def _bone(name: str) -> int:
 
 
 def _skin_weights(vertices: np.ndarray, mesh: SymmetricMesh, adjacency) -> np.ndarray:
-    """[V, 24]: the owner of each vertex, diffused twice over the surface.
+    """[V, 24]: the owner of each vertex, diffused twice over the surface, at most four bones a vertex.
 
     (I + s^2 L) w = onehot with s >= 0 per vertex has an M-matrix, so weights cannot turn negative and rows sum to 1.
     """
     import scipy.sparse as sparse
     from scipy.sparse.linalg import splu
 
-    count, half = len(vertices), len(mesh.half)
-    weights = np.zeros((count, NUM_JOINTS))
+    half = len(mesh.half)
     owners = _owners(vertices[:half])
+    weights = np.zeros((len(vertices), NUM_JOINTS))
     weights[np.arange(half), owners] = 1.0
     weights[mesh.mirror[:half], np.array(MIRROR_JOINT)[owners]] = 1.0
-    seam = np.flatnonzero(mesh.seam)
-    weights[seam] = weights[seam] / weights[seam].sum(axis=1, keepdims=True)
-    edges = adjacency.tocoo()
-    # On an even triangle mesh 2/3 sum_j (f_j - f_i) / h^2 is the Laplacian.
-    stiffness = 2 / 3 / np.sum((vertices[edges.row] - vertices[edges.col]) ** 2, axis=1)
-    laplacian = sparse.coo_matrix((stiffness, (edges.row, edges.col)), (count, count)).tocsr()
-    laplacian = sparse.diags(np.asarray(laplacian.sum(axis=1)).ravel()) - laplacian
-    widths = np.array([BORDER_M[name.removeprefix("left_").removeprefix("right_")] for name in SMPL_JOINTS])
-    joints = rest_joints()
-    closeness = np.exp(-np.sum((vertices[:, None] - joints) ** 2, axis=2) / (2 * 0.05**2)) + 1e-12
-    border = closeness @ widths / closeness.sum(axis=1)
-    solve = splu((sparse.eye(count) + sparse.diags(border**2) @ laplacian).tocsc()).solve
+    weights /= weights.sum(axis=1, keepdims=True)
+    diffusion = sparse.diags(_border_widths(vertices) ** 2) @ _laplacian(vertices, adjacency)
+    solve = splu((sparse.eye(len(vertices)) + diffusion).tocsc()).solve
     weights = solve(solve(weights))
     weights = (weights + weights[mesh.mirror][:, MIRROR_JOINT]) / 2
     # Where left and right tie for the last place on the plane of symmetry, both go.
     fifth = np.sort(weights, axis=1)[:, -BONES_PER_VERTEX - 1, None]
     weights = np.where(weights > fifth * (1 + 1e-9), weights, 0.0)
     return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _laplacian(vertices: np.ndarray, adjacency):
+    """Positive Laplacian [V, V], 1 / m^2, sparse: 2/3 sum_j (f_i - f_j) / length_ij^2, exact on an even mesh."""
+    import scipy.sparse as sparse
+
+    edges = adjacency.tocoo()
+    stiffness = 2 / 3 / np.sum((vertices[edges.row] - vertices[edges.col]) ** 2, axis=1)
+    matrix = sparse.coo_matrix((stiffness, (edges.row, edges.col)), adjacency.shape).tocsr()
+    return sparse.diags(np.asarray(matrix.sum(axis=1)).ravel()) - matrix
+
+
+def _border_widths(vertices: np.ndarray, reach_m: float = 0.05) -> np.ndarray:
+    """[V], m: `BORDER_M` of the joints near each vertex, fading from joint to joint."""
+    widths = np.array([BORDER_M[name.removeprefix("left_").removeprefix("right_")] for name in SMPL_JOINTS])
+    squares = np.sum((vertices[:, None] - rest_joints()) ** 2, axis=2)
+    closeness = np.exp(-squares / (2 * reach_m**2)) + 1e-12
+    return closeness @ widths / closeness.sum(axis=1)
 
 
 def _joint_shapedirs(joints: np.ndarray) -> np.ndarray:

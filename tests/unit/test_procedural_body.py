@@ -79,6 +79,7 @@ def test_left_and_right_are_mirror_images():
 
 
 def test_measures_are_those_of_an_adult():
+    # Ranges: roughly what surveys of adults find between the slight and the stout.
     assert 1.72 < MESH.extents[1] < 1.77
     assert 0.065 < MESH.volume < 0.085
     left = BODY.v_template[BODY.v_template[:, 0] > 0]
