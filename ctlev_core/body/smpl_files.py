@@ -68,9 +68,7 @@ def read_smpl_file(path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"{path}: cannot be read as a body model: {error.strerror}") from error
     found = _read_npz(path) if is_npz else _read_pickle(path)
     arrays = {name: _numbers(value, f"{path}: {name}") for name, value in found.items()}
-    for name in ("f", "kintree_table"):
-        if name in arrays:
-            arrays[name] = _whole_numbers(arrays[name], f"{path}: {name}")
+    arrays["f"] = _whole_numbers(arrays["f"], f"{path}: f")
     if "kintree_table" in arrays:
         arrays["kintree_table"] = _check_tree(arrays["kintree_table"], path)
     return arrays
@@ -138,10 +136,10 @@ def _check_tree(table: np.ndarray, path: Path) -> np.ndarray:
     if not np.array_equal(table, expected):
         row, joint = np.argwhere(table != expected)[0]
         raise DataError(
-            f"{path}: kintree_table is not SMPL's tree: [{row}, {joint}] is {table[row, joint]}, expected "
+            f"{path}: kintree_table is not SMPL's tree: [{row}, {joint}] is {table[row, joint]:g}, expected "
             f"{expected[row, joint]}"
         )
-    return table
+    return expected
 
 
 def _whole_numbers(array: np.ndarray, where: str) -> np.ndarray:
@@ -166,7 +164,7 @@ def _numbers(value: Any, where: str, depth: int = 0) -> np.ndarray:
         raise
     except Exception as error:  # the state is whatever the file says, and wrong ones fail in many ways
         raise DataError(f"{where} cannot be made an array: {type(error).__name__}: {error}") from error
-    if array.dtype.kind not in "fiub":
+    if array.dtype.kind not in "fiub" or array.ndim == 0:
         raise DataError(f"{where} must be an array of numbers, got {type(value).__name__} of {array.dtype}")
     return array.astype(np.float64)
 
@@ -191,21 +189,21 @@ def _dense(form: str, state: dict[str, Any]) -> np.ndarray:
     """A sparse matrix of scipy as a dense one; entries that are there twice add up."""
     rows, columns = (int(n) for n in state["_shape" if "_shape" in state else "shape"])
     if min(rows, columns) < 0 or rows * columns > _MAX_ELEMENTS:
-        raise DataError(f"a sparse matrix of the shape {[rows, columns]}")
+        raise ValueError(f"a sparse matrix of the shape {[rows, columns]}")
     data = np.asarray(state["data"], dtype=np.float64)
     if form == "coo":
         row, column = state["coords"] if "coords" in state else (state["row"], state["col"])
     else:
         starts = np.asarray(state["indptr"])
         if len(starts) != (columns if form == "csc" else rows) + 1 or starts[0] != 0 or starts[-1] > len(data):
-            raise DataError(f"a sparse matrix whose rows or columns start at {starts.tolist()[:8]} ...")
+            raise ValueError(f"a sparse matrix whose rows or columns start at {starts.tolist()[:8]} ...")
         outer = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         inner, data = np.asarray(state["indices"])[: len(outer)], data[: len(outer)]
         row, column = (inner, outer) if form == "csc" else (outer, inner)
     row, column = np.asarray(row), np.asarray(column)
     for name, index, count in (("row", row, rows), ("column", column, columns)):
         if math.prod(index.shape) and (index.min() < 0 or index.max() >= count):
-            raise DataError(f"a sparse matrix with an entry in {name} {index.min()} .. {index.max()} of {count}")
+            raise ValueError(f"a sparse matrix with an entry in {name} {index.min()} .. {index.max()} of {count}")
     dense = np.zeros((rows, columns))
     np.add.at(dense, (row, column), data)
     return dense

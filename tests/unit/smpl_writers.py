@@ -1,0 +1,80 @@
+"""Body files in SMPL's published layout, of random numbers: the real ones may not be passed on."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+import types
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from ctlev_core.skeletons import SMPL_PARENTS
+
+
+def smpl_arrays(seed: int = 0, num_vertices: int = 6890, num_faces: int = 13776) -> dict[str, Any]:
+    """Arrays with the names, shapes and types of SMPL's files; the regressor dense."""
+    rng = np.random.default_rng(seed)
+    weights = np.zeros((num_vertices, 24))
+    for vertex in weights:
+        vertex[rng.choice(24, 4, replace=False)] = rng.dirichlet(np.ones(4))
+    regressor = np.zeros((24, num_vertices))
+    for joint in regressor:
+        joint[rng.choice(num_vertices, 12, replace=False)] = rng.dirichlet(np.ones(12))
+    return {
+        "v_template": rng.uniform(-0.9, 0.9, (num_vertices, 3)),
+        "f": rng.integers(0, num_vertices, (num_faces, 3)).astype(np.uint32),
+        "weights": weights,
+        "shapedirs": 0.02 * rng.normal(size=(num_vertices, 3, 10)),
+        "posedirs": 0.003 * rng.normal(size=(num_vertices, 3, 207)),
+        "J_regressor": regressor,
+        "kintree_table": np.array([[2**32 - 1, *SMPL_PARENTS[1:]], range(24)], np.uint32),
+    }
+
+
+def pickled(tree: dict[str, Any], protocol: int = 2) -> bytes:
+    """The bytes of a pickle; sparse matrices under the module names that scipy had when SMPL was published."""
+    content = pickle.dumps(tree, protocol)
+    if protocol > 2:  # there a length stands before each name
+        return content
+    for form in (b"csc", b"csr", b"coo"):
+        content = content.replace(b"scipy.sparse._" + form, b"scipy.sparse." + form)
+    return content
+
+
+def sparse(matrix: np.ndarray, form: str = "csc") -> Any:
+    """A scipy matrix of one of the forms csc, csr and coo."""
+    return getattr(scipy.sparse, f"{form}_matrix")(matrix)
+
+
+@contextmanager
+def chumpy_classes() -> Iterator[types.SimpleNamespace]:
+    """Classes with the names of chumpy's and a state as theirs, as long as the context is open."""
+    modules = {name: types.ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering", "chumpy.ch_ops")}
+    classes = types.SimpleNamespace()
+    for module, name in (
+        ("chumpy.ch", "Ch"),
+        ("chumpy.reordering", "Select"),
+        ("chumpy.reordering", "Reshape"),
+        ("chumpy.reordering", "transpose"),
+        ("chumpy.ch_ops", "multiply"),
+    ):
+        made = type(name, (_Expression,), {"__module__": module})
+        setattr(modules[module], name, made)
+        setattr(classes, name, made)
+    sys.modules.update(modules)
+    try:
+        yield classes
+    finally:
+        for name in modules:
+            del sys.modules[name]
+
+
+class _Expression:
+    def __init__(self, **terms: Any) -> None:
+        self.__dict__.update(
+            _dirty_vars=set(terms), _itr=None, _make_dense=False, _make_sparse=False, _depends_on_deps={}, **terms
+        )
