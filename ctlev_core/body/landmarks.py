@@ -61,12 +61,12 @@ def find_landmarks(names: Sequence[str], where: str) -> dict[str, int]:
 
 
 def _bare_names(names: Sequence[str]) -> list[str]:
-    """Lower case without punctuation, name space and what all names begin with."""
+    """Lower case without punctuation, name space and what all names but perhaps the root's begin with."""
     plain = [re.sub(r"[^a-z0-9]", "", name.rpartition(":")[2].lower()) for name in names]
-    shared = 0
+    others = plain[1:]
+    if len(others) < 2:
+        return plain
     # The first and the last in alphabetical order begin with what all begin with, and differ after it.
-    for one, other in zip(min(plain), max(plain), strict=False):
-        if one != other or len(plain) == 1:
-            break
-        shared += 1
-    return [name[shared:] for name in plain]
+    first, last = min(others), max(others)
+    shared = next((i for i, pair in enumerate(zip(first, last, strict=False)) if pair[0] != pair[1]), len(first))
+    return [name.removeprefix(first[:shared]) for name in plain]

@@ -32,6 +32,8 @@ NUM_JOINTS = len(T_POSE)
 # Seven digits more than a pose has anyway; what is left comes from rounding in the logarithm of a rotation.
 LIMIT_DEG = 1e-5
 
+KNEES = ("left_knee", "right_knee")
+
 HANGING = [
     (name, parent, (0, -abs(place[0]), 0) if name.endswith(("ForeArm", "Hand")) else place)
     for name, parent, place in T_POSE
@@ -89,6 +91,9 @@ def test_the_walk_of_cmu_goes_where_it_looks():
     assert way[2] > 3 and abs(way[0]) < 0.3
     left = joints["left_hip"] - joints["right_hip"]
     assert (left[:, 0] > 0.1).all()
+    knees = bvh.read(real("cmu_12_01_walk.bvh")).pose.reshape(-1, 24, 3)[:, [SMPL_JOINTS.index(n) for n in KNEES]]
+    bent = knees[np.linalg.norm(knees, axis=-1) > 0.5]
+    assert len(bent) > 100 and (bent[:, 0] / np.linalg.norm(bent, axis=-1) > 0.95).all()
     # Four steps in four seconds; each foot stands still on the ground for a part of the time.
     for side in ("left", "right"):
         speed = np.linalg.norm(np.diff(joints[f"{side}_foot"], axis=0), axis=1) * 120
@@ -184,6 +189,7 @@ def words(hip: str, knee: str, ankle: str, shoulder: str, elbow: str, wrist: str
 NAMINGS = {
     "mixamo": {name: f"mixamorig:{name}" for name, *_ in T_POSE},
     "underscores": {name: f"Character1_{name}" for name, *_ in T_POSE},
+    "below a root": {name: "Armature" if name == "Hips" else f"mixamorig_{name}" for name, *_ in T_POSE},
     "biped": {
         **{name: f"Bip01 {name}" for name, *_ in T_POSE},
         **renamed("Bip01 L {}", "Bip01 R {}", words("Thigh", "Calf", "Foot", "UpperArm", "Forearm", "Hand"), {}),

@@ -81,6 +81,27 @@ def test_chest_neck_and_root_turn_trunk_and_head(tmp_path):
         np.testing.assert_allclose(pose[SMPL_JOINTS.index(name)], [bend, 0, 0], atol=1e-9)
 
 
+def test_hinges_of_the_humanoid_are_hinges_of_smpl(tmp_path):
+    """Knees bend back about the left, elbows of a T forward about the vertical; bones of the two differ by degrees."""
+    frames = standing_frames(1)
+    frames[0, [20, 34]], frames[0, [29, 43]] = -1.0, 1.2
+    pose = deepmimic.read(write_deepmimic(tmp_path / "a.txt", frames)).pose.reshape(24, 3)
+    hinges = (("knee", 1.0, [1, 0, 0], [1, 0, 0]), ("elbow", 1.2, [0, -1, 0], [0, 1, 0]))
+    for part, angle, left, right in hinges:
+        for side, axis in (("left", left), ("right", right)):
+            turn = pose[SMPL_JOINTS.index(f"{side}_{part}")]
+            assert turn @ axis / np.linalg.norm(turn) > np.cos(np.deg2rad(15)), (side, part)
+            assert np.linalg.norm(turn) == pytest.approx(angle, abs=0.15)
+
+
+def test_knees_of_real_walks_bend_back():
+    for name in ("walk", "run"):
+        pose = deepmimic.read(real(name)).pose.reshape(-1, 24, 3)
+        for knee in (SMPL_JOINTS.index("left_knee"), SMPL_JOINTS.index("right_knee")):
+            bent = pose[:, knee][np.linalg.norm(pose[:, knee], axis=1) > 0.5]
+            assert len(bent) and (bent[:, 0] / np.linalg.norm(bent, axis=1) > 0.95).all()
+
+
 def test_quaternions_of_any_length_and_sign(tmp_path):
     frames = standing_frames(3, 1)
     expected = deepmimic.read(write_deepmimic(tmp_path / "a.txt", frames))
