@@ -93,13 +93,14 @@ def read_skeleton_motion(path: Path) -> SkeletonMotion:
 
 
 def _without_calibration(clip: MotionClip) -> MotionClip:
-    from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+    from ctlev_core.body.rotations import matrix_from_axis_angle
 
     if len(clip) < 3:
         return clip
     rotations = matrix_from_axis_angle(clip.pose.reshape(-1, 24, 3))
-    steps = axis_angle_from_matrix(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
-    speeds = np.rad2deg(np.linalg.norm(steps, axis=-1).max(axis=1)) / np.diff(clip.time_s)
+    # Rotations that are an angle apart have a Frobenius distance of sqrt(8) sin(angle / 2).
+    distances = np.linalg.norm(np.diff(rotations, axis=0), axis=(-2, -1)).max(axis=1)
+    speeds = np.rad2deg(2 * np.arcsin(np.minimum(distances / np.sqrt(8), 1))) / np.diff(clip.time_s)
     if speeds[0] < max(MAX_SPEED_DEG_S, CALIBRATION_FACTOR * speeds[1:].max()):
         return clip
     return take(clip, np.arange(1, len(clip)))

@@ -53,6 +53,14 @@ def test_options_are_frozen_documented_and_have_defaults(kind, name):
     assert module.Options(**required) == module.Options(**required)
 
 
+@pytest.mark.parametrize("name", plugins.names("motions"))
+def test_motion_formats_that_assume_a_rate_take_another(name):
+    module = plugins.load("motions", name)
+    rate = inspect.signature(module.read).parameters.get("rate_hz")
+    assert (rate is not None) == hasattr(module, "RATE_HZ")
+    assert rate is None or rate.default == module.RATE_HZ > 0
+
+
 def test_planning_imports_are_light():
     """The plan of an experiment loads every plug-in; it must not wait for torch."""
     code = """
