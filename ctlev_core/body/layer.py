@@ -37,6 +37,8 @@ BONES_PER_VERTEX = 4
 NUM_POSE_FEATURES = 9 * (NUM_JOINTS - 1)
 FRAMES_A_MATMUL = 64
 """So many frames of corrective shapes at once: their memory stays below the last cache's."""
+_FEW_PRODUCTS = 100**3
+"""Up to so many multiplications OpenBLAS takes its kernels for small matrices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,11 +273,14 @@ def _rows_first(directions: np.ndarray) -> np.ndarray:
 def _blend(directions: np.ndarray, features: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     """Blend shapes [K, 3 V] by features [T, K] as one matrix product: [T, V, 3] float32."""
     out = np.empty((len(features), directions.shape[1] // 3, 3), np.float32) if out is None else out
-    if len(features) == 1:
-        # A matrix of one row goes to another routine of BLAS, with other rounding; every batch shall give the same.
-        out[0] = (np.concatenate([features, features]) @ directions)[0].reshape(-1, 3)
-    else:
+    # Every batch shall give the same bits, and BLAS has other routines, with other rounding, for few products.
+    least = min(FRAMES_A_MATMUL, max(2, _FEW_PRODUCTS // directions.size + 1))
+    if len(features) >= least:
         np.matmul(features, directions, out=out.reshape(len(features), -1))
+    else:
+        padded = np.zeros((least, features.shape[1]), np.float32)
+        padded[: len(features)] = features
+        out[:] = (padded @ directions)[: len(features)].reshape(out.shape)
     return out
 
 

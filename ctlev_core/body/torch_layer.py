@@ -52,6 +52,7 @@ class BodyLayer(torch.nn.Module):
         count = len(body.v_template)
         weights = np.zeros((count, NUM_JOINTS))
         np.put_along_axis(weights, body.weight_indices, body.weight_values, axis=1)
+        weights /= weights.sum(axis=1, keepdims=True)
         # Coordinates lie apart, [3, V]: every product then runs over vertices that lie side by side.
         arrays = {
             "v_template": body.v_template.T,
