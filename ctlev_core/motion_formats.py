@@ -48,14 +48,27 @@ def read_motion(path: Path, rate_hz: float | None = None) -> MotionClip:
         rate_hz: frames a second of a file that does not say; None = what its format assumes.
     Raises:
         DataError: see `find_format` and the format's own `read`; or no format recognises the file, then the message
-            lists the known ones.
+            lists the known ones, and says what those of its suffix have against it.
     """
     module = find_format(path)
     if module is None:
         known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in list_formats().items())
+        size = path.stat().st_size
         raise DataError(
-            f"{path}: not a motion file of a known format ({path.stat().st_size} bytes); known formats: {known}"
+            f"{path}: not a motion file of a known format ({size} bytes); known formats: {known}{_objections(path)}"
         )
     if rate_hz is not None and hasattr(module, "RATE_HZ"):
         return module.read(path, rate_hz)
     return module.read(path)
+
+
+def _objections(path: Path) -> str:
+    """Why the formats with the file's suffix do not read it."""
+    reasons = ""
+    for name, module in list_formats().items():
+        if path.suffix.lower() in module.SUFFIXES:
+            try:
+                module.read(path)
+            except DataError as error:
+                reasons += f"; {name}: {str(error).removeprefix(f'{path}: ')}"
+    return reasons

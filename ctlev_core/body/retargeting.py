@@ -8,8 +8,9 @@ that the orientation of SMPL's joint in the world is
 
     G_j = M^T W_j M A_j
 
-and thighs, shanks, upper arms and forearms point exactly where the source's do. A foot's A is a turn about the vertical
-alone, since where a skeleton puts its toe joint says little of the sole; a hand has the forearm's.
+and thighs, shanks, upper arms and forearms of the bundled body point exactly where the source's do (those of another
+SMPL body are off by as much as its rest bones are off the bundled one's, a few degrees). A foot's A is a turn about the
+vertical alone, since where a skeleton puts its toe joint says little of the sole; a hand has the forearm's.
 
 Positions are scaled so that legs are as long as those of the mean body, and follow the middle of the hips; where the
 source's ground is at a height of 0, feet touch it but for what proportions differ.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
 import shutil
@@ -30,6 +31,15 @@ from tasks.ingest import ingest
 from tasks.store import Store
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "motion"
+
+
+def npy_bytes(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+HUMAN_ML_3D = npy_bytes(np.zeros((5, 263)))
 
 
 @pytest.fixture
@@ -149,8 +159,10 @@ def test_feet_come_to_the_ground(tmp_path):
         ("a.bvh", b"", r"a\.bvh: not a motion file of a known format"),
         ("a.npy", b"\x93NUMPY", r"a\.npy: not a motion file"),
         ("a.npz", b"PK\x03\x04", r"a\.npz: not a motion file"),
-        ("a.pkl", pickle.dumps({"poses": 1}), r"a\.pkl: not a motion file"),
+        ("a.pkl", pickle.dumps({"poses": 1}), r"a\.pkl: not a motion file .*; aist: lacks smpl_poses; found poses"),
+        ("a.npy", HUMAN_ML_3D, r"a\.npy: not a motion .*smpl_arrays: poses must be .*, got \[5, 263\]"),
     ],
+    ids=["text", "empty", "cut npy", "cut npz", "other pickle", "other array"],
 )
 def test_damaged_files_are_named(name, content, message, root):
     (root / "mocap" / name).write_bytes(content)
@@ -179,7 +191,7 @@ def test_code_in_a_pickle_is_not_run(root, tmp_path):
     with pytest.raises(DataError, match=r"evil\.pkl: refused: it names (posix|nt)\.system"):
         motion_files.read_labels(recording, options)
     (root / "evil.pkl").write_bytes(pickle.dumps(RunsCode(f"touch {mark}")))
-    with pytest.raises(DataError, match=r"evil\.pkl: not a motion file"):
+    with pytest.raises(DataError, match=r"evil\.pkl: not a motion file .* aist: refused: it names (posix|nt)\.system"):
         motion_files.list_recordings(options)
     assert not mark.exists()
 
