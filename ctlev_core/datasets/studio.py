@@ -64,6 +64,9 @@ class Options(Frozen):
     joint_set: Literal["dhp19", "smpl"] = Field(
         default="dhp19", description="13 markers as DHP19 labels them, or the 24 joints of SMPL as Event-HPE does"
     )
+    yaw_range_deg: tuple[float, float] = Field(
+        default=(0.0, 360.0), description="from where the camera looks at people who face +z; 0 = from the front"
+    )
     textured: bool = Field(default=True, description="False: grey people before a plain wall, as in naive simulations.")
 
 
@@ -173,7 +176,7 @@ def _perform(recording: Recording, options: Options) -> _Performance:
     from ctlev_core.body.layer import joint_transforms, load_body
     from ctlev_core.body.motions import pose_at, sample_style
     from ctlev_core.render.scene import sample_betas
-    from ctlev_core.virtual_camera import sample_camera
+    from ctlev_core.virtual_camera import CameraRange, sample_camera
 
     rng = np.random.default_rng(_entropy(recording, options))
     style = sample_style(recording.class_name, rng)
@@ -182,7 +185,9 @@ def _perform(recording: Recording, options: Options) -> _Performance:
     framed_s = 1e-6 * options.recording_duration_us * np.array([0.0, 0.5, 1.0] if recording.has_events else [0.0])
     rotations, transl = pose_at(recording.class_name, framed_s, style)
     _, joints = joint_transforms(load_body(), rotations, betas, transl)
-    return _Performance(style, betas, sample_camera(rng, joints, options.sensor_size))
+    low, high = np.deg2rad(options.yaw_range_deg)
+    camera = sample_camera(rng, joints, options.sensor_size, CameraRange(yaw_rad=(low, high)))
+    return _Performance(style, betas, camera)
 
 
 def _subject(recording: Recording, options: Options) -> Subject:
