@@ -6,8 +6,8 @@
 One thread; from axis-angle poses to vertices, milliseconds of CPU time a batch, the median of interleaved rounds, and
 the largest error against float64. The body has SMPL's shapes and four random bones a vertex, which is more than most
 vertices of the real one have. `correctives` are the pose-dependent shapes, one product of [frames, 207] by
-[207, 20670], which smplx always applies: its time is compared with both; `limit` is that product alone. smplx (`pip install smplx`) is left out where
-it is not installed.
+[207, 20670], which smplx always applies: its time is compared with both. `limit` is that product alone. smplx
+(`pip install smplx`) is left out where it is not installed.
 """
 
 from __future__ import annotations

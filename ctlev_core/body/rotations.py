@@ -81,7 +81,7 @@ def rotation_6d_from_matrix(matrix: np.ndarray) -> np.ndarray:
 
 
 def matrix_from_rotation_6d(rotation_6d: np.ndarray) -> np.ndarray:
-    """Rotation matrices [..., 3, 3] float64 of pairs of vectors [..., 6], by Gram-Schmidt (Zhou et al., eq. 15).
+    """Rotation matrices [..., 3, 3] float64 of pairs of vectors [..., 6], by Gram-Schmidt (Zhou et al., sec. 4.2).
 
     Raises:
         ValueError: the last axis is not 6.

@@ -102,7 +102,7 @@ def rotation_6d_from_matrix(matrix: torch.Tensor) -> torch.Tensor:
 
 
 def matrix_from_rotation_6d(rotation_6d: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices [..., 3, 3] of any two vectors [..., 6] by Gram-Schmidt (Zhou et al., eq. 15).
+    """Rotation matrices [..., 3, 3] of any two vectors [..., 6] by Gram-Schmidt (Zhou et al., sec. 4.2).
 
     Where the first vector is 0 the x axis takes its place; where the second is 0 or parallel to the first (sine of the
     angle below 1e-6), or either is not finite, the coordinate axis least along the first does. What was replaced gets
