@@ -41,11 +41,20 @@ def aist(root):
     (root / "ignore_list.txt").write_text("")
 
 
-@pytest.mark.parametrize(("preset", "write"), [("amass", amass), ("aist", aist)])
-def test_prepare_dataset(preset, write, tmp_path):
+@pytest.mark.parametrize(
+    ("preset", "write", "condition"),
+    [("amass", amass, "skeleton"), ("amass", amass, "normals"), ("aist", aist, "skeleton"), ("aist", aist, "normals")],
+)
+def test_prepare_dataset(preset, write, condition, tmp_path):
     root, home = tmp_path / "poses", tmp_path / "home"
     write(root)
-    options = ("--set", f"poses.options.root={root}", "--set", f"dataset.options={STUDIO}", "--set", "num_synthetic=6")
+    settings = (
+        f"poses.options.root={root}",
+        f"dataset.options={STUDIO}",
+        "num_synthetic=6",
+        f"condition.name={condition}",
+    )
+    options = [word for setting in settings for word in ("--set", setting)]
     finished = run_script("prepare_dataset", "--preset", preset, *options, home=home)
     assert finished.status == 0, finished.errors
     (folder,) = (home / "artefacts" / "condition_samples").iterdir()
@@ -56,4 +65,10 @@ def test_prepare_dataset(preset, write, tmp_path):
     head, feet = labels.joints2d[:, 0, 1], labels.joints2d[:, -2:, 1].mean(axis=1)
     assert (head < feet).all(), "upright people, whatever axis points up in the file"
     images = conditions.array("images")
-    assert len(images) == 6 and all(image.any() for image in images)
+    assert len(images) == 6
+    assert (home / "reports" / f"{preset}_conditions.html").stat().st_size > 10_000
+    for image, joints, visible in zip(images, labels.joints2d, labels.visible, strict=True):
+        drawn = (image != image[0, 0]).any(axis=-1)
+        # Labelled joints lie inside the body that is drawn, and the body is a person's part of the picture.
+        columns, rows = joints[visible].astype(int).T
+        assert drawn[rows, columns].mean() > 0.9 and 0.02 < drawn.mean() < 0.4
