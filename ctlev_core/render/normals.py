@@ -9,6 +9,7 @@ camera has z < 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numba
@@ -57,20 +58,79 @@ def render_normals(
             not finite or a focal length is not positive; "pyrender" finds no OpenGL.
         ValueError: unknown renderer, or fewer than one worker.
     """
-    if renderer not in RENDERERS:
-        raise ValueError(f"unknown renderer {renderer!r}; known: {', '.join(RENDERERS)}")
-    if workers < 1:
-        raise ValueError(f"workers must be 1 or more, got {workers}")
-    _check_mesh(vertices_cam, faces)
-    _check_cameras(intrinsics, len(vertices_cam), image_size)
-    vertices = np.ascontiguousarray(vertices_cam, np.float32)
-    triangles = np.ascontiguousarray(faces, np.int32)
-    cameras = np.ascontiguousarray(intrinsics, np.float64)
+    vertices, triangles, cameras = _checked(vertices_cam, faces, intrinsics, image_size, renderer, workers)
     if renderer == "pyrender":
         from ctlev_core.render.gl import render_normals_gl
 
         return render_normals_gl(vertices, triangles, cameras, image_size)
-    return _render_numba(vertices, triangles, cameras, image_size, workers)
+    width, height = image_size
+    normals = np.zeros((len(vertices), height, width, 3), np.float32)
+    depth_inverse = np.zeros((len(vertices), height, width), np.float32)
+    remaining = iter(range(0, len(vertices), FRAMES_AT_A_TIME))
+
+    def work() -> None:
+        for start in remaining:
+            some = slice(start, start + FRAMES_AT_A_TIME)
+            rasterise_normals(vertices[some], triangles, cameras[some], NEAR_M, normals[some], depth_inverse[some])
+
+    _in_threads(work, workers)
+    return normals, depth_inverse
+
+
+def render_normal_maps(
+    vertices_cam: np.ndarray,
+    faces: np.ndarray,
+    intrinsics: np.ndarray,
+    image_size: tuple[int, int],
+    convention: str,
+    *,
+    renderer: str = "numba",
+    workers: int = 1,
+) -> np.ndarray:
+    """`normal_map` of `render_normals`, where nobody asks for the normals themselves.
+
+    Each thread draws one frame after the other into memory that stays in its cache, and colours it there: a sixth of
+    the memory, and a sixth less time.
+
+    Args:
+        vertices_cam: as for `render_normals`, and so are `faces`, `intrinsics`, `image_size`, `renderer`, `workers`.
+        faces: see above.
+        intrinsics: see above.
+        image_size: see above.
+        convention: one of `CONVENTIONS`.
+        renderer: see above.
+        workers: see above.
+    Returns:
+        [N, H, W, 3] uint8, channels in the order in which the network takes them.
+    Raises:
+        DataError: as `render_normals`.
+        ValueError: as `render_normals`, or an unknown convention.
+    """
+    _check_convention(convention)
+    vertices, triangles, cameras = _checked(vertices_cam, faces, intrinsics, image_size, renderer, workers)
+    width, height = image_size
+    images = np.empty((len(vertices), height, width, 3), np.uint8)
+    if renderer == "pyrender":
+        from ctlev_core.render.gl import render_normals_gl
+
+        for start in range(0, len(vertices), FRAMES_AT_A_TIME):
+            some = slice(start, start + FRAMES_AT_A_TIME)
+            normals, _ = render_normals_gl(vertices[some], triangles, cameras[some], image_size)
+            _colour(normals, *_COLOURS[convention], images[some])
+        return images
+    remaining = iter(range(len(vertices)))
+
+    def work() -> None:
+        normals = np.empty((1, height, width, 3), np.float32)
+        depth_inverse = np.empty((1, height, width), np.float32)
+        for i in remaining:
+            one = slice(i, i + 1)
+            normals[:], depth_inverse[:] = 0.0, 0.0
+            rasterise_normals(vertices[one], triangles, cameras[one], NEAR_M, normals, depth_inverse)
+            _colour(normals, *_COLOURS[convention], images[one])
+
+    _in_threads(work, workers)
+    return images
 
 
 def normal_map(normals: np.ndarray, convention: str) -> np.ndarray:
@@ -97,8 +157,7 @@ def normal_map(normals: np.ndarray, convention: str) -> np.ndarray:
         ValueError: unknown convention.
     Source: lllyasviel/ControlNet, annotator/midas/__init__.py and gradio_normal2image.py.
     """
-    if convention not in CONVENTIONS:
-        raise ValueError(f"unknown convention {convention!r}; known: {', '.join(CONVENTIONS)}")
+    _check_convention(convention)
     if normals.ndim != 4 or normals.shape[3] != 3:
         raise DataError(f"normals must be [N, H, W, 3], got {normals.shape}")
     colours = np.empty(normals.shape, np.uint8)
@@ -122,25 +181,41 @@ def _colour(normals, axes, factors, offset, background, colours):
                         colours[i, row, column, k] = np.uint8(min(max(colour, 0.0), 255.0))
 
 
-def _render_numba(
-    vertices: np.ndarray, faces: np.ndarray, intrinsics: np.ndarray, image_size: tuple[int, int], workers: int
-) -> tuple[np.ndarray, np.ndarray]:
-    width, height = image_size
-    normals = np.zeros((len(vertices), height, width, 3), np.float32)
-    depth_inverse = np.zeros((len(vertices), height, width), np.float32)
-
-    def render(start: int) -> None:
-        some = slice(start, start + FRAMES_AT_A_TIME)
-        rasterise_normals(vertices[some], faces, intrinsics[some], NEAR_M, normals[some], depth_inverse[some])
-
-    starts = range(0, len(vertices), FRAMES_AT_A_TIME)
+def _in_threads(work: Callable[[], None], workers: int) -> None:
+    """Run the same work in each thread; they share what is left to do through an iterator, of which next is atomic."""
     if workers == 1:
-        for start in starts:
-            render(start)
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(render, starts))
-    return normals, depth_inverse
+        work()
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        for future in [pool.submit(work) for _ in range(workers)]:
+            future.result()
+
+
+def _checked(
+    vertices_cam: np.ndarray,
+    faces: np.ndarray,
+    intrinsics: np.ndarray,
+    image_size: tuple[int, int],
+    renderer: str,
+    workers: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and intrinsics as the kernels take them, after all checks."""
+    if renderer not in RENDERERS:
+        raise ValueError(f"unknown renderer {renderer!r}; known: {', '.join(RENDERERS)}")
+    if workers < 1:
+        raise ValueError(f"workers must be 1 or more, got {workers}")
+    _check_mesh(vertices_cam, faces)
+    _check_cameras(intrinsics, len(vertices_cam), image_size)
+    return (
+        np.ascontiguousarray(vertices_cam, np.float32),
+        np.ascontiguousarray(faces, np.int32),
+        np.ascontiguousarray(intrinsics, np.float64),
+    )
+
+
+def _check_convention(convention: str) -> None:
+    if convention not in CONVENTIONS:
+        raise ValueError(f"unknown convention {convention!r}; known: {', '.join(CONVENTIONS)}")
 
 
 def _check_mesh(vertices_cam: np.ndarray, faces: np.ndarray) -> None:

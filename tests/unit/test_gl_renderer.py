@@ -7,7 +7,7 @@ import pytest
 
 from ctlev_core.body.layer import load_body
 from ctlev_core.render.gl import gl_available
-from ctlev_core.render.normals import render_normals
+from ctlev_core.render.normals import normal_map, render_normal_maps, render_normals
 from data_contracts.errors import DataError
 
 BODY = load_body()
@@ -56,6 +56,8 @@ def test_both_renderers_agree(opengl, size):
     assert theirs[0].dtype == theirs[1].dtype == np.float32
     assert_same_picture(ours, theirs)
     assert (ours[1][3] > 0).any()
+    maps = render_normal_maps(vertices, FACES, intrinsics, size, "controlnet", renderer="pyrender")
+    np.testing.assert_array_equal(maps, normal_map(theirs[0], "controlnet"))
 
 
 def test_other_sizes_other_meshes_and_back(opengl):

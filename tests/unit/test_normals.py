@@ -7,7 +7,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.render.normals import normal_map, render_normals
+from ctlev_core.render.normals import CONVENTIONS, normal_map, render_normal_maps, render_normals
 from ctlev_core.render.rasteriser import NEAR_M
 from data_contracts.errors import DataError
 
@@ -146,6 +146,18 @@ def test_frames_depend_on_nothing_but_themselves(workers):
         np.testing.assert_array_equal(together[i], np.concatenate([one[i] for one in expected]), err_msg=name)
 
 
+@pytest.mark.parametrize("workers", [1, 2, 5])
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_maps_without_normals_in_between_are_the_same(convention, workers):
+    vertices, faces = ball()
+    poses = vertices + np.random.default_rng(1).uniform(-0.5, 0.5, (19, 1, 3)).astype(np.float32)
+    intrinsics = np.tile(INTRINSICS, (19, 1))
+    expected = normal_map(render(poses, faces)[0], convention)
+    maps = render_normal_maps(poses, faces, intrinsics, SIZE, convention, workers=workers)
+    assert maps.dtype == np.uint8
+    np.testing.assert_array_equal(maps, expected)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e38])
 def test_a_vertex_that_is_not_finite_costs_its_own_faces_only(bad):
     vertices, faces = ball()
@@ -249,5 +261,7 @@ def test_wrong_calls_are_named(changes, error, message):
 def test_wrong_pictures_are_named():
     with pytest.raises(ValueError, match="controlnet, rgb"):
         normal_map(np.zeros((1, 2, 2, 3)), "blue")
+    with pytest.raises(ValueError, match="controlnet, rgb"):
+        render_normal_maps(np.zeros((1, 3, 3)), np.array([[0, 1, 2]]), INTRINSICS[None], SIZE, "blue")
     with pytest.raises(DataError, match=r"\[N, H, W, 3\]"):
         normal_map(np.zeros((2, 2, 3)), "rgb")
