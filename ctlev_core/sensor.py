@@ -1,106 +1,187 @@
 """The DVS pixel: from linear intensity over time to events, with the faults of a real sensor.
 
-Each pixel compares its logarithmic, low-passed photocurrent with the level of its last event. Between two frames the
-log intensity is taken as linear in time, so the low-pass is exact at the frames and event times are interpolated
-between them, not rounded to them.
+Each pixel compares its logarithmic, low-passed photocurrent with the level of its last event, its reference. The model:
+
+    response        log(intensity), below `log_floor` its tangent; linear in time between two frames
+    photoreceptor   one-pole low-pass; its bandwidth grows linearly with intensity, from `cutoff_dark_hz` to
+                    `cutoff_bright_hz` at white; constant over an interval between two frames, at its mean intensity
+    events          whenever the low-passed response is a threshold away from the reference, as often as it takes; each
+                    moves the reference by that threshold. Times are the exact crossings under these assumptions
+    refractory      an event less than `refractory_us` after the last one that was sent is dropped. The reference moves
+                    all the same, and a dropped event does not extend the silence. ESIM's rule; v2e leaves the reference
+                    where it is, and so sends the change later; a pixel of silicon starts again from the light at the
+                    end of the silence
+    leak            the reference falls at a constant rate, which a pixel in still light turns into ON events
+    shot noise      a Poisson process; its rate falls linearly with intensity; either polarity; the reference stays
+    hot pixels      a Poisson process of ON events, added to that
+
+Every random number comes from a counter-based generator of the pixel's own, seeded by (seed, pixel). So the events are
+the same bit for bit however the frames are cut into chunks, and a frame between two equal ones changes nothing.
 
 Source: Lichtsteiner et al., A 128x128 120 dB 15 us latency asynchronous temporal contrast vision sensor, JSSC 2008;
-noise after Hu et al., v2e, CVPRW 2021; linear interpolation after Rebecq et al., ESIM, CoRL 2018.
+noise after Hu et al., v2e, CVPRW 2021; linear interpolation and the refractory rule after Rebecq et al., ESIM, CoRL
+2018. Unlike v2e, times are crossings rather than spread evenly over the frame, the low-pass is solved rather than
+stepped, and noise does not depend on the frame rate.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import fields
 
-import numba
 import numpy as np
-from pydantic import Field
 
-from data_contracts.config import Frozen
+from ctlev_core import sensor_kernels as kernels
+from ctlev_core.sensor_options import PRESETS, PixelMaps, SensorOptions, read_preset, sample_pixel_maps
 from data_contracts.errors import DataError
-from data_contracts.events import Events, SensorSize, check_events
+from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
+
+__all__ = [
+    "PRESETS", "EventBudgetError", "PixelMaps", "Sensor", "SensorOptions", "read_preset", "sample_pixel_maps",
+    "simulate_events",
+]  # fmt: skip
+
+PIECE_FRAMES = 64
+"""`simulate_events` goes through a recording in pieces of so many frames."""
 
 
-class SensorOptions(Frozen):
-    """One kind of sensor. The defaults are an ideal one; `PRESETS["noisy"]` is a real one."""
+class EventBudgetError(DataError):
+    """More events than asked for at most; `events` are those up to the last piece that was within the budget."""
 
-    threshold: float = Field(default=0.2, gt=0, description="Mean log-intensity step of an event, both polarities.")
-    threshold_sigma: float = Field(default=0.0, ge=0, description="Standard deviation of the thresholds over pixels.")
-    threshold_minimum: float = Field(default=0.05, gt=0, description="No pixel is more sensitive than this.")
-    log_floor: float = Field(default=0.02, gt=0, description="Below this intensity the response is linear; white is 1.")
-    cutoff_dark_hz: float | None = Field(
-        default=None, gt=0, description="Photoreceptor bandwidth in the dark; None = none."
-    )
-    cutoff_bright_hz: float = Field(default=180.0, gt=0, description="Photoreceptor bandwidth at white.")
-    refractory_us: int = Field(default=0, ge=0, description="Time after an event in which a pixel stays silent.")
-    leak_rate_hz: float = Field(
-        default=0.0, ge=0, description="ON events a second of a pixel that sees nothing happen."
-    )
-    shot_rate_hz: float = Field(
-        default=0.0, ge=0, description="Noise events a second of a dark pixel, either polarity."
-    )
-    shot_rate_bright: float = Field(default=0.25, ge=0, le=1, description="Share of the shot noise left at white.")
-    rate_spread: float = Field(default=0.0, ge=0, description="Log-normal spread of leak and shot rates over pixels.")
-    hot_pixel_fraction: float = Field(default=0.0, ge=0, le=1, description="Pixels that fire on their own.")
-    hot_rate_hz: tuple[float, float] = Field(default=(20.0, 150.0), description="Their rates, uniform in this range.")
-    starts_settled: bool = Field(
-        default=True, description="False: the first frame is the reference level of every pixel."
-    )
+    def __init__(self, message: str, events: Events) -> None:
+        super().__init__(message)
+        self.events = events
 
 
-PRESETS = {
-    "ideal": SensorOptions(starts_settled=False),
-    "noisy": SensorOptions(
-        threshold=0.25,
-        threshold_sigma=0.035,
-        cutoff_dark_hz=20.0,
-        refractory_us=500,
-        leak_rate_hz=0.25,
-        shot_rate_hz=0.6,
-        rate_spread=0.5,
-        hot_pixel_fraction=0.0034,
-    ),
-}
+class Sensor:
+    """A sensor that is shown frames one after the other, in any portions, and sends the same events.
 
-
-@dataclass(frozen=True, eq=False)
-class PixelMaps:
-    """What distinguishes the pixels of one sensor, all [H, W] float64.
-
-    Attributes:
-        threshold_on: log-intensity step of an ON event.
-        threshold_off: log-intensity step of an OFF event, positive.
-        leak: fall of the reference level, log intensity per second.
-        shot_rate_hz: noise events a second in the dark.
-        hot_rate_hz: ON events a second of a hot pixel, 0 elsewhere.
+    Args:
+        sensor_size: (width, height) px.
+        options: the kind of sensor.
+        sensor_seed: which one of that kind: thresholds, rates, hot pixels.
+        seed: of this recording: noise and reference levels.
+        max_events: budget of the whole recording; None = as many as there are. May be changed at any time.
     """
 
-    threshold_on: np.ndarray
-    threshold_off: np.ndarray
-    leak: np.ndarray
-    shot_rate_hz: np.ndarray
-    hot_rate_hz: np.ndarray
+    def __init__(
+        self,
+        sensor_size: SensorSize,
+        options: SensorOptions,
+        *,
+        sensor_seed: int | list[int],
+        seed: int | list[int],
+        max_events: int | None = None,
+    ) -> None:
+        self.sensor_size = sensor_size
+        self.options = options
+        self.maps = sample_pixel_maps(sensor_size, options, sensor_seed)
+        self.max_events = max_events
+        self.num_events = 0
+        """Events sent so far."""
+        self.num_frames = 0
+        """Frames seen so far."""
+        flat = {field.name: getattr(self.maps, field.name).ravel() for field in fields(PixelMaps)}
+        self._maps = kernels.FlatMaps(**flat | {"leak": 1e-6 * flat["leak"]})
+        self._physics = kernels.Physics(
+            options.log_floor,
+            options.cutoff_dark_hz or 0.0,
+            options.cutoff_bright_hz,
+            options.shot_rate_bright,
+            float(options.refractory_us),
+        )
+        self._seed = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
+        num_pixels = sensor_size[0] * sensor_size[1]
+        self._state = np.zeros(num_pixels, kernels.PIXEL_STATE)
+        self._due_us = np.zeros(num_pixels)
+        self._frame = np.zeros(0, np.float32)
+        self._first_t_us = self._last_t_us = 0
+        # Rows for the events of one interval: exact time, pixel, polarity.
+        self._rows = (np.empty(4096), np.empty(4096, np.int32), np.empty(4096, np.uint8))
 
+    def push(self, intensity: np.ndarray, t_us: np.ndarray) -> Events:
+        """The events from the last frame pushed before to the last one of these; the very first frame sends none.
 
-def sample_pixel_maps(sensor_size: SensorSize, options: SensorOptions, seed: int | list[int]) -> PixelMaps:
-    """The pixels of the sensor `seed`: the same sensor has the same mismatch and hot pixels for ever."""
-    rng = np.random.default_rng(seed)
-    shape = sensor_size[::-1]
+        Args:
+            intensity: [T, H, W] linear, non-negative, white = 1; computed in float64, whatever its dtype.
+            t_us: [T] int64, times of the frames, increasing, later than all before, not negative.
+        Returns:
+            Events in the order of their time, rounded to whole microseconds, those of one microsecond and interval
+            in raster order. An event within half a microsecond of a frame has that frame's time.
+        Raises:
+            DataError: shapes disagree, times do not increase, or an intensity is negative or not finite.
+            EventBudgetError: `max_events` would be exceeded.
+            After either, the sensor is as it was before this call: nothing is lost, and it can go on.
+        """
+        return self.push_exact(intensity, t_us)[0]
 
-    def thresholds() -> np.ndarray:
-        return np.maximum(rng.normal(options.threshold, options.threshold_sigma, shape), options.threshold_minimum)
+    def push_exact(self, intensity: np.ndarray, t_us: np.ndarray) -> tuple[Events, np.ndarray]:
+        """As `push`, and the times before rounding: [N] float64, us after the very first frame of this sensor."""
+        intensity = _check_frames(intensity, t_us, self.sensor_size, self._last_t_us if self.num_frames else None)
+        before = self._snapshot() if self.max_events is not None else None
+        found = []
+        for frame, time_us in zip(intensity.reshape(len(t_us), -1), t_us.tolist(), strict=True):
+            if self.num_frames == 0:
+                self._start(frame, time_us)
+            else:
+                found.append(self._advance(frame, time_us))
+            if before is not None and self.num_events > (self.max_events or 0):
+                self._restore(before)
+                raise EventBudgetError(
+                    f"sensor: more than max_events = {self.max_events} events by t = {time_us} us (frame "
+                    f"{before[0] + len(found)}); the sensor is as before these {len(t_us)} frames",
+                    self._join([])[0],
+                )
+        return self._join(found)
 
-    def rates(mean: float) -> np.ndarray:
-        # exp(-s^2 / 2) keeps the mean of the log-normal at 1.
-        return mean * np.exp(rng.normal(-(options.rate_spread**2) / 2, options.rate_spread, shape))
+    def _start(self, frame: np.ndarray, time_us: int) -> None:
+        settled = self.options.starts_settled
+        kernels.start(frame, self._maps, self._physics, settled, self._seed, self._state, self._due_us)
+        # Copies, because the caller may render into the same array again.
+        self._frame, self._first_t_us, self._last_t_us, self.num_frames = frame.copy(), time_us, time_us, 1
 
-    threshold_on, threshold_off = thresholds(), thresholds()
-    leak, shot_rate_hz = rates(options.leak_rate_hz) * threshold_on, rates(options.shot_rate_hz)
-    hot = rng.choice(math.prod(shape), round(options.hot_pixel_fraction * math.prod(shape)), replace=False)
-    hot_rate_hz = np.zeros(shape)
-    hot_rate_hz.ravel()[hot] = rng.uniform(*options.hot_rate_hz, len(hot))
-    return PixelMaps(threshold_on, threshold_off, leak, shot_rate_hz, hot_rate_hz)
+    def _advance(self, frame: np.ndarray, time_us: int) -> list[np.ndarray]:
+        """Columns t, x, y, p and exact times of the events since the last frame."""
+        begin_us, end_us = (float(time - self._first_t_us) for time in (self._last_t_us, time_us))
+        if frame.dtype != self._frame.dtype:
+            frame, self._frame = frame.astype(np.float64), self._frame.astype(np.float64)
+        pixel, count = 0, 0
+        while True:
+            pixel, count, needed = kernels.advance(
+                self._frame, frame, begin_us, end_us, self._maps, self._physics, self._state, self._due_us, pixel,
+                self._rows[0], self._rows[1], self._rows[2], count,
+            )  # fmt: skip
+            if pixel == len(frame):
+                break
+            self._rows = tuple(_enlarged(column, needed) for column in self._rows)
+            if self.max_events is not None and self.num_events + needed > self.max_events:
+                break  # `push_exact` puts everything back
+        exact_us, pixels, polarity = (column[:count] for column in self._rows)
+        span_us = time_us - self._last_t_us
+        if span_us <= 4 * count + 4096:
+            position = kernels.stamp_positions(exact_us, begin_us, np.empty(span_us + 2, np.int64))
+        else:
+            position = np.empty(count, np.int64)
+            position[np.argsort(np.floor(exact_us - begin_us + 0.5), kind="stable")] = np.arange(count)
+        columns = _empty_columns(count)
+        kernels.write_columns(
+            exact_us, pixels, polarity, position, begin_us, self._last_t_us, self.sensor_size[0], *columns
+        )
+        self._frame, self._last_t_us = frame.copy(), time_us
+        self.num_frames += 1
+        self.num_events += needed
+        return columns
+
+    def _join(self, found: list[list[np.ndarray]]) -> tuple[Events, np.ndarray]:
+        t, x, y, p, exact_us = (np.concatenate(column) for column in zip(*(found or [_empty_columns(0)]), strict=True))
+        return check_events(Events(t, x, y, p, self.sensor_size), "sensor"), exact_us
+
+    def _snapshot(self) -> tuple:
+        state, due_us = self._state.copy(), self._due_us.copy()
+        return self.num_frames, self.num_events, state, due_us, self._frame, self._first_t_us, self._last_t_us
+
+    def _restore(self, snapshot: tuple) -> None:
+        self.num_frames, self.num_events, self._state, self._due_us = snapshot[:4]
+        self._frame, self._first_t_us, self._last_t_us = snapshot[4:]
 
 
 def simulate_events(
@@ -110,6 +191,7 @@ def simulate_events(
     *,
     sensor_seed: int | list[int],
     seed: int | list[int],
+    max_events: int | None = None,
 ) -> Events:
     """The events a sensor sends while it watches `intensity`.
 
@@ -119,178 +201,67 @@ def simulate_events(
         options: the kind of sensor.
         sensor_seed: which one of that kind: thresholds, rates, hot pixels.
         seed: of this recording: noise and reference levels.
+        max_events: budget; None = as many as there are.
     Returns:
         Events in the order of their time, each within [t_us[0], t_us[-1]].
     Raises:
         DataError: shapes disagree, times do not increase, or an intensity is negative or not finite.
+        EventBudgetError: there are more than `max_events`; it carries those of the frames before.
     """
     if intensity.ndim != 3 or 0 in intensity.shape:
         raise DataError(f"sensor: intensity must be [T, H, W] with T, H, W >= 1, got {intensity.shape}")
+    size = (intensity.shape[2], intensity.shape[1])
+    intensity = _check_frames(intensity, t_us, size, None)
+    sensor = Sensor(size, options, sensor_seed=sensor_seed, seed=seed, max_events=max_events)
+    pieces: list[Events] = []
+    for first in range(0, len(t_us), PIECE_FRAMES):
+        try:
+            pieces.append(sensor.push(intensity[first : first + PIECE_FRAMES], t_us[first : first + PIECE_FRAMES]))
+        except EventBudgetError as error:
+            raise EventBudgetError(f"{error}; `events` of this error are those before", join(pieces, size)) from None
+    return join(pieces, size)
+
+
+def join(pieces: list[Events], sensor_size: SensorSize) -> Events:
+    """One recording of successive pieces; none give an empty one."""
+    if not pieces:
+        t, x, y, p = (np.empty(0, dtype) for dtype in EVENT_DTYPES.values())
+    else:
+        t, x, y, p = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in EVENT_DTYPES)
+    return Events(t, x, y, p, sensor_size)
+
+
+def _check_frames(intensity: np.ndarray, t_us: np.ndarray, sensor_size: SensorSize, last_us: int | None) -> np.ndarray:
+    """The frames, contiguous and in float32 or float64, or a `DataError`."""
+    shape = (len(intensity), sensor_size[1], sensor_size[0])
+    if intensity.shape != shape or 0 in shape:
+        raise DataError(f"sensor: intensity must be [T, {shape[1]}, {shape[2]}] with T >= 1, got {intensity.shape}")
     if t_us.shape != (len(intensity),) or t_us.dtype != np.int64:
         raise DataError(f"sensor: t_us must be [{len(intensity)}] int64, got {t_us.shape} {t_us.dtype}")
     late = t_us[1:] <= t_us[:-1]
     if t_us[0] < 0 or late.any():
         frame = int(np.argmax(late)) + 1 if late.any() else 0
         raise DataError(f"sensor: frame times must increase from 0 or later, got t = {t_us[frame]} us at frame {frame}")
-    if not np.isfinite(intensity).all() or intensity.min() < 0.0:
-        raise DataError("sensor: intensity must be finite and not negative")
-    height, width = intensity.shape[1:]
-    maps = sample_pixel_maps((width, height), options, sensor_seed)
-    t, x, y, p = _simulate(
-        np.ascontiguousarray(intensity.transpose(1, 2, 0), dtype=np.float32),
-        t_us,
-        maps.threshold_on,
-        maps.threshold_off,
-        maps.leak,
-        maps.shot_rate_hz,
-        maps.hot_rate_hz,
-        options.log_floor,
-        options.cutoff_dark_hz or 0.0,
-        options.cutoff_bright_hz,
-        options.shot_rate_bright,
-        options.refractory_us,
-        options.starts_settled,
-        np.random.SeedSequence(seed).generate_state(1, np.uint64)[0],
-    )
-    # Events come pixel by pixel; a stable sort keeps simultaneous ones in raster order.
-    order = np.argsort(t, kind="stable")
-    return check_events(Events(t[order], x[order], y[order], p[order], (width, height)), "sensor")
+    if last_us is not None and t_us[0] <= last_us:
+        raise DataError(f"sensor: frame times must increase, got t = {t_us[0]} us after the frame of {last_us} us")
+    dtype = np.float32 if intensity.dtype == np.float32 else np.float64
+    intensity = np.ascontiguousarray(intensity, dtype)
+    bad = kernels.first_bad(intensity.reshape(-1))
+    if bad < intensity.size:
+        frame, y, x = (int(index) for index in np.unravel_index(bad, shape))
+        raise DataError(
+            f"sensor: intensity must be finite and not negative, got {intensity[frame, y, x]} at frame {frame}, "
+            f"x = {x}, y = {y}"
+        )
+    return intensity
 
 
-@numba.njit(cache=True, nogil=True)
-def _simulate(
-    intensity, t_us, threshold_on, threshold_off, leak, shot_rate_hz, hot_rate_hz,
-    log_floor, cutoff_dark_hz, cutoff_bright_hz, shot_rate_bright, refractory_us, starts_settled, seed,
-):  # fmt: skip
-    """All pixels one after the other; intensity is [H, W, T]. Returns the columns t, x, y, p in raster order."""
-    height, width = intensity.shape[:2]
-    t, p = np.empty(4096, np.int64), np.empty(4096, np.uint8)
-    x, y = np.empty(4096, np.uint16), np.empty(4096, np.uint16)
-    count = 0
-    for row in range(height):
-        for column in range(width):
-            pixel_seed = _mix(seed ^ _mix(np.uint64(row * width + column)))
-            while True:
-                end = _simulate_pixel(
-                    intensity[row, column], t_us, threshold_on[row, column], threshold_off[row, column],
-                    leak[row, column], shot_rate_hz[row, column], hot_rate_hz[row, column], log_floor,
-                    cutoff_dark_hz, cutoff_bright_hz, shot_rate_bright, refractory_us, starts_settled,
-                    pixel_seed, t, p, count,
-                )  # fmt: skip
-                if end <= len(t):
-                    break
-                # Too little room: the pixel is run again in larger columns.
-                t, x, y, p = _enlarged(t, end), _enlarged(x, end), _enlarged(y, end), _enlarged(p, end)
-            x[count:end] = column
-            y[count:end] = row
-            count = end
-    return t[:count], x[:count], y[:count], p[:count]
+def _empty_columns(count: int) -> list[np.ndarray]:
+    """The columns of `Events`, and that of exact times."""
+    return [np.empty(count, dtype) for dtype in (*EVENT_DTYPES.values(), np.float64)]
 
 
-@numba.njit(cache=True, nogil=True)
-def _simulate_pixel(
-    intensity, t_us, on, off, leak, shot, hot, log_floor, cutoff_dark_hz, cutoff_bright_hz, shot_rate_bright,
-    refractory_us, starts_settled, state, t, p, count,
-):  # fmt: skip
-    """One pixel through time. Writes from row `count` on, as far as there is room; returns the row after the last."""
-    state, start = _uniform(state)
-    # A pixel that has been running for long may be anywhere between its two thresholds.
-    difference = start * (on + off) - off if starts_settled else 0.0
-    # Noise is a Poisson process of varying rate: an event falls whenever the summed rate has used up this allowance.
-    state, allowance = _exponential(state)
-    light = intensity[0]
-    signal = filtered = _log_response(light, log_floor)
-    last_us = -refractory_us - 1
-    for frame in range(1, len(t_us)):
-        span_us = t_us[frame] - t_us[frame - 1]
-        span_s = 1e-6 * span_us
-        light_before, signal_before, filtered_before, light = light, signal, filtered, intensity[frame]
-        if light != light_before:
-            signal = _log_response(light, log_floor)
-        middle = min(0.5 * (light_before + light), 1.0)
-        cutoff_hz = cutoff_dark_hz + (cutoff_bright_hz - cutoff_dark_hz) * middle if cutoff_dark_hz > 0.0 else 0.0
-        filtered = _low_pass(filtered_before, signal_before, signal, span_s, cutoff_hz)
-        # The leak lowers the reference level, which is as good as a rising signal.
-        change = filtered - filtered_before + leak * span_s
-        expected = (shot * (1.0 - (1.0 - shot_rate_bright) * middle) + hot) * span_s
-        noise_at = allowance / expected if expected > 0.0 else np.inf
-        while True:
-            crossing_at = _crossing(difference, change, on, off)
-            at = min(crossing_at, noise_at)
-            if at > 1.0:
-                break
-            rises = change > 0.0
-            if noise_at < crossing_at:
-                state, choice = _uniform(state)
-                rises = choice * (shot + hot) < 0.5 * shot + hot
-                state, allowance = _exponential(state)
-                noise_at += allowance / expected
-            else:
-                difference -= on if rises else -off
-            now_us = t_us[frame - 1] + np.int64(at * span_us + 0.5)
-            if now_us - last_us >= refractory_us:
-                last_us = now_us
-                if count < len(t):
-                    t[count] = now_us
-                    p[count] = rises
-                count += 1
-        difference += change
-        if expected > 0.0:
-            allowance = (noise_at - 1.0) * expected
-    return count
-
-
-@numba.njit(cache=True, nogil=True)
-def _crossing(difference, change, on, off):
-    """Fraction of the interval at which the difference to the reference level reaches a threshold; inf = not."""
-    if change > 0.0:
-        return max((on - difference) / change, 0.0)
-    if change < 0.0:
-        return max((-off - difference) / change, 0.0)
-    return np.inf
-
-
-@numba.njit(cache=True, nogil=True)
-def _log_response(light, log_floor):
-    """Log above the floor, its tangent below: finite at zero, without a kink."""
-    if light > log_floor:
-        return math.log(light)
-    return math.log(log_floor) + (light - log_floor) / log_floor
-
-
-@numba.njit(cache=True, nogil=True)
-def _low_pass(filtered, signal_before, signal, span_s, cutoff_hz):
-    """First-order low-pass after a ramp from `signal_before` to `signal`, exactly; no filter at cutoff 0."""
-    if cutoff_hz <= 0.0 or (filtered == signal_before and signal == signal_before):
-        return signal
-    lag_s = 1.0 / (2.0 * math.pi * cutoff_hz)
-    lag = lag_s * (signal - signal_before) / span_s
-    return signal - lag + (filtered - signal_before + lag) * math.exp(-span_s / lag_s)
-
-
-@numba.njit(cache=True, nogil=True)
-def _mix(value):
-    """The finaliser of splitmix64: every bit of the result depends on every bit of the value."""
-    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return value ^ (value >> np.uint64(31))
-
-
-@numba.njit(cache=True, nogil=True)
-def _uniform(state):
-    """The next state and a number in [0, 1). A generator a pixel: no result depends on what other pixels did."""
-    state = state + np.uint64(0x9E3779B97F4A7C15)
-    return state, (_mix(state) >> np.uint64(11)) * (1.0 / (1 << 53))
-
-
-@numba.njit(cache=True, nogil=True)
-def _exponential(state):
-    state, uniform = _uniform(state)
-    return state, -math.log1p(-uniform)
-
-
-@numba.njit(cache=True, nogil=True)
-def _enlarged(column, needed):
+def _enlarged(column: np.ndarray, needed: int) -> np.ndarray:
     larger = np.empty(max(needed, 2 * len(column)), column.dtype)
     larger[: len(column)] = column
     return larger

@@ -1,5 +1,6 @@
-"""The DVS pixel against closed forms, a slow reference, and the statistics its noise promises."""
+"""The DVS pixel against closed forms, its promises about chunks and budgets, hard cases, and its noise's statistics."""
 
+import itertools
 import math
 
 import numpy as np
@@ -7,7 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.sensor import PRESETS, SensorOptions, sample_pixel_maps, simulate_events
+from ctlev_core.sensor import (
+    PRESETS,
+    EventBudgetError,
+    Sensor,
+    SensorOptions,
+    join,
+    read_preset,
+    sample_pixel_maps,
+    simulate_events,
+)
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 
@@ -35,8 +45,8 @@ def test_crossing_times_of_a_ramp_do_not_depend_on_the_frame_rate(rate, frames):
     t_us = np.rint(np.linspace(0, 500_000, frames)).astype(np.int64)
     events = simulate(ramp(rate, t_us), t_us)
     expected = 1e6 * np.arange(1, int(abs(rate) * 0.5 / 0.2) + 1) * 0.2 / abs(rate)
-    # Half a microsecond of rounding; float32 intensity adds 1e-7 / rate, at most 0.1 us.
-    np.testing.assert_allclose(events.t, expected, atol=0.7)
+    # Half a microsecond of rounding; the frames are exact.
+    np.testing.assert_allclose(events.t, expected, atol=0.5 + 1e-6)
     assert set(events.p) == {int(rate > 0)}
 
 
@@ -67,8 +77,10 @@ def test_low_pass_step_response():
     light = np.where(t_us > 0, 0.1 * math.exp(0.9), 0.1)[:, None, None]
     lag_us = 1e6 / (2 * math.pi * 50.0)
     expected = -lag_us * np.log(1 - 0.2 * np.arange(1, 5) / 0.9)
-    # Frames every 50 us: interpolating the exponential linearly errs by less than 50^2 / (8 lag) = 0.1 us there.
-    np.testing.assert_allclose(simulate(light, t_us, options).t, expected, atol=1.5)
+    # The step is a ramp of 1 us, half of which it comes late, and half a microsecond is rounding.
+    np.testing.assert_allclose(simulate(light, t_us, options).t, expected, atol=1.001)
+    few = [0, 1, 2, -1]
+    np.testing.assert_array_equal(simulate(light[few], t_us[few], options).t, simulate(light, t_us, options).t)
 
 
 def test_low_pass_is_exact_on_a_ramp_whatever_the_frame_rate():
@@ -101,80 +113,179 @@ def test_refractory_time_drops_events_and_moves_the_reference():
     np.testing.assert_array_equal(some.t, all_events.t[::2])
 
 
-def slow_reference(intensity, t_us, maps, options):
-    """The model of the module's docstring without noise, pixel by pixel, in plain Python."""
-    rows = []
-    for (row, column), _ in np.ndenumerate(intensity[0]):
-        on, off = maps.threshold_on[row, column], maps.threshold_off[row, column]
-        leak = maps.leak[row, column]
-
-        def response(light):
-            floor = options.log_floor
-            return math.log(light) if light > floor else math.log(floor) + (light - floor) / floor
-
-        light = [float(np.float32(value)) for value in intensity[:, row, column]]
-        filtered = response(light[0])
-        level, last = filtered, -math.inf
-        for frame in range(1, len(t_us)):
-            span_s = 1e-6 * (t_us[frame] - t_us[frame - 1])
-            before, after = response(light[frame - 1]), response(light[frame])
-            start = filtered
-            if options.cutoff_dark_hz is None:
-                filtered = after
-            else:
-                middle = min(0.5 * (light[frame - 1] + light[frame]), 1.0)
-                cutoff = options.cutoff_dark_hz + (options.cutoff_bright_hz - options.cutoff_dark_hz) * middle
-                decay = math.exp(-2 * math.pi * cutoff * span_s)
-                slope = (after - before) / (2 * math.pi * cutoff * span_s)
-                filtered = after - slope + (start - before + slope) * decay
-            begin_level, end_level = level, level - leak * span_s
-            rise = (filtered - end_level) - (start - begin_level)
-            moved, crossing = 0.0, 0
-            while True:
-                target = on if rise > 0 else -off
-                if (
-                    rise == 0
-                    or abs(start - begin_level - moved + rise) < abs(target)
-                    or ((start - begin_level - moved + rise) * target < 0)
-                ):
-                    break
-                crossing = max((target - (start - begin_level - moved)) / rise, 0.0)
-                moved += target
-                now = int(t_us[frame - 1] + crossing * (t_us[frame] - t_us[frame - 1]) + 0.5)
-                if now - last >= options.refractory_us:
-                    last = now
-                    rows.append((now, row, column, int(rise > 0)))
-            level = end_level + moved
-    return sorted(rows)
+def same_events(first, second):
+    return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in "txyp")
 
 
-@settings(deadline=None, max_examples=40)
-@given(
-    st.integers(0, 10_000),
-    st.sampled_from([None, 15.0]),
-    st.sampled_from([0, 700]),
-    st.sampled_from([0.0, 3.0]),
-)
-def test_equals_the_slow_reference(seed, cutoff_dark_hz, refractory_us, leak_rate_hz):
+def flicker(seed, num_frames=24, height=3, width=4):
+    """Light that jumps, stands still and goes out, at uneven times."""
     rng = np.random.default_rng(seed)
-    intensity = np.exp(np.cumsum(rng.normal(0, 0.3, (12, 2, 3)), axis=0) - 2.0)
+    intensity = np.exp(np.cumsum(rng.normal(0, 0.5, (num_frames, height, width)), axis=0) - 1.5)
     intensity[rng.random(intensity.shape) < 0.1] = 0.0
-    t_us = np.cumsum(rng.integers(1, 5000, 12)).astype(np.int64)
-    options = SensorOptions(
-        threshold_sigma=0.05,
-        cutoff_dark_hz=cutoff_dark_hz,
-        refractory_us=refractory_us,
-        leak_rate_hz=leak_rate_hz,
-        rate_spread=0.4,
-        starts_settled=False,
+    for frame in range(1, num_frames):
+        still = rng.random((height, width)) < 0.4
+        intensity[frame][still] = intensity[frame - 1][still]
+    return intensity, np.cumsum(rng.integers(1, 30_000, num_frames)).astype(np.int64)
+
+
+RESTLESS = PRESETS["noisy"].model_copy(update={"leak_rate_hz": 8.0, "shot_rate_hz": 20.0, "hot_pixel_fraction": 0.2})
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 10_000), st.lists(st.integers(1, 23), max_size=6), st.booleans())
+def test_any_chunks_give_the_same_events(seed, cuts, is_float32):
+    intensity, t_us = flicker(seed)
+    intensity = intensity.astype(np.float32 if is_float32 else np.float64)
+    whole, whole_exact_us = make_sensor(RESTLESS).push_exact(intensity, t_us)
+    sensor = make_sensor(RESTLESS)
+    parts = [
+        sensor.push_exact(intensity[first:last], t_us[first:last])
+        for first, last in itertools.pairwise(sorted({0, *cuts, 24}))
+    ]
+    assert len(whole) > 20 and sensor.num_events == len(whole) and sensor.num_frames == 24
+    assert same_events(join([events for events, _ in parts], (4, 3)), whole)
+    np.testing.assert_array_equal(np.concatenate([exact_us for _, exact_us in parts]), whole_exact_us)
+    assert same_events(simulate_events(intensity, t_us, RESTLESS, sensor_seed=1, seed=2), whole)
+
+
+def make_sensor(options, max_events=None):
+    return Sensor((4, 3), options, sensor_seed=1, seed=2, max_events=max_events)
+
+
+def test_a_chunk_may_end_in_the_middle_of_a_crossing():
+    """A ramp takes 100 ms for a threshold; chunks end at 60 % of it, and the event still comes at 100 ms."""
+    sensor = Sensor((1, 1), IDEAL, sensor_seed=0, seed=0)
+    early = sensor.push(ramp(2.0, [0, 60_000]), np.array([0, 60_000]))
+    late = sensor.push(ramp(2.0, [120_000]), np.array([120_000]))
+    assert len(early) == 0 and late.t.tolist() == [100_000]
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10_000))
+def test_frames_that_show_nothing_new_change_nothing(seed):
+    """A still scene may be sampled as rarely as one likes, noise, leak and lag included."""
+    rng = np.random.default_rng(seed)
+    first, second = np.exp(rng.normal(-1, 1, (2, 3, 4)))
+    knots_us = np.array([0, 3_000, 200_000, 205_000, 400_000])
+    still_us = np.unique(np.concatenate([knots_us, rng.integers(3_000, 200_000, 9), rng.integers(205_000, 400_000, 9)]))
+    frames = np.where((still_us < 3_000)[:, None, None] | (still_us > 200_000)[:, None, None], first, second)
+    dense, dense_us = make_sensor(RESTLESS).push_exact(frames, still_us)
+    sparse, sparse_us = make_sensor(RESTLESS).push_exact(np.stack([first, second, second, first, first]), knots_us)
+    assert len(sparse) == len(dense) > 20
+    assert same_events(sparse, dense)
+    # The same numbers in another order of operations.
+    np.testing.assert_allclose(sparse_us, dense_us, rtol=1e-12)
+
+
+def test_all_kinds_of_floats_and_layouts_are_the_same_light():
+    intensity, t_us = flicker(5)
+    intensity = intensity.astype(np.float32)
+    expected = make_sensor(RESTLESS).push(intensity, t_us)
+    views = [intensity.astype(np.float64), np.asfortranarray(intensity), intensity.astype(">f8")]
+    assert all(same_events(make_sensor(RESTLESS).push(view, t_us), expected) for view in views)
+    sensor = make_sensor(RESTLESS)
+    mixed = [
+        sensor.push(intensity[k : k + 1].astype(np.float64 if k % 3 else np.float32), t_us[k : k + 1])
+        for k in range(24)
+    ]
+    assert same_events(join(mixed, (4, 3)), expected)
+
+
+def test_the_caller_may_render_into_the_same_array_again():
+    intensity, t_us = flicker(6)
+    sensor, canvas, parts = make_sensor(RESTLESS), np.empty((1, 3, 4)), []
+    for k in range(24):
+        canvas[0] = intensity[k]
+        parts.append(sensor.push(canvas, t_us[k : k + 1]))
+    assert same_events(join(parts, (4, 3)), make_sensor(RESTLESS).push(intensity, t_us))
+
+
+# Hard cases ----------------------------------------------------------------------------------------------------------
+
+
+def test_zero_light_for_ever_sends_noise_alone():
+    intensity, t_us = np.zeros((5, 3, 4)), 250_000 * np.arange(5)
+    assert len(simulate(intensity, t_us)) == 0
+    events = simulate(intensity, t_us, SensorOptions(shot_rate_hz=30.0))
+    assert 250 < len(events) < 480  # 12 pixels x 30 Hz x 1 s, six standard deviations
+
+
+def test_thresholds_near_zero_are_clipped():
+    options = SensorOptions(threshold=0.01, threshold_sigma=0.02, threshold_minimum=0.004, starts_settled=False)
+    maps = sample_pixel_maps((4, 3), options, 0)
+    assert maps.threshold_on.min() == 0.004
+    events = simulate(np.stack([np.full((3, 4), 0.1), np.full((3, 4), 0.1 * math.e)]), [0, 10], options)
+    counts = np.bincount(events.y.astype(int) * 4 + events.x, minlength=12).reshape(3, 4)
+    np.testing.assert_allclose(counts, 1 / maps.threshold_on, atol=1)
+
+
+def test_refractory_time_longer_than_the_frame_interval():
+    """It is counted from event to event, whatever frames come between."""
+    options = SensorOptions(refractory_us=30_000, starts_settled=False)
+    t_us = np.arange(0, 100_001, 500)
+    np.testing.assert_array_equal(
+        simulate(ramp(10.0, t_us), t_us, options).t, simulate(ramp(10.0, t_us[[0, -1]]), t_us[[0, -1]], options).t
     )
-    events = simulate(intensity, t_us, options, sensor_seed=3)
-    expected = slow_reference(intensity, t_us, sample_pixel_maps((3, 2), options, 3), options)
-    got = sorted(zip(events.t.tolist(), events.y.tolist(), events.x.tolist(), events.p.tolist(), strict=True))
-    assert len(got) == len(expected)
-    # The order of float operations may move a time across a rounding border: one microsecond.
-    np.testing.assert_allclose(sorted(row[0] for row in got), [row[0] for row in expected], atol=1)
-    assert sorted(row[1:] for row in got) == sorted(row[1:] for row in expected)
+
+
+def test_one_frame_in_each_chunk():
+    sensor = Sensor((1, 1), IDEAL, sensor_seed=0, seed=0)
+    counts = [len(sensor.push(np.array([[[light]]]), np.array([t]))) for t, light in ((5, 0.1), (9, 0.5), (10, 0.1))]
+    assert counts == [0, 8, 8]
+
+
+def test_a_long_interval_with_few_events_and_a_short_one_with_many():
+    rng = np.random.default_rng(0)
+    frames = np.exp(rng.normal(-2, 1, (3, 30, 40)))
+    frames[1] = frames[0]
+    frames[1, 3:5, 7] *= 4
+    events = simulate(frames, [0, 10**9, 10**9 + 20])
+    check_events(events, "test")
+    assert (events.t < 10**9).sum() == 12 and len(events) > 5_000
+    rows = events.y[events.t == 10**9 + 7].astype(int) * 40 + events.x[events.t == 10**9 + 7]
+    assert (np.diff(rows) >= 0).all() and len(rows) > 50
+
+
+def test_nothing_is_lost_when_the_budget_is_exceeded():
+    intensity, t_us = flicker(8)
+    whole = make_sensor(RESTLESS).push(intensity, t_us)
+    sensor = make_sensor(RESTLESS, max_events=len(whole) - 1)
+    first = sensor.push(intensity[:10], t_us[:10])
+    with pytest.raises(EventBudgetError, match=f"more than max_events = {len(whole) - 1} events by t = "):
+        sensor.push(intensity[10:], t_us[10:])
+    assert sensor.num_events == len(first) and sensor.num_frames == 10
+    sensor.max_events = len(whole)
+    assert same_events(join([first, sensor.push(intensity[10:], t_us[10:])], (4, 3)), whole)
+
+
+def test_a_budget_bounds_memory_and_the_error_carries_what_there_was():
+    intensity = np.ones((130, 2, 2))
+    intensity[60], intensity[100:] = 1.5, 1e300
+    t_us = 1000 * np.arange(130)
+    options = SensorOptions(threshold=1e-6, threshold_minimum=1e-6, starts_settled=False)
+    with pytest.raises(EventBudgetError, match="max_events = 4000000") as caught:
+        simulate_events(intensity, t_us, options, sensor_seed=0, seed=0, max_events=4_000_000)
+    expected = simulate_events(intensity[:64], t_us[:64], options, sensor_seed=0, seed=0)
+    assert same_events(caught.value.events, expected) and len(expected) > 3_000_000
+
+
+def test_bad_frames_leave_the_sensor_as_it_was():
+    intensity, t_us = flicker(9)
+    bad = intensity.copy()
+    bad[20, 1, 2] = np.nan
+    sensor = make_sensor(RESTLESS)
+    first = sensor.push(intensity[:7], t_us[:7])
+    with pytest.raises(DataError, match="got nan at frame 13, x = 2, y = 1"):
+        sensor.push(bad[7:], t_us[7:])
+    with pytest.raises(DataError, match=f"got t = {t_us[6]} us after the frame of {t_us[6]} us"):
+        sensor.push(intensity[7:], t_us[6:23])
+    with pytest.raises(DataError, match=r"\[T, 3, 4\]"):
+        sensor.push(intensity[7:, :2], t_us[7:])
+    rest = sensor.push(intensity[7:], t_us[7:])
+    assert same_events(join([first, rest], (4, 3)), make_sensor(RESTLESS).push(intensity, t_us))
+
+
+# Noise ---------------------------------------------------------------------------------------------------------------
 
 
 def test_shot_noise_is_poisson_and_weaker_in_the_light():
@@ -198,7 +309,7 @@ def test_shot_noise_does_not_depend_on_the_frame_rate():
     coarse = simulate(np.full((2, 8, 8), 0.4), [0, 1_000_000], options)
     fine = simulate(np.full((501, 8, 8), 0.4), 2_000 * np.arange(501), options)
     assert len(coarse) > 100
-    np.testing.assert_allclose(coarse.t, fine.t, atol=1)
+    np.testing.assert_array_equal(coarse.t, fine.t)
 
 
 def test_hot_pixels_fire_at_their_rates_and_are_on():
@@ -241,7 +352,8 @@ def test_settled_pixels_start_anywhere_between_their_thresholds():
 @pytest.mark.parametrize(
     ("intensity", "t_us", "message"),
     [
-        (np.full((2, 1, 1), np.nan), [0, 1], "finite"),
+        (np.full((2, 1, 1), np.nan), [0, 1], "finite.*nan at frame 0, x = 0, y = 0"),
+        (np.full((2, 1, 1), np.inf), [0, 1], "finite"),
         (np.full((2, 1, 1), -0.1), [0, 1], "not negative"),
         (np.ones((2, 1, 1)), [5, 4], "must increase.*4 us at frame 1"),
         (np.ones((2, 1, 1)), [5, 5], "must increase"),
@@ -254,3 +366,22 @@ def test_settled_pixels_start_anywhere_between_their_thresholds():
 def test_bad_input_is_named(intensity, t_us, message):
     with pytest.raises(DataError, match=message):
         simulate(intensity, t_us)
+
+
+def test_presets_are_files_too(tmp_path):
+    path = tmp_path / "preset.yaml"
+    path.write_text("threshold: 0.3\nhot_rate_hz: [5, 6]\n")
+    assert read_preset(path) == SensorOptions(threshold=0.3, hot_rate_hz=(5, 6))
+    for content, message in (
+        ("threshold: -1", "threshold"),
+        ("hot_rate_hz: [6, 5]", "lower first"),
+        ("treshold: 1", "treshold"),
+        ("- 1", "table of options, got list"),
+        ("{", "not a sensor preset"),
+        ("1: 2", "not a sensor preset"),
+    ):
+        path.write_text(content)
+        with pytest.raises(DataError, match=message):
+            read_preset(path)
+    with pytest.raises(DataError, match="No such file"):
+        read_preset(tmp_path / "none.yaml")
