@@ -11,7 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ctlev_core.body.ground_contact import stand_on_ground
+from ctlev_core.body.foot_planting import LEG_JOINTS, plant_feet
+from ctlev_core.body.ground_contact import body_path, find_contact
 from ctlev_core.body.layer import NUM_BETAS, NUM_JOINTS, joint_transforms, load_body
 from ctlev_core.body.motion_clip import MotionClip, check_clip
 from ctlev_core.body.motion_plan import Piece, plan_pieces
@@ -24,15 +25,19 @@ from ctlev_core.body.motions import (
     find_motion,
     rotations_from_channels,
 )
-from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_euler, slerp
+from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle, matrix_from_euler, slerp
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 GRID_S = 0.01
 """Contact with the ground has a history; it is followed at these steps, whatever the rate that is asked for."""
+AIRBORNE_M = 0.03
+"""Height of a jump from which on the ground has no hold."""
 BLEND_S = 0.4
 BLEND_S_PER_HALF_TURN = 0.9
 """More where the trunk has to turn far, from standing to the ground say."""
+SOFT_ENDS = 0.2
+"""Share of a motion, at its begin and at its end, in which it gains and loses its pace."""
 HABIT_RAD = 0.035
 TEXT_STREAM = 31
 
@@ -61,8 +66,8 @@ def generate_motion(sentence: str, *, seed: int = 0, rate_hz: float = 60.0) -> M
     """A motion of procedural clips; the default `TextToMotion`.
 
     Each clip begins where the one before ended, and faces as that ended. Between two clips, every joint goes the
-    shortest way on SO(3) with an eased pace, while both go on; a foot that must be elsewhere is lifted there. After
-    that the body is set on the ground and sticks to it, so no foot slides that did not slide in the clips.
+    shortest way on SO(3) with an eased pace, while both go on; a foot that must be elsewhere is lifted there. The body
+    is set on the ground by its skin and carried on by what touches it, with inertia; feet on the ground are planted.
 
     Args:
         sentence: such as "a person walks, then jumps twice"; see `motion_sentences.parse_sentence`.
@@ -124,12 +129,16 @@ class _Performance:
 
     def sample(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [T, 24, 3, 3] and translations [T, 3] m."""
-        rotations, jump, _ = self._pose(time_s)
         grid_s = GRID_S * np.arange(int(np.ceil(self.duration_s / GRID_S)) + 2)
-        on_grid, _, velocity = self._pose(grid_s)
-        ground = stand_on_ground(on_grid)
-        ground[1:] += GRID_S * np.cumsum((velocity[1:] + velocity[:-1]) / 2, axis=0)
-        transl = np.stack([np.interp(time_s, grid_s, ground[:, axis]) for axis in range(3)], axis=1)
+        on_grid, grid_jump, velocity = self._pose(grid_s)
+        contact = find_contact(on_grid)
+        grounded = 1.0 - np.clip(grid_jump / AIRBORNE_M, 0.0, 1.0)
+        path = body_path(contact, grounded, GRID_S)
+        path[1:] += GRID_S * np.cumsum((velocity[1:] + velocity[:-1]) / 2, axis=0)
+        turns = plant_feet(on_grid, contact, path, grounded, GRID_S)
+        rotations, jump, _ = self._pose(time_s)
+        rotations[:, LEG_JOINTS] = rotations[:, LEG_JOINTS] @ matrix_from_axis_angle(_at_times(time_s, grid_s, turns))
+        transl = _at_times(time_s, grid_s, path)
         transl[:, 1] += jump
         return rotations, transl
 
@@ -158,12 +167,12 @@ class _Performance:
         for join in (number - 1, number):
             if 0 <= join < len(self._joins):
                 self._lift_foot(channels, time_s, join)
-        turned = piece.turn_deg * _ease_turn(passed_s / piece.turn_s)
+        turned = piece.turn_deg * _ease_ends(passed_s / piece.turn_s, 0.1)
         channels[:, COLUMN["yaw"]] += self._headings_deg[number] + turned
         rotations = rotations_from_channels(channels, time_s, self._style)
         jump = piece.jump_scale * np.maximum(channels[:, COLUMN["jump"]], 0.0)
         facing = matrix_from_euler("Y", channels[:, COLUMN["yaw"], None])[:, :, 2]
-        airborne = np.clip(jump / 0.04, 0.0, 1.0)
+        airborne = np.clip(jump / AIRBORNE_M, 0.0, 1.0)
         return rotations, jump, piece.jump_speed_m_s * airborne[:, None] * facing
 
     def _join(self, number: int) -> tuple[float, float, str]:
@@ -184,32 +193,39 @@ class _Performance:
                 channels[:, COLUMN[f"{side}_{name}"]] += lift * degrees
 
 
+def _at_times(time_s: np.ndarray, grid_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values [G, ...] of a grid at times [T] between."""
+    columns = values.reshape(len(values), -1).T
+    return np.stack([np.interp(time_s, grid_s, column) for column in columns], axis=1).reshape(-1, *values.shape[1:])
+
+
 def _channels(piece: Piece, passed_s: np.ndarray) -> np.ndarray:
     """Channels [T, C] of a piece, `passed_s` [T] after its start; before and after it as `Piece.flows` says."""
-    phase = piece.start + (piece.end - piece.start) * passed_s / piece.duration_s
-    if not piece.flows:
-        phase = np.clip(phase, min(piece.start, piece.end), max(piece.start, piece.end))
+    done = passed_s / piece.duration_s
+    if not find_motion(piece.motion).cyclic:
+        # Its key poses begin and end in motion, the person does not.
+        done = _ease_ends(done, SOFT_ENDS)
+    elif not piece.flows:
+        done = np.clip(done, 0.0, 1.0)
+    phase = piece.start + (piece.end - piece.start) * done
     channels = channels_at_phase(piece.motion, phase, piece.amplitude, piece.mirrored)
-    if piece.arms is None:
-        return channels
-    arms = piece.arms
-    return _lay_over(channels, arms, passed_s)
+    return channels if piece.arms is None else _lay_over(channels, piece.arms, passed_s)
 
 
 def _lay_over(channels: np.ndarray, arms: Piece, passed_s: np.ndarray) -> np.ndarray:
     """Channels with those of arms and head that the motion `arms` names in their place, eased in and out."""
     motion = find_motion(arms.motion)
-    cycle_s = min(motion.duration_s, arms.duration_s / arms.end) if motion.cyclic else motion.duration_s
     left_s = arms.duration_s - passed_s
+    done = arms.end * np.clip(passed_s / arms.duration_s, 0.0, 1.0)
     if motion.cyclic:
-        phase = np.clip(passed_s / arms.duration_s, 0.0, 1.0) * arms.end
-    elif arms.end == 1 and arms.duration_s > cycle_s:
+        phase = done
+    elif arms.end == 1 and arms.duration_s > motion.duration_s:
         # Held in the middle for as long as there is time.
-        phase = np.where(passed_s < left_s, np.minimum(passed_s / cycle_s, 0.5), np.maximum(1 - left_s / cycle_s, 0.5))
+        begun, ending = passed_s / motion.duration_s, 1 - left_s / motion.duration_s
+        phase = _ease_ends(np.where(passed_s < left_s, np.minimum(begun, 0.5), np.maximum(ending, 0.5)), SOFT_ENDS)
     else:
-        rounds = np.clip(passed_s / arms.duration_s, 0.0, 1.0) * arms.end
-        phase = np.where(rounds < arms.end, rounds % 1.0, 1.0)
-    own = channels_at_phase(arms.motion, np.clip(phase, 0.0, None), 1.0, arms.mirrored)
+        phase = _ease_ends(np.where(done < arms.end, done % 1.0, 1.0), SOFT_ENDS)
+    own = channels_at_phase(arms.motion, phase, 1.0, arms.mirrored)
     columns = _named_columns(arms)
     ramp_s = min(BLEND_S, arms.duration_s / 3)
     weight = _ease(np.minimum(passed_s, left_s) / ramp_s) if motion.cyclic else np.ones(len(passed_s))
@@ -253,8 +269,8 @@ def _ease(fraction: np.ndarray) -> np.ndarray:
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 
-def _ease_turn(fraction: np.ndarray) -> np.ndarray:
-    """From 0 to 1 at a constant pace, but for a tenth at each end."""
-    u, ramp = np.clip(fraction, 0.0, 1.0), 0.1
+def _ease_ends(fraction: np.ndarray, ramp: float) -> np.ndarray:
+    """From 0 to 1 at a constant pace, but for the share `ramp` at each end."""
+    u = np.clip(fraction, 0.0, 1.0)
     start, end = u**2 / (2 * ramp), 1 - ramp - (1 - u) ** 2 / (2 * ramp)
     return np.where(u < ramp, start, np.where(u > 1 - ramp, end, u - ramp / 2)) / (1 - ramp)

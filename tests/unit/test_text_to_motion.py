@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ctlev_core.body import keyframes
 from ctlev_core.body.everyday_motions import EVERYDAY_MOTIONS
-from ctlev_core.body.ground_contact import stand_on_ground
+from ctlev_core.body.ground_contact import body_path, find_contact
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.motion_clip import MotionClip, check_clip
 from ctlev_core.body.motion_sentences import known_verbs, parse_sentence
@@ -173,9 +173,10 @@ def test_motions_are_smooth_and_stay_on_the_ground(sentence):
     vertices, joints = posed(clip)
     lowest = vertices[..., 1].min(axis=1)
     # Soft contact lets the lowest vertices sink in by about its softness of 4 mm.
-    assert lowest.min() > -0.012
+    assert lowest.min() > -0.02
     if "jump" not in sentence and "run" not in sentence:
-        assert lowest.max() < 0.002
+        # Knees that take up the shock of a step let the body be up to 15 mm off.
+        assert lowest.max() < 0.016
     # A kicking foot reaches 10 m/s; a gap between two clips would be several decimetres in a frame, 20 m/s and more.
     speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * 60
     assert speed.max() < 12.0
@@ -187,16 +188,23 @@ def test_motions_are_smooth_and_stay_on_the_ground(sentence):
 
 @pytest.mark.parametrize("sentence", SENTENCES)
 def test_planted_feet_do_not_slide(sentence):
-    # Two feet that move against one another on the ground slide by what the key poses have them do; the motions of
-    # `keyframes.py` set on the ground by the skin have up to 0.06 m/s for gaits and 0.2 for steps on the spot.
-    assert slide_m_s(generate_motion(sentence)).mean() < 0.2
+    # 0.02 to 0.09 over these; the key poses alone, on the ground, have 0.05 to 0.15, and 0.4 set on joints.
+    assert slide_m_s(generate_motion(sentence)).mean() < 0.12
 
 
-def test_walking_slides_no_more_than_a_tenth_of_its_speed():
+def test_walking_slides_no_more_than_a_twentieth_of_its_speed():
     clip = generate_motion("a person walks for 4 seconds")
     speed = clip.transl[-1, 2] / 4
     assert 1.0 < speed < 2.0
-    assert slide_m_s(clip).mean() < 0.1 * speed
+    assert slide_m_s(clip).mean() < 0.05 * speed
+
+
+def test_bodies_have_inertia():
+    walking = generate_motion("a person walks for 4 seconds", rate_hz=100)
+    pelvis = posed(walking)[1][:, 0]
+    acceleration = np.linalg.norm(np.diff(pelvis, 2, axis=0), axis=-1) * 100**2
+    # A walker's trunk has a few m/s2. The steps of these key poses make 36 at a heel strike, and 130 without inertia.
+    assert acceleration.max() < 50.0 and acceleration.mean() < 8.0
 
 
 def test_directions_are_those_of_the_person():
@@ -334,7 +342,8 @@ def test_any_pose_is_set_on_the_ground(seed):
         size=(1, 24, 3)
     )
     rotations = matrix_from_axis_angle(vectors)
-    transl = stand_on_ground(rotations)
+    transl = body_path(find_contact(rotations), np.ones(6), 0.01)
     vertices, _ = pose_vertices(BODY, rotations, np.zeros(10), transl)
-    assert (np.abs(vertices[..., 1].min(axis=1)) < 0.012).all()
+    # 4 mm of softness, and 15 mm by which knees may take up a shock.
+    assert (np.abs(vertices[..., 1].min(axis=1)) < 0.02).all()
     assert (transl[0, ::2] == 0).all()
