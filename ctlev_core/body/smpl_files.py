@@ -36,7 +36,13 @@ POSE_COLUMNS = {72: "SMPL", 156: "SMPL-H", 165: "SMPL-X"}
 _NUM_SHARED = 66
 """Columns of the root and the 21 body joints, which all three have first and in the same order."""
 
-_CHUMPY = ("chumpy.ch.Ch", "chumpy.reordering.Select", "chumpy.reordering.Reshape", "chumpy.reordering.transpose")
+_CHUMPY = {
+    "chumpy.ch.Ch": "x",
+    "chumpy.reordering.Select": "a",
+    "chumpy.reordering.Reshape": "a",
+    "chumpy.reordering.transpose": "a",
+}
+"""The expressions that hold or reorder numbers and calculate nothing, and what they call these."""
 _SPARSE = tuple(
     f"scipy.sparse.{module}.{form}_{kind}"
     for form in ("csc", "csr", "coo")
@@ -108,7 +114,7 @@ def _read_npz(path: Path) -> dict[str, Any]:
 
 def _read_pickle(path: Path) -> dict[str, Any]:
     try:
-        loaded = safe_pickle.load(path, stand_ins=(*_CHUMPY, *_SPARSE))
+        loaded = safe_pickle.load(path, stand_ins=("chumpy.*", *_SPARSE))
     except DataError as error:
         raise DataError(f"{path}: cannot be read as a body model: {str(error).removeprefix(f'{path}: ')}") from None
     if not isinstance(loaded, dict):
@@ -158,7 +164,7 @@ def _numbers(value: Any, where: str, depth: int = 0) -> np.ndarray:
             if value.name in _SPARSE:
                 value = _dense(value.name.rsplit(".", 1)[1][:3], state)
             else:
-                value = _evaluate(value.name.rsplit(".", 1)[1], state, where, depth)
+                value = _evaluate(value.name, state, where, depth)
         array = np.asarray(value)
     except DataError:
         raise
@@ -169,18 +175,22 @@ def _numbers(value: Any, where: str, depth: int = 0) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def _evaluate(kind: str, state: dict[str, Any], where: str, depth: int) -> np.ndarray:
-    """The value of one of chumpy's expressions that only hold or reorder numbers."""
-    source = "x" if kind == "Ch" else "a"
-    if source not in state:
-        raise DataError(f"{where} is chumpy's {kind} without its `{source}`; it holds {', '.join(map(str, state))}")
-    array = _numbers(state[source], where, depth + 1)
-    if kind == "Select":
+def _evaluate(name: str, state: dict[str, Any], where: str, depth: int) -> np.ndarray:
+    """The value of one of chumpy's expressions."""
+    if name not in _CHUMPY:
+        raise DataError(
+            f"{where} is an expression that would have to be calculated ({name}); read are {', '.join(_CHUMPY)}. "
+            f"Convert the file where chumpy runs: every value as numpy.array(value)"
+        )
+    if _CHUMPY[name] not in state:
+        raise DataError(f"{where} is a {name} without its `{_CHUMPY[name]}`; it holds {', '.join(map(str, state))}")
+    array = _numbers(state[_CHUMPY[name]], where, depth + 1)
+    if name.endswith(".Select"):
         chosen = array.ravel()[np.asarray(state["idxs"])]
         return chosen.reshape(state["preferred_shape"]) if "preferred_shape" in state else chosen
-    if kind == "Reshape":
+    if name.endswith(".Reshape"):
         return array.reshape(state["newshape"])
-    if kind == "transpose":
+    if name.endswith(".transpose"):
         return np.transpose(array, state.get("axes"))
     return array
 

@@ -155,7 +155,8 @@ class PlainUnpickler(_BaseUnpickler):
     Args:
         reader: the bytes of the file.
         max_bytes: limit of the bytes of all arrays together.
-        stand_ins: classes, as `module.Class`, of which a `StandIn` is made; none of them is imported.
+        stand_ins: classes, as `module.Class` or, for all of a package, `package.*`, of which a `StandIn` is made; none
+            of them is imported.
     """
 
     GLOBALS: ClassVar[dict[str, Any]] = {
@@ -192,7 +193,6 @@ class PlainUnpickler(_BaseUnpickler):
                 self._globals[f"{module}._reconstructor"] = _reconstruct_stand_in
             for module in ("builtins", "__builtin__"):
                 self._globals[f"{module}.object"] = _OBJECT
-            self._globals.update((name, _StandInClass(name)) for name in stand_ins)
         self._stand_ins = stand_ins
 
     def load(self) -> Any:
@@ -210,10 +210,15 @@ class PlainUnpickler(_BaseUnpickler):
     def find_class(self, module: str, name: str) -> Any:
         """What stands in for a global."""
         meaning = self._globals.get(f"{module}.{name}")
+        if meaning is None and self._is_wanted(f"{module}.{name}"):
+            meaning = self._globals[f"{module}.{name}"] = _StandInClass(f"{module}.{name}")
         if meaning is None:
             wanted = ", ".join(["plain data", *sorted(self._stand_ins)])
             raise DataError(f"refused: it names {module}.{name}, and only {wanted} and NumPy arrays are read")
         return meaning
+
+    def _is_wanted(self, name: str) -> bool:
+        return any(name == one or (one.endswith(".*") and name.startswith(one[:-1])) for one in self._stand_ins)
 
     def load_reduce(self) -> None:
         """Call a function: one of the stand-ins."""

@@ -38,8 +38,8 @@ def load(path: Path, max_bytes: int = MAX_BYTES, stand_ins: Collection[str] = ()
     Args:
         path: the file; what follows the first pickle in it is not read.
         max_bytes: more than this, in the file or in the arrays made from it, is refused.
-        stand_ins: classes, as `module.Class`, that the file may name besides: in the place of such an object comes a
-            `plain_unpickler.StandIn` with its state, which is plain data again. No code of the class runs.
+        stand_ins: classes, as `module.Class` or `package.*`, that the file may name besides: in the place of such an
+            object comes a `plain_unpickler.StandIn` with its state, which is plain data again. No code of it runs.
     Raises:
         DataError: no such file, damaged, too large, or it holds anything but plain data; a function or class it names
             is told by name, and was not called.
