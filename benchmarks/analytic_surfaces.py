@@ -125,13 +125,16 @@ def compare(normals: np.ndarray, covered: np.ndarray, exact: np.ndarray) -> Norm
         exact: [H, W, 3] as `exact_normals` returns them.
     """
     seen = np.isfinite(exact[..., 0])
-    inner = binary_erosion(seen, iterations=SILHOUETTE_PX)
+    inner = np.asarray(binary_erosion(seen, iterations=SILHOUETTE_PX))
     first, second = normals.astype(np.float64), np.nan_to_num(exact)
     sines = np.linalg.norm(np.cross(first, second), axis=-1)
     angles = np.degrees(np.arctan2(sines, (first * second).sum(axis=-1)))
-    middle, rim = angles[inner & covered], angles[seen & covered & ~inner]
+    middle, rim = angles[inner & covered], angles[seen & covered & np.logical_not(inner)]
     return NormalsError(
-        *(float(value) for value in (middle.mean(), middle.max(), rim.mean(), rim.max())),
-        int(np.count_nonzero(seen != covered)),
-        int(seen.sum()),
+        mean_deg=float(middle.mean()),
+        max_deg=float(middle.max()),
+        rim_mean_deg=float(rim.mean()),
+        rim_max_deg=float(rim.max()),
+        coverage_px=int(np.count_nonzero(seen != covered)),
+        covered_px=int(seen.sum()),
     )
