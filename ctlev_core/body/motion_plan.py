@@ -8,8 +8,8 @@ import numpy as np
 
 from ctlev_core.body.everyday_motions import EVERYDAY_MOTIONS
 from ctlev_core.body.keyframes import MOTIONS
-from ctlev_core.body.motion_sentences import MAX_DURATION_S, Action
-from ctlev_core.body.motion_words import MotionWord
+from ctlev_core.body.motion_sentences import Action
+from ctlev_core.body.motion_words import MAX_DURATION_S, MotionWord
 from data_contracts.errors import DataError
 
 GAIT_SECONDS = 3.0
