@@ -19,16 +19,8 @@ from ctlev_core.body.smpl_files import read_smpl_file
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
 from data_contracts.errors import DataError
 
-__all__ = [
-    "BodyModel",
-    "joint_transforms",
-    "load_body",
-    "make_body",
-    "pose_offsets",
-    "pose_vertices",
-    "shape_vertices",
-    "skin",
-]
+__all__ = ["BodyModel", "joint_transforms", "load_body", "make_body", "pose_offsets", "pose_vertices", "shape_vertices"]
+__all__ += ["skin"]
 
 BUNDLED_BODY = Path(__file__).with_name("procedural_body.npz")
 NUM_JOINTS = len(SMPL_JOINTS)
@@ -123,7 +115,7 @@ def make_body(
         normals=_rest_normals(vertices, faces).astype(np.float32),
         joints=j_regressor.astype(np.float64) @ vertices,
         joint_shapedirs=np.einsum("jv,vcb->jcb", j_regressor.astype(np.float64), directions, optimize=True),
-        posedirs=None if posedirs is None else _rows_first(posedirs).astype(np.float32),
+        posedirs=None if posedirs is None else np.ascontiguousarray(_rows_first(posedirs), dtype=np.float32),
     )
 
 
@@ -266,8 +258,8 @@ def _pose_features(rotations: np.ndarray) -> np.ndarray:
 
 
 def _rows_first(directions: np.ndarray) -> np.ndarray:
-    """Blend shapes [V, 3, K] as [K, 3 V]."""
-    return np.ascontiguousarray(directions.reshape(-1, directions.shape[2]).T)
+    """Blend shapes [V, 3, K] as a view [K, 3 V]."""
+    return directions.reshape(-1, directions.shape[2]).T
 
 
 def _blend(directions: np.ndarray, features: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
