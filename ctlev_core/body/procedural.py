@@ -21,7 +21,7 @@ from ctlev_core.skeletons import JOINT_SETS, SMPL_JOINTS, SMPL_PARENTS
 INDEX = {name: joint for joint, name in enumerate(SMPL_JOINTS)}
 MIRROR_JOINT = list(JOINT_SETS["smpl"].mirror)
 LEG_JOINTS = ("hip", "knee", "ankle", "foot")
-GRID_LOW, GRID_HIGH = (0.0, -1.34, -0.37), (1.38, 0.83, 0.38)
+GRID_LOW, GRID_HIGH = (0.0, -1.34, -0.37), (1.46, 0.87, 0.38)
 """Box of the left half in the space of `magnify`, m."""
 SHAPE_NAMES = ("height", "legs", "arms", "torso", "shoulders", "hips", "girth", "limb_girth", "belly", "head")
 
@@ -248,11 +248,15 @@ def _joint_regressor(
     return regressor
 
 
-def build_arrays(voxel_m: float = 0.024) -> dict[str, np.ndarray]:
+def build_arrays(voxel_m: float = 0.025) -> dict[str, np.ndarray]:
     """The body as arrays under SMPL's key names, float64; see `make_body`."""
     joints = rest_joints()
     mesh = _extract_surface(voxel_m)
     adjacency = _neighbours(mesh.faces, len(mesh.mirror))
+    # Vertices - edges + faces of a sphere: a grid that just misses the gap between two fingers makes handles.
+    euler_number = len(mesh.mirror) - adjacency.nnz // 2 + len(mesh.faces)
+    if euler_number != 2:
+        raise ValueError(f"voxel_m = {voxel_m} m: fingers touch or come off; try a finer or slightly different grid")
     vertices = mesh.whole(magnify(_relax(mesh, adjacency)))
     weights = _skin_weights(vertices, mesh, adjacency)
     joint_shapedirs = _joint_shapedirs(joints)
@@ -269,13 +273,13 @@ def build_arrays(voxel_m: float = 0.024) -> dict[str, np.ndarray]:
     }
 
 
-def build_body(voxel_m: float = 0.024) -> BodyModel:
+def build_body(voxel_m: float = 0.025) -> BodyModel:
     """Build the procedural body from nothing; needs scikit-image (in the `test` extra).
 
     Args:
-        voxel_m: edge of the marching-cubes grid; 0.024 gives about 7,500 vertices.
+        voxel_m: edge of the marching-cubes grid; 0.025 gives about 7,600 vertices.
     Raises:
-        ValueError: the grid is too coarse to hold the fingers, or would need gigabytes.
+        ValueError: the grid does not hold the fingers, or would need gigabytes.
     """
     if not 0.004 <= voxel_m <= 0.05:
         raise ValueError(f"voxel_m must be between 0.004 and 0.05 m, got {voxel_m}")

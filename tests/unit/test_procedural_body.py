@@ -65,6 +65,8 @@ def test_it_is_one_closed_surface_without_handles():
     assert 5_000 <= len(BODY.v_template) <= 8_000
     angles = np.rad2deg(trimesh.triangles.angles(MESH.triangles))
     assert angles.min() > 5 and np.percentile(angles.min(axis=1), 1) > 20
+    # No triangle is folded over its neighbours.
+    assert np.sum(MESH.face_normals[:, None] * BODY.normals[BODY.faces], axis=2).min() > -0.2
 
 
 def test_left_and_right_are_mirror_images():
@@ -143,6 +145,12 @@ def test_extreme_shapes_stay_bodies(direction, beta):
     # Inside out a face would look the other way; a dented belly may turn a few.
     turned = np.sum(mesh.face_normals * MESH.face_normals, axis=1) < 0
     assert turned.mean() < 0.005
+
+
+def test_a_grid_that_loses_the_fingers_is_refused():
+    pytest.importorskip("skimage")
+    with pytest.raises(ValueError, match=r"voxel_m = 0.05 m: fingers touch or come off"):
+        procedural.build_body(voxel_m=0.05)
 
 
 def test_the_finer_mesh_has_the_same_shape():
