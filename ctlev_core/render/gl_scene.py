@@ -61,10 +61,19 @@ def current_context() -> Iterator[None]:
     """The one OpenGL context of this process, for this thread alone while it lasts.
 
     One for all sizes and meshes, and never deleted: pyrender closes the display with a context, which ends the others.
+
+    Raises:
+        DataError: no context, or something else in this process has ended it in that way.
     """
     with _one_at_a_time:
         platform = _platform()
-        platform.make_current()
+        try:
+            platform.make_current()
+        except (GL.error.GLError, AssertionError) as error:
+            raise DataError(
+                "the OpenGL context of renderer 'pyrender' is lost; deleting any pyrender.OffscreenRenderer in this "
+                "process ends it. Keep such renderers, or use renderer 'numba'"
+            ) from error
         try:
             yield
         finally:

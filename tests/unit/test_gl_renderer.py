@@ -1,5 +1,8 @@
 """The OpenGL route against the numba one, and what it says where there is no OpenGL."""
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -118,6 +121,31 @@ def test_threads_take_turns(opengl):
         ]
     for future in futures:
         np.testing.assert_array_equal(future.result()[0], expected[0])
+
+
+LOSE_CONTEXT = """
+import numpy as np
+import pyrender
+from ctlev_core.render.normals import render_normals
+corners = np.array([[[-1, -1, 2], [1, -1, 2], [0, 1, 2]]], np.float32)
+scene = corners, np.array([[0, 2, 1]]), np.array([[8.0, 8, 4, 4]]), (8, 8)
+assert render_normals(*scene, renderer="pyrender")[1].any()
+pyrender.OffscreenRenderer(8, 8).delete()
+try:
+    assert render_normals(*scene, renderer="pyrender")[1].any()
+except Exception as error:
+    print(type(error).__name__, error)
+else:
+    print("survived")
+"""
+
+
+def test_a_context_that_others_have_ended_is_named(opengl):
+    environment = os.environ | {"PYOPENGL_PLATFORM": opengl}
+    ended = subprocess.run(
+        [sys.executable, "-c", LOSE_CONTEXT], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert ended.stdout.startswith(("DataError the OpenGL context", "survived")), ended.stdout + ended.stderr
 
 
 def test_without_opengl_the_message_says_what_to_do(monkeypatch):
