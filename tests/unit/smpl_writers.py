@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import pickle
+import struct
 import sys
 import types
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import scipy.sparse
@@ -43,6 +45,30 @@ def pickled(tree: dict[str, Any], protocol: int = 2) -> bytes:
     for form in (b"csc", b"csr", b"coo"):
         content = content.replace(b"scipy.sparse._" + form, b"scipy.sparse." + form)
     return content
+
+
+def pickled_by_python_2(tree: dict[str, Any]) -> bytes:
+    """Protocol 2 as Python 2 wrote it: text and the bytes of arrays alike are strings of one byte a letter."""
+    buffer = io.BytesIO()
+    _Python2Pickler(buffer, 2).dump(tree)
+    content = buffer.getvalue().replace(b"cnumpy._core.", b"cnumpy.core.")
+    for form in (b"csc", b"csr", b"coo"):
+        content = content.replace(b"scipy.sparse._" + form, b"scipy.sparse." + form)
+    return content
+
+
+class _Python2Pickler(cast(Any, pickle)._Pickler):
+    dispatch: ClassVar[dict[type, Any]] = dict(cast(Any, pickle)._Pickler.dispatch)
+
+    def save_string(self, text: str | bytes) -> None:
+        content = text.encode("ascii") if isinstance(text, str) else text
+        if len(content) < 256:
+            self.write(pickle.SHORT_BINSTRING + bytes([len(content)]) + content)
+        else:
+            self.write(pickle.BINSTRING + struct.pack("<i", len(content)) + content)
+        self.memoize(text)
+
+    dispatch[str] = dispatch[bytes] = save_string
 
 
 def sparse(matrix: np.ndarray, form: str = "csc") -> Any:

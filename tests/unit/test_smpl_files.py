@@ -11,7 +11,7 @@ import pytest
 import scipy.sparse
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from smpl_writers import chumpy_classes, pickled, smpl_arrays, sparse
+from smpl_writers import chumpy_classes, pickled, pickled_by_python_2, smpl_arrays, sparse
 
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.smpl_files import read_smpl_file, smpl_pose_from_smplh
@@ -83,6 +83,20 @@ def test_sparse_arrays_and_entries_that_are_there_twice(tmp_path):
     twice = scipy.sparse.coo_array(([0.25, 0.75, 1.0], ([0, 0, 1], [3, 3, 0])), shape=(24, 40))
     (tmp_path / "model.pkl").write_bytes(pickled(SMALL | {"J_regressor": twice}))
     np.testing.assert_array_equal(read_smpl_file(tmp_path / "model.pkl")["J_regressor"], twice.toarray())
+
+
+def test_files_that_python_2_wrote(tmp_path):
+    with chumpy_classes() as chumpy:
+        tree = SMALL | {
+            "weights": chumpy.Ch(x=SMALL["weights"]),
+            "J_regressor": sparse(SMALL["J_regressor"]),
+            "pose_training_info": {"gender": "x", "dirs": ["a" * 300]},
+        }
+        content = pickled_by_python_2(tree)
+    assert b"scipy.sparse.csc\ncsc_matrix\n" in content
+    assert b"U\rkintree_table" in content and b"encode" not in content
+    (tmp_path / "model.pkl").write_bytes(content)
+    assert_read(tmp_path / "model.pkl", SMALL)
 
 
 @pytest.mark.parametrize("protocol", [0, 1, 2, 4])
