@@ -118,7 +118,9 @@ def _natural(name: str, action: Action | None, rng: np.random.Generator) -> tupl
     motion = MOTIONS.get(name) or EVERYDAY_MOTIONS[name]
     speed = (action.speed if action else 1.0) * np.exp(_SPEED_SPREAD * rng.uniform(-1, 1))
     spread = np.exp(_AMPLITUDE_SPREAD * rng.uniform(-1, 1))
-    return motion.duration_s / speed, (action.amplitude if action else 1.0) * spread
+    # What begins and ends at rest takes longer for the same pace between.
+    seconds = motion.duration_s * (1.0 if motion.cyclic else 1.2)
+    return seconds / speed, (action.amplitude if action else 1.0) * spread
 
 
 def _hold(posture: str, duration_s: float, rng: np.random.Generator) -> Piece:

@@ -196,6 +196,8 @@ def _combine(base: Action, added: Action) -> Action:
         base, added = added, base
     if base.meanwhile is not None:
         raise DataError(f"{added.verb!r} would be the third thing at the same time; two are possible")
+    if base.word.posture == "prone" and added.word.limb == "arm":
+        raise DataError(f"{base.verb!r} needs the hands, so {added.verb!r} cannot be done at the same time")
     turning = added.word.kind == "turn" and base.word.kind == "gait"
     if turning or (added.word.kind == "arms" and base.word.kind in ("gait", "step", "stand", "turn", "posture")):
         return replace(base, meanwhile=added)

@@ -136,6 +136,7 @@ def test_details_go_to_their_action():
         ("walks at the same time", "as what"),
         ("kicks while jumping", "cannot be done at the same time"),
         ("walks while waving while nodding", "third thing"),
+        ("crawls while drinking", "'crawl' needs the hands"),
         ("walks #3", "'#' is neither"),
         ("raises", "needs an arm"),
         ("\N{GREEK SMALL LETTER ALPHA} walks", "is neither a word nor a number"),
