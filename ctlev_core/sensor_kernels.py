@@ -115,37 +115,32 @@ def advance(before, after, begin_us, end_us, maps, physics, state, due_us, pixel
         )  # fmt: skip
         on, off, leak = maps.threshold_on[i], maps.threshold_off[i], maps.leak[i]
         rate, on_share = _noise(light_before, i, maps, physics)
+        still_us = begin_us - knot_us
         if light == light_before:
-            lag_us = _lag_us(light, physics)
-            difference, allowance, sent_us, random, end = _follow(
-                knot_us, begin_us - knot_us, end_us - knot_us, leak, -lag, lag_us, on, off, difference, allowance,
-                rate, on_share, physics.refractory_us, here.sent_us, here.random, exact_us, polarity, count,
-            )  # fmt: skip
-            if end > room:
-                return i, count, end
+            s, s_end, slope, gain, lag_us = still_us, end_us - knot_us, leak, -lag, _lag_us(light, physics)
+            signal_after = signal
         else:
-            still_us = begin_us - knot_us
             if still_us > 0.0:
-                decayed = -math.expm1(-still_us / _lag_us(light_before, physics)) if lag != 0.0 else 0.0
-                difference += leak * still_us - lag * decayed
-                lag -= lag * decayed
+                settled = lag * _arrived(still_us, _lag_us(light_before, physics), lag)
+                difference += leak * still_us - settled
+                lag -= settled
                 allowance -= rate * still_us
             signal_after = _log_response(light, physics.log_floor)
-            slope = (signal_after - signal) / span_us
             middle = 0.5 * (light_before + light)
-            lag_us = _lag_us(middle, physics)
             rate, on_share = _noise(middle, i, maps, physics)
-            gain = -(lag + slope * lag_us)
-            difference, allowance, sent_us, random, end = _follow(
-                begin_us, 0.0, span_us, slope + leak, gain, lag_us, on, off, difference, allowance,
-                rate, on_share, physics.refractory_us, here.sent_us, here.random, exact_us, polarity, count,
-            )  # fmt: skip
-            if end > room:
-                return i, count, end
-            arrived = -math.expm1(-span_us / lag_us) if gain != 0.0 else 0.0
-            difference += signal_after - signal + leak * span_us + gain * arrived
+            ramp, lag_us = (signal_after - signal) / span_us, _lag_us(middle, physics)
+            knot_us, s, s_end, slope, gain = begin_us, 0.0, span_us, ramp + leak, -(lag + ramp * lag_us)
+        arrived = _arrived(s_end, lag_us, gain)
+        difference, allowance, sent_us, random, end = _follow(
+            knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, on_share,
+            physics.refractory_us, here.sent_us, here.random, exact_us, polarity, count,
+        )  # fmt: skip
+        if end > room:
+            return i, count, end
+        if light != light_before:
+            difference += slope * s_end + gain * arrived
             lag += gain * arrived
-            allowance -= rate * span_us
+            allowance -= rate * s_end
             knot_us, signal = end_us, signal_after
             rate, _ = _noise(light, i, maps, physics)
         pixels[count:end] = i
@@ -158,88 +153,117 @@ def advance(before, after, begin_us, end_us, maps, physics, state, due_us, pixel
 
 @numba.njit(cache=True, nogil=True)
 def _follow(
-    knot_us, s, s_end, slope, gain, lag_us, on, off, difference, allowance, rate, on_share, refractory_us,
+    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, on_share, refractory_us,
     sent_us, random, exact_us, polarity, count,
 ):  # fmt: skip
-    """Events of one pixel from s to s_end after its knot; writes as far as there is room, counts on all the same."""
+    """Events of one pixel from s to s_end after its knot; writes as far as there is room, counts on all the same.
+
+    `arrived` is 1 - exp(-s_end / lag_us). Thresholds that are crossed are taken off the `difference` at the knot.
+    """
+    curve_end = slope * s_end + gain * arrived
+    reach = abs(slope) * s_end + abs(gain)
+    seeks = reach > 0.0 and (difference + reach >= on or difference - reach <= -off)
+    turn, curve_turn, rises_first, rises_last = s_end, curve_end, slope > 0.0, slope > 0.0
+    if seeks and gain != 0.0:
+        turn, curve_turn, rises_first, rises_last = _turn(slope, gain, lag_us, arrived, s_end, curve_end)
+    crossing_at, rises = np.inf, False
     while True:
-        crossing_at, rises = _next_crossing(difference, slope, gain, lag_us, on, off, s, s_end)
+        if seeks:
+            crossing_at, rises = _seek(
+                difference, slope, gain, lag_us, on, off, s, turn, curve_turn, rises_first, s_end, curve_end, rises_last
+            )
+            seeks = False
         noise_at = max(allowance / rate, s) if rate > 0.0 else np.inf
         at = min(crossing_at, noise_at)
         if at > s_end:
             return difference, allowance, sent_us, random, count
+        is_on = rises
         if noise_at < crossing_at:
             random, choice = _uniform(random)
             random, more = _exponential(random)
-            rises = choice < on_share
+            is_on = choice < on_share
             allowance += more
         else:
             difference -= on if rises else -off
+            seeks = True
         s = at
         if knot_us + at - sent_us >= refractory_us:
             sent_us = knot_us + at
             if count < len(exact_us):
                 exact_us[count] = sent_us
-                polarity[count] = rises
+                polarity[count] = is_on
             count += 1
 
 
 @numba.njit(cache=True, nogil=True)
-def _next_crossing(difference, slope, gain, lag_us, on, off, s, s_end):
+def _seek(
+    difference, slope, gain, lag_us, on, off, s, turn, curve_turn, rises_first, s_end, curve_end, rises_last
+):  # fmt: skip
     """When from s on the difference reaches a threshold, and whether it rises to it; inf = not before s_end."""
+    if s < turn:
+        target = (on if rises_first else -off) - difference
+        if (curve_turn >= target) == rises_first:
+            return _crossing(target, slope, gain, lag_us, s, turn, rises_first), rises_first
+    if s >= turn or turn < s_end:
+        target = (on if rises_last else -off) - difference
+        if (curve_end >= target) == rises_last:
+            return _crossing(target, slope, gain, lag_us, max(s, turn), s_end, rises_last), rises_last
+    return np.inf, False
+
+
+@numba.njit(cache=True, nogil=True)
+def _turn(slope, gain, lag_us, arrived, s_end, curve_end):
+    """Where line and exponential pull apart, the difference may turn round once; s_end = it does not.
+
+    Returns when, how far the curve has come by then, and whether it rises before and after.
+    """
+    rises_first, rises_last = slope * lag_us + gain > 0.0, slope * lag_us + gain * (1.0 - arrived) > 0.0
+    if rises_first == rises_last:
+        return s_end, curve_end, rises_first, rises_last
+    turn = min(max(-lag_us * math.log(-slope * lag_us / gain), 0.0), s_end)
+    return turn, slope * turn - gain * math.expm1(-turn / lag_us), rises_first, rises_last
+
+
+@numba.njit(cache=True, nogil=True)
+def _crossing(target, slope, gain, lag_us, low, high, rises):
+    """Where slope s + gain (1 - exp(-s / lag_us)), monotonic from low to high, reaches `target`.
+
+    Halley's method in a bracket, from the root of the parabola that osculates at `low`.
+    """
     if gain == 0.0:
-        if slope > 0.0:
-            return max((on - difference) / slope, s), True
-        if slope < 0.0:
-            return max((-off - difference) / slope, s), False
-        return np.inf, False
-    reach = abs(slope) * s_end + abs(gain)
-    if difference + reach < on and difference - reach > -off:
-        return np.inf, False
-    turn = _turn(slope, gain, lag_us, s, s_end)
-    while True:
-        value = difference + slope * s - gain * math.expm1(-s / lag_us)
-        value_turn = difference + slope * turn - gain * math.expm1(-turn / lag_us)
-        if value_turn > value and value_turn >= on:
-            return _root(on - difference, slope, gain, lag_us, s, turn, True), True
-        if value_turn < value and value_turn <= -off:
-            return _root(-off - difference, slope, gain, lag_us, s, turn, False), False
-        if turn == s_end:
-            return np.inf, False
-        s, turn = turn, s_end
-
-
-@numba.njit(cache=True, nogil=True)
-def _turn(slope, gain, lag_us, s, s_end):
-    """Where between s and s_end the difference turns round, as line and exponential pull apart; s_end = nowhere."""
-    ratio = -slope * lag_us / gain
-    if not 0.0 < ratio < 1.0:
-        return s_end
-    turn = -lag_us * math.log(ratio)
-    return turn if s < turn < s_end else s_end
-
-
-@numba.njit(cache=True, nogil=True)
-def _root(target, slope, gain, lag_us, low, high, rises):
-    """Where slope s + gain (1 - exp(-s / lag_us)) reaches `target`, monotonic from low to high: Newton in a bracket."""
-    s = 0.5 * (low + high)
+        return min(max(target / slope, low), high)
+    # In units of the time constant after `low`: a x + b (1 - exp(-x)) = c.
+    less_one = math.expm1(-low / lag_us)
+    a, b, c = slope * lag_us, gain * (1.0 + less_one), target - slope * low + gain * less_one
+    x_low, x_high = 0.0, (high - low) / lag_us
+    root = (a + b) * (a + b) - 2.0 * b * c
+    x = 2.0 * c / (a + b + math.copysign(math.sqrt(root), a + b)) if root >= 0.0 and a + b != 0.0 else -1.0
+    if not 0.0 <= x <= x_high:
+        x = 0.5 * x_high
     for _ in range(100):
-        less_one = math.expm1(-s / lag_us)
-        excess = slope * s - gain * less_one - target
-        if excess == 0.0:
-            break
-        if (excess > 0.0) == rises:
-            high = s
+        less_one = math.expm1(-x)
+        excess = a * x - b * less_one - c
+        if (excess >= 0.0) == rises:
+            x_high = x
         else:
-            low = s
-        velocity = slope + gain * (less_one + 1.0) / lag_us
-        s_new = s - excess / velocity if velocity != 0.0 else low
-        if not low < s_new < high:
-            s_new = 0.5 * (low + high)
-        moved, s = abs(s_new - s), s_new
-        if moved <= 1e-15 * s:
+            x_low = x
+        pull = b * (1.0 + less_one)
+        velocity = a + pull
+        divisor = velocity * velocity + 0.5 * excess * pull
+        x_new = x - excess * velocity / divisor if divisor != 0.0 else x_low
+        if not x_low <= x_new <= x_high:
+            x_new = 0.5 * (x_low + x_high)
+        moved, x = abs(x_new - x), x_new
+        # Each step cubes the relative error.
+        if moved <= 1e-7 * x:
             break
-    return s
+    return low + x * lag_us
+
+
+@numba.njit(cache=True, nogil=True)
+def _arrived(s, lag_us, gain):
+    """1 - exp(-s / lag_us), where there is anything to multiply it by."""
+    return -math.expm1(-s / lag_us) if gain != 0.0 else 0.0
 
 
 @numba.njit(cache=True, nogil=True)
