@@ -1,7 +1,8 @@
 """SMPL poses from joint positions, in closed form: every joint of a skeleton of the body's own proportions is met.
 
 Positions leave the twist about a bone open. It is chosen so that knees and elbows bend about their hinges, the spine
-shares what the chest turns against the pelvis, and everything else turns as little as possible.
+shares what the chest turns against the pelvis, and everything else turns as little as possible. Of a limb that bends
+through straight, the twist would jump; it is smoothed over a few frames, which moves no joint.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from ctlev_core.body.layer import NUM_BETAS, NUM_JOINTS, BodyModel, joint_transforms, load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle, slerp
@@ -22,6 +24,8 @@ MAX_UNEVENNESS = 0.1
 """Of the lengths of a limb, over time and left against right."""
 STRAIGHT = 0.1
 """Sine of the bend, 6 degrees, below which the hinge has no more say than the smallest twist."""
+SMOOTHING_FRAMES = 2.0
+"""Standard deviation of the smoothing of twists over time."""
 _PRIOR = 1e-9
 """Weight of the parent's orientation where positions do not determine one, as with hips in one place."""
 
@@ -184,6 +188,8 @@ def _twist_to_hinge(name: str, swung: np.ndarray, joints: np.ndarray, rest: np.n
     sine = np.sum(upper * np.cross(axis, bend), axis=-1)
     across = np.sum(axis * upper, axis=-1) * np.sum(bend * upper, axis=-1)
     cosine = np.sum(axis * bend, axis=-1) - across
+    # Over a few frames, weighted by how clearly the limb is bent: joints do not show a twist, so none must jump.
+    sine, cosine = (gaussian_filter1d(part, SMOOTHING_FRAMES, mode="nearest") for part in (sine, cosine))
     return matrix_from_axis_angle(np.arctan2(sine, cosine)[:, None] * upper) @ swung
 
 

@@ -87,6 +87,14 @@ def test_poses_follow_joints_smoothly_through_a_straight_limb():
     assert angles_deg(rotations[1:], rotations[:-1]).max() < 1.0
 
 
+@pytest.mark.parametrize("name", ["spin_kick", "throw", "run", "crawl"])
+def test_poses_do_not_jump_where_joints_do_not(name):
+    rotations, transl = motions.sample_pose(name, np.arange(0, 1.3, 1 / 60), np.random.default_rng(2))
+    fitted = fit_pose(joints_of(rotations, transl)).rotations
+    steps = [angles_deg(turns[1:], turns[:-1]).max() for turns in (rotations, fitted)]
+    assert steps[1] < 2 * steps[0]
+
+
 def test_the_spine_shares_a_twist():
     vectors = np.zeros((1, 24, 3))
     vectors[0, SMPL_JOINTS.index("spine3"), 1] = 0.9
