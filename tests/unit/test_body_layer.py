@@ -1,5 +1,6 @@
 """The body layers, numba's and torch's, against a slow float64 reference written from the paper's equations."""
 
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -306,6 +307,19 @@ def test_torch_layer_moves_and_says_what_is_wrong():
         torch_layer(pose, betas.double(), transl)
     double = torch_layer.double()
     assert double(pose.double(), betas.double(), transl.double())[0].dtype == torch.float64
+
+
+def test_smplx_poses_the_same_file_to_the_same_vertices(tmp_path):
+    smplx = pytest.importorskip("smplx", reason="the optional oracle smplx is not installed")
+    (tmp_path / "SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps(smpl_arrays(), 2))
+    body, (pose, betas, transl) = layer.load_body(tmp_path / "SMPL_NEUTRAL.pkl"), random_batch(3)
+    oracle = smplx.SMPL(str(tmp_path), batch_size=3)
+    pose_32, betas_32, transl_32 = as_tensors(pose, betas, transl, dtype=torch.float32)
+    posed = oracle(global_orient=pose_32[:, :3], body_pose=pose_32[:, 3:], betas=betas_32, transl=transl_32)
+    vertices, joints = layer.pose_vertices(body, rotations_of(pose), betas, transl)
+    # It works in float32 from the pose on: a few roundings of positions of some metres.
+    np.testing.assert_allclose(vertices, posed.vertices.detach(), atol=4e-6)
+    np.testing.assert_allclose(joints, posed.joints[:, :24].detach(), atol=4e-6)
 
 
 @pytest.mark.gpu
