@@ -3,8 +3,9 @@
 OpenCV camera frame (x right, y down, z forward, m); pixel (row, column) samples the point (column + 0.5, row + 0.5).
 Depth is kept as 1 / z: linear on the screen, so interpolating it is exact, and 0 means "nothing here".
 Edges that two triangles share are covered without gaps: their edge functions are exact negatives of each other.
-Whether a pixel of a small triangle's box is covered is anyone's guess, also the processor's, so nothing branches on it:
-each pixel of the box is written to a queue that grows only at a covered one (a third faster than a branch).
+Whether a small triangle faces the camera, and covers a pixel of its box, is anyone's guess, also the processor's. So
+nothing branches on it: each triangle, and each pixel of a box, is written to a list that grows only where it counts
+(half the time of branches).
 
 Source: Pineda, A parallel algorithm for polygon rasterization, SIGGRAPH 1988.
 """
@@ -180,7 +181,7 @@ def _project(points, K, near, screen):
             screen[i, 1] = focal_y * points[i, 1] * inverse + centre_y
             screen[i, 2] = inverse
         else:
-            screen[i, 2] = -1.0
+            screen[i, 0], screen[i, 1], screen[i, 2] = 0.0, 0.0, -1.0
             all_in_front = False
     return all_in_front
 
@@ -233,40 +234,60 @@ def _interpolate(rows, start, end, fraction, out, out_row):
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(screen, faces, attributes, cull_back, unit_length, image, depth_inverse):
-    """Draw all triangles whose corners are in front of the camera."""
-    height, width = depth_inverse.shape
-    weights, places, queued = np.empty((QUEUE_LENGTH + 1, 3)), np.empty((QUEUE_LENGTH + 1, 3), np.int32), 0
+def _choose(screen, faces, cull_back, width, height):
+    """Triangles to draw, [n, 5] int32: number, and first and last column and row of the pixels it may cover."""
+    chosen, number = np.empty((faces.shape[0] + 1, 5), np.int32), 0
     for f in range(faces.shape[0]):
         a, b, c = np.uint32(faces[f, 0]), np.uint32(faces[f, 1]), np.uint32(faces[f, 2])
-        if not (screen[a, 2] > 0.0 and screen[b, 2] > 0.0 and screen[c, 2] > 0.0):
-            continue
         ax, ay, bx, by, cx, cy = screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1]
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        # y points down, so a face that is counter-clockwise from outside has a negative area. NaN and inf end here.
-        if not (-np.inf < area < 0.0 or (0.0 < area < np.inf and not cull_back)):
+        if not np.abs(area) < np.inf:
             continue
+        # y points down, so a face that is counter-clockwise from outside has a negative area.
+        is_facing = (area < 0.0) | ((area > 0.0) & (not cull_back))
+        is_in_front = (screen[a, 2] > 0.0) & (screen[b, 2] > 0.0) & (screen[c, 2] > 0.0)
         # Clamped before the cast: far outside the image a position need not fit an integer.
         left = max(int(np.ceil(min(max(min(ax, bx, cx), 0.0), float(width)) - 0.5)), 0)
         right = min(int(np.floor(max(min(max(ax, bx, cx), float(width)), 0.0) - 0.5)), width - 1)
         top = max(int(np.ceil(min(max(min(ay, by, cy), 0.0), float(height)) - 0.5)), 0)
         bottom = min(int(np.floor(max(min(max(ay, by, cy), float(height)), 0.0) - 0.5)), height - 1)
-        sign = 1.0 if area > 0.0 else -1.0
-        for row in range(top, bottom + 1):
-            y = row + 0.5
-            for start in range(left, right + 1, QUEUE_LENGTH):
-                stop = min(start + QUEUE_LENGTH, right + 1)
-                if queued + stop - start > QUEUE_LENGTH:
-                    _resolve(weights, places, queued, screen, faces, attributes, unit_length, image, depth_inverse)
-                    queued = 0
-                for column in range(start, stop):
-                    x = column + 0.5
-                    wa = sign * ((bx - x) * (cy - y) - (by - y) * (cx - x))
-                    wb = sign * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
-                    wc = sign * ((ax - x) * (by - y) - (ay - y) * (bx - x))
-                    weights[queued, 0], weights[queued, 1], weights[queued, 2] = wa, wb, wc
-                    places[queued, 0], places[queued, 1], places[queued, 2] = f, row, column
-                    queued += int(min(wa, wb, wc) >= 0.0)
+        chosen[number, 0], chosen[number, 1], chosen[number, 2] = f, left, right
+        chosen[number, 3], chosen[number, 4] = top, bottom
+        number += int(is_facing & is_in_front & (left <= right) & (top <= bottom))
+    return chosen[:number]
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(screen, faces, attributes, cull_back, unit_length, image, depth_inverse):
+    """Draw all triangles whose corners are in front of the camera."""
+    height, width = depth_inverse.shape
+    chosen = _choose(screen, faces, cull_back, width, height)
+    weights, places, queued = np.empty((QUEUE_LENGTH + 1, 3)), np.empty((QUEUE_LENGTH + 1, 3), np.int32), 0
+    for i in range(chosen.shape[0]):
+        f, left, right = int(chosen[i, 0]), int(chosen[i, 1]), int(chosen[i, 2])
+        top, bottom = int(chosen[i, 3]), int(chosen[i, 4])
+        a, b, c = np.uint32(faces[f, 0]), np.uint32(faces[f, 1]), np.uint32(faces[f, 2])
+        ax, ay, bx, by, cx, cy = screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1]
+        sign = 1.0 if (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) > 0.0 else -1.0
+        row, column, remaining = top, left, (right - left + 1) * (bottom - top + 1)
+        while remaining > 0:
+            step = min(remaining, QUEUE_LENGTH)
+            remaining -= step
+            if queued + step > QUEUE_LENGTH:
+                _resolve(weights, places, queued, screen, faces, attributes, unit_length, image, depth_inverse)
+                queued = 0
+            # One loop over the box, for each end of a loop is a wrong guess.
+            for _ in range(step):
+                x, y = column + 0.5, row + 0.5
+                wa = sign * ((bx - x) * (cy - y) - (by - y) * (cx - x))
+                wb = sign * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
+                wc = sign * ((ax - x) * (by - y) - (ay - y) * (bx - x))
+                weights[queued, 0], weights[queued, 1], weights[queued, 2] = wa, wb, wc
+                places[queued, 0], places[queued, 1], places[queued, 2] = f, row, column
+                queued += int(min(wa, wb, wc) >= 0.0)
+                is_last = column == right
+                row += int(is_last)
+                column = left if is_last else column + 1
     _resolve(weights, places, queued, screen, faces, attributes, unit_length, image, depth_inverse)
 
 
