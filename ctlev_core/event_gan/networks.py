@@ -34,6 +34,26 @@ def _convolution(
     return nn.Sequential(convolution, NORMS[norm](num_outputs)) if norm else nn.Sequential(convolution)
 
 
+class RevivableReLU(torch.autograd.Function):
+    """ReLU whose gradient also reaches values at or below 0 where it would raise them.
+
+    Most pixels of an event image are 0. With plain ReLU a network with one or two output channels dies within a few
+    steps of the absolute difference: no pixel is above 0 and none gets a gradient any more. The function is the same.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        """max(0, values)."""
+        ctx.save_for_backward(values > 0)
+        return values.clamp(min=0)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        """The gradient where a value is positive or where descending on it makes the value grow."""
+        (is_positive,) = ctx.saved_tensors
+        return torch.where(is_positive | (gradient < 0), gradient, 0.0)
+
+
 class ResidualBlock(nn.Module):
     """Two convolutions beside an identity; ReLU after each."""
 
@@ -52,7 +72,7 @@ class EventVolumeUNet(nn.Module):
 
     The head keeps the resolution, each encoder halves it and doubles the channels, residual blocks follow; each decoder
     enlarges to the size of its skip connection (nearest neighbour), concatenates and convolves; a 1 x 1 convolution
-    with ReLU predicts. Any image size works that leaves 2 px at the bottleneck.
+    with ReLU (see `RevivableReLU`) predicts. Any image size works that leaves 2 px at the bottleneck.
 
     Args:
         num_volume_channels: channels of the volume, one a polarity. Published: 9 temporal bins a polarity.
@@ -99,7 +119,7 @@ class EventVolumeUNet(nn.Module):
         for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
             enlarged = interpolate(features, size=skip.shape[-2:], mode="nearest")
             features = nn.functional.leaky_relu(decoder(torch.cat([enlarged, skip], dim=1)))
-        return torch.relu(self.prediction(features))
+        return RevivableReLU.apply(self.prediction(features))
 
 
 class PatchDiscriminator(nn.Module):

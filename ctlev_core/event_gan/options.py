@@ -60,6 +60,12 @@ class TrainingOptions(Frozen):
     )
     generator_learning_rate: float = Field(default=2e-4, gt=0, description="of RAdam with beta_1 = 0; published")
     discriminator_learning_rate: float = Field(default=5e-5, gt=0, description="of RAdam with beta_1 = 0; published")
+    beta2: float = Field(
+        default=0.99,
+        gt=0,
+        lt=1,
+        description="RAdam's decay of squared gradients; published: 0.999, which warms up over the first 1,000 steps",
+    )
     flip: float = Field(
         default=0.5,
         ge=0,

@@ -36,8 +36,6 @@ from data_contracts.labels import History
 
 # Entropy that keeps random streams apart.
 _SPLIT_STREAM, _WEIGHT_STREAM, _BATCH_STREAM, _CALIBRATION_STREAM = 20, 21, 22, 23
-# The published optimiser of both networks.
-BETAS = (0.0, 0.999)
 # What the averaged generator sees before it is judged.
 CALIBRATION_BATCHES, CALIBRATION_BATCH_SIZE = 16, 16
 
@@ -103,11 +101,12 @@ class EventGAN:
         weight_seed = int(np.random.SeedSequence([seed, _WEIGHT_STREAM]).generate_state(1)[0])
         self.generator, self.discriminator = build_seeded(build, weight_seed).to(self.device).children()
         self.averaged = copy.deepcopy(self.generator)
+        betas = (0.0, options.beta2)
         self.generator_optimizer = torch.optim.RAdam(
-            self.generator.parameters(), lr=options.generator_learning_rate, betas=BETAS
+            self.generator.parameters(), lr=options.generator_learning_rate, betas=betas
         )
         self.discriminator_optimizer = torch.optim.RAdam(
-            self.discriminator.parameters(), lr=options.discriminator_learning_rate, betas=BETAS
+            self.discriminator.parameters(), lr=options.discriminator_learning_rate, betas=betas
         )
         self.step = 0
         self.curves = Curves()
