@@ -7,14 +7,14 @@ from typing import Any
 
 import pyarrow as pa
 
-from ctlev_core.diffusion.pretraining import PretrainingOptions, pretrain
+from ctlev_core.diffusion.pretraining import PretrainingOptions, pretrain, start_folder
 from data_contracts import tables
 from data_contracts.manifest import history_table
 from tasks.stage import Output, files_of, stage
 
 
 def _start_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
-    start = arguments["options"].start
+    start = start_folder(arguments["options"])
     return [] if start is None else files_of([start])
 
 

@@ -9,8 +9,10 @@ import math
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -28,6 +30,7 @@ from ctlev_core.diffusion.prior import (
     load_prior,
     save_prior,
 )
+from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
 from ctlev_core.diffusion.small_prior import IMAGE_SIZE, SCHEDULER_CONFIG, WIDTHS, build_prior
 from ctlev_core.diffusion.training import Trainer, run_training, sample_rows
 from ctlev_core.processes import die_with_parent
@@ -66,13 +69,21 @@ class PretrainingOptions(Frozen):
         default=3, gt=0, description="how often each scene is shown, every time in a random style"
     )
     text_dropout: float = Field(default=0.1, ge=0, le=1, description="share of empty prompts, for guidance")
-    condition_dropout: float = Field(default=0.2, ge=0, le=1, description="share of people without their skeleton")
+    condition: procedural_images.ConditionKind = Field(
+        default="skeleton", description="what the ControlNet is steered by: skeletons, or normal maps of bodies"
+    )
+    tune: Literal["both", "controlnet"] = Field(
+        default="both", description="U-Net and ControlNet together, or a ControlNet for the U-Net of `start` alone"
+    )
+    people_share: float = Field(default=procedural_images.PEOPLE_SHARE, ge=0, le=1, description="people among scenes")
+    condition_dropout: float = Field(default=0.2, ge=0, le=1, description="share of people without their condition")
     image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
     widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
     start: Path | None = Field(
         default=None,
         json_schema_extra=RUN_SETTING,
-        description="diffusers folder of a small prior to go on from; random weights when null",
+        description="diffusers folder of a small prior to go on from; when null random weights, or the bundled prior "
+        "where the ControlNet alone is tuned",
     )
     seed: int = Field(default=0, ge=0, description="of weights, pictures, order and noise")
     workers: int = Field(
@@ -82,11 +93,11 @@ class PretrainingOptions(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One training picture: `skeleton` is None where it goes through the U-Net alone."""
+    """One training picture: `condition` is None where it goes through the U-Net alone."""
 
     image: np.ndarray
     caption: str
-    skeleton: np.ndarray | None
+    condition: np.ndarray | None
 
 
 class ImageStream:
@@ -108,7 +119,7 @@ class ImageStream:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
     def fetch(self, number: int) -> Batch:
-        """Batch `number`: people with a skeleton first, then everything that goes through the U-Net alone."""
+        """Batch `number`: people with a condition first, then everything that goes through the U-Net alone."""
         options = self._options
         block, position = divmod(number, self._batches_per_block)
         scenes = self._scenes(block)
@@ -118,51 +129,60 @@ class ImageStream:
         batch = []
         for row in rows:
             image, caption = procedural_images.apply_style(scenes[row], rng)
-            steered = scenes[row].has_skeleton and rng.random() >= options.condition_dropout
+            condition = scenes[row].condition
+            steered = condition is not None and rng.random() >= options.condition_dropout
             caption = "" if rng.random() < options.text_dropout else caption
-            batch.append(Row(image, caption, scenes[row].skeleton if steered else None))
+            batch.append(Row(image, caption, condition if steered else None))
         return make_batch(self._prior, batch)
 
     def _scenes(self, block: int) -> list[procedural_images.Scene]:
         if self._block[0] != block:
-            seed, count, size = self._options.seed, self._options.block_scenes, self._options.image_size
+            options = self._options
+            wanted = options.block_scenes, options.image_size, options.condition, options.people_share
             if self._pool is None:
-                self._block = (block, procedural_images.draw_block(seed, block, count, size))
+                self._block = (block, procedural_images.draw_block(options.seed, block, *wanted))
             else:
-                for ahead in range(block, block + 1 + self._options.workers):
+                for ahead in range(block, block + 1 + options.workers):
                     if ahead not in self._ahead:
-                        self._ahead[ahead] = self._pool.submit(procedural_images.draw_block, seed, ahead, count, size)
+                        self._ahead[ahead] = self._pool.submit(
+                            procedural_images.draw_block, options.seed, ahead, *wanted
+                        )
                 self._block = (block, self._ahead.pop(block).result())
         return self._block[1]
 
 
 def make_batch(prior: Prior, rows: list[Row]) -> Batch:
-    """Latents, prompt embeddings and conditions, rows with a skeleton first."""
-    rows = sorted(rows, key=lambda row: row.skeleton is None)
+    """Latents, prompt embeddings and conditions, rows with a condition first."""
+    rows = sorted(rows, key=lambda row: row.condition is None)
     images = images_to_tensor(np.stack([row.image for row in rows]))
     with torch.no_grad():
         latents = prior.vae.encode(images)[0].mode() * prior.scaling_factor
     embeddings = encode_prompts(prior, [row.caption for row in rows])
-    skeletons = [row.skeleton for row in rows if row.skeleton is not None]
-    conditions = conditions_to_tensor(np.stack(skeletons)) if skeletons else None
-    return Batch(latents, embeddings, conditions)
+    conditions = [row.condition for row in rows if row.condition is not None]
+    return Batch(latents, embeddings, conditions_to_tensor(np.stack(conditions)) if conditions else None)
 
 
 def draw_validation_rows(options: PretrainingOptions, draw: DrawScene) -> list[Row]:
-    """Held-back pictures from a stream of their own, with a skeleton where they show a person."""
+    """Held-back pictures from a stream of their own, with a condition where they show a person."""
     rows = []
     for index in range(VALIDATION_IMAGES):
         rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + index])
         scene = draw(rng, options.image_size)
         image, caption = procedural_images.apply_style(scene, rng)
-        rows.append(Row(image, caption, scene.skeleton if scene.has_skeleton else None))
+        rows.append(Row(image, caption, scene.condition))
     return rows
+
+
+def start_folder(options: PretrainingOptions) -> Path | None:
+    """The prior that training goes on from; None = random weights."""
+    return options.start or (BUNDLED_PRIOR if options.tune == "controlnet" else None)
 
 
 def new_prior(options: PretrainingOptions) -> Prior:
     """The prior before training: fitted patch code, trained tokenizer and random networks, or those of `start`."""
-    if options.start is not None:
-        return replace(load_prior(options.start), scheduler_config=dict(SCHEDULER_CONFIG))
+    start = start_folder(options)
+    if start is not None:
+        return replace(load_prior(start), scheduler_config=dict(SCHEDULER_CONFIG))
     scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
     rng = np.random.default_rng([options.seed, STYLE_STREAM])
     images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
@@ -172,10 +192,10 @@ def new_prior(options: PretrainingOptions) -> Prior:
 
 
 def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:
-    """The untrained prior and the trainer of its U-Net and ControlNet; patch code and text encoder stay as they are."""
+    """The untrained prior and the trainer of what learns; patch code and text encoder stay as they are."""
     prior = new_prior(options)
     parameters = []
-    for model in (prior.unet, prior.controlnet):
+    for model in (prior.unet, prior.controlnet) if options.tune == "both" else (prior.controlnet,):
         if model is not None:
             parameters += list(model.train().requires_grad_(True).parameters())
     identity = hashlib.sha256(json.dumps(cache_material(options), sort_keys=True).encode()).hexdigest()
@@ -190,14 +210,15 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
         out: becomes a diffusers folder.
         work: resumable state; a killed run goes on from there.
     Returns:
-        Loss curves; the validation losses are of people with their own and with somebody else's skeleton. Those of
+        Loss curves; the validation losses are of people with their own and with somebody else's condition. Those of
         objects with their own and with another's caption are logged beside them: both gaps must grow, or the prior
         does not heed what it is asked for.
     """
     prior, trainer = prepare(options)
     denoiser = Denoiser(prior.unet, prior.controlnet)
     schedule = NoiseSchedule(prior.scheduler_config)
-    people = make_batch(prior, draw_validation_rows(options, procedural_images.draw_person))
+    draw_person = partial(procedural_images.draw_person, condition=options.condition)
+    people = make_batch(prior, draw_validation_rows(options, draw_person))
     objects = make_batch(prior, draw_validation_rows(options, procedural_images.draw_thing))
     stream = ImageStream(prior, options)
 
@@ -207,7 +228,7 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
         speed = trainer.step * options.training.batch_size / max(trainer.seconds, 1e-9)
         loss = trainer.history.loss[-1] if trainer.history.loss else math.nan
         logger.info(
-            "step %d, %.0f s, %.1f img/s, loss %.4f, validation: own skeleton %.4f, another's %.4f; "
+            "step %d, %.0f s, %.1f img/s, loss %.4f, validation: own condition %.4f, another's %.4f; "
             "own caption %.4f, another's %.4f",
             trainer.step, trainer.seconds, speed, loss, *losses, *of_objects,
         )  # fmt: skip

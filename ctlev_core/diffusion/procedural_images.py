@@ -1,10 +1,10 @@
 """The endless stream of captioned pictures the small prior is pre-trained on. Never events, never a data set.
 
 Half of the pictures are people: colour renderings of the procedural body in random poses and in poses of the procedural
-motions that are not held out for tests, with the skeleton drawn in the manner of OpenPose. The others are everyday
-objects (`procedural_objects`), without a skeleton. A scene is drawn once and shown in several styles: photograph, grey
-photograph, line drawing on black, coloured line drawing. A network that knows outlines needs far fewer event images to
-learn what an event camera sees.
+motions that are not held out for tests, with what a ControlNet is steered by: the skeleton in the manner of OpenPose,
+or the map of the body's normals. The others are everyday objects (`procedural_objects`), without such a condition. A
+scene is drawn once and shown in several styles: photograph, grey photograph, line drawing on black, coloured line
+drawing. A network that knows outlines needs far fewer event images to learn what an event camera sees.
 
 Scene i is a function of (seed, i) alone, style s of scene i of (seed, i, s).
 """
@@ -13,20 +13,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import cv2
 import numpy as np
 
+from ctlev_core.body.body_labels import labels_in_camera
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motions import SEEN, UNSEEN, pose_at, sample_style
 from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.camera import is_inside, project
+from ctlev_core.conditions import normals
 from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object
 from ctlev_core.render.scene import render_person, sample_background, sample_subject
 from ctlev_core.render.skeleton import draw_skeleton
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_TO_DHP19
 from ctlev_core.virtual_camera import CameraRange, sample_camera
 
+ConditionKind = Literal["skeleton", "normals"]
 PEOPLE_SHARE = 0.5
 MOTION_SHARE = 0.55
 """Of the people, how many take their pose from a procedural motion, never a held-out one; the others' is random."""
@@ -73,15 +77,13 @@ class Scene:
 
     Attributes:
         image: [S, S, 3] uint8 RGB colours.
-        skeleton: [S, S, 3] uint8 RGB; black where there is nobody.
-        has_skeleton: is `skeleton` a condition at all?
+        condition: [S, S, 3] uint8 RGB, the person's skeleton or normal map; None for objects.
         noun: a key of `OBJECTS`, or `person`.
         colour: of the object; empty for people.
     """
 
     image: np.ndarray
-    skeleton: np.ndarray
-    has_skeleton: bool
+    condition: np.ndarray | None
     noun: str
     colour: str
 
@@ -118,8 +120,8 @@ def sample_pose(rng: np.random.Generator) -> np.ndarray:
     return matrix_from_euler("YXZ", np.array([angles[name][[1, 0, 2]] for name in SMPL_JOINTS]))
 
 
-def draw_person(rng: np.random.Generator, size: int) -> Scene:
-    """A rendered person with their skeleton; the pose is random."""
+def draw_person(rng: np.random.Generator, size: int, condition: ConditionKind = "skeleton") -> Scene:
+    """A rendered person with their skeleton or normals; the pose is random."""
     subject = sample_subject(rng, colour=True)
     if rng.random() < MOTION_SHARE:
         motion = str(rng.choice(SEEN + UNSEEN))
@@ -134,28 +136,36 @@ def draw_person(rng: np.random.Generator, size: int) -> Scene:
         background[:] = background.mean(axis=(0, 1))
     linear = render_person(rng, subject, rotations, transl, camera, background, (size, size))
     image = (np.clip(linear, 0, 1) ** (1 / 2.2) * 255).round().astype(np.uint8)
+    if condition == "normals":
+        body = labels_in_camera(
+            rotations[None], transl[None], subject.betas, camera, class_name="", t_us=np.zeros(1, int)
+        )
+        drawn = normals.render(body, (size, size), normals.Options(workers=1), [0]).images
+        assert drawn is not None
+        return Scene(image, drawn[0], "person", "")
     joints2d = project(camera, joints[0])[list(SMPL_TO_DHP19)]
     visible = is_inside(joints2d, (size, size))
     if rng.random() < 0.1:  # real labels miss joints
         visible &= rng.random(len(visible)) < 0.85
-    return Scene(image, draw_skeleton(joints2d, visible, "dhp19", (size, size)), True, "person", "")
+    return Scene(image, draw_skeleton(joints2d, visible, "dhp19", (size, size)), "person", "")
 
 
 def draw_thing(rng: np.random.Generator, size: int) -> Scene:
-    """A drawn object on a plain or stained background, without a skeleton."""
+    """A drawn object on a plain or stained background, without a condition."""
     noun, colour = rng.choice(list(OBJECTS)), rng.choice(list(COLOURS))
     background = sample_background(rng, (size, size), colour=True) ** (1 / 2.2) * 255
     if rng.random() < PLAIN_SHARE:
         background[:] = rng.choice((8, 60, 200, 250)) if rng.random() < 0.5 else background.mean(axis=(0, 1))
     image = draw_object(noun, colour, background.astype(np.uint8), rng)
-    return Scene(image, np.zeros((size, size, 3), np.uint8), False, noun, colour)
+    return Scene(image, None, noun, colour)
 
 
-def draw_scene(seed: int, index: int, size: int) -> Scene:
+def draw_scene(
+    seed: int, index: int, size: int, condition: ConditionKind = "skeleton", people_share: float = PEOPLE_SHARE
+) -> Scene:
     """Scene `index` of the stream, a function of its arguments alone."""
     rng = np.random.default_rng([seed, index])
-    draw = draw_person if rng.random() < PEOPLE_SHARE else draw_thing
-    return draw(rng, size)
+    return draw_person(rng, size, condition) if rng.random() < people_share else draw_thing(rng, size)
 
 
 def apply_style(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, str]:
@@ -187,7 +197,7 @@ def _outlines(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _caption(scene: Scene, style: str, rng: np.random.Generator) -> str:
-    if scene.has_skeleton:
+    if scene.condition is not None:
         caption = str(rng.choice(PERSON_CAPTIONS))
     else:
         # A grey picture has no colour to name.
@@ -209,6 +219,14 @@ def caption_corpus() -> list[str]:
     return 4 * (plain + styled) + 40 * EXTRA_WORDS.split()
 
 
-def draw_block(seed: int, block: int, block_size: int, size: int) -> list[Scene]:
+def draw_block(
+    seed: int,
+    block: int,
+    block_size: int,
+    size: int,
+    condition: ConditionKind = "skeleton",
+    people_share: float = PEOPLE_SHARE,
+) -> list[Scene]:
     """Scenes block * block_size .. (block + 1) * block_size - 1; what a worker process makes at a time."""
-    return [draw_scene(seed, index, size) for index in range(block * block_size, (block + 1) * block_size)]
+    indices = range(block * block_size, (block + 1) * block_size)
+    return [draw_scene(seed, index, size, condition, people_share) for index in indices]

@@ -41,20 +41,19 @@ def test_scenes_do_not_depend_on_order_or_block():
     alone = procedural_images.draw_scene(3, 11, 32)
     inside = procedural_images.draw_block(3, 1, 8, 32)[3]
     np.testing.assert_array_equal(alone.image, inside.image)
-    np.testing.assert_array_equal(alone.skeleton, inside.skeleton)
+    np.testing.assert_array_equal(alone.condition, inside.condition)
     other = procedural_images.draw_scene(4, 11, 32)
     assert not np.array_equal(alone.image, other.image)
 
 
 def test_mixture_of_people_and_objects():
     scenes = procedural_images.draw_block(0, 0, 60, 32)
-    people = [scene for scene in scenes if scene.has_skeleton]
+    people = [scene for scene in scenes if scene.condition is not None]
     # 60 draws at 0.5: four standard deviations either way.
     assert 15 <= len(people) <= 45
-    assert all(scene.skeleton.any() for scene in people), (
+    assert all(scene.condition.any() for scene in people), (
         "a person whose skeleton is out of the picture teaches nothing"
     )
-    assert not any(scene.skeleton.any() for scene in scenes if not scene.has_skeleton)
 
 
 def test_held_out_motions_are_never_drawn(monkeypatch):
@@ -94,7 +93,7 @@ def test_captions_name_what_is_seen_and_the_tokenizer_knows_their_words():
     for scene in procedural_images.draw_block(0, 0, 40, 16):
         image, caption = procedural_images.apply_style(scene, rng)
         assert image.dtype == np.uint8 and image.shape == (16, 16, 3)
-        if not scene.has_skeleton:
+        if scene.condition is None:
             assert scene.noun in caption
         words = caption.split()
         assert tokenizer.tokenize(caption) == [f"{word}</w>" for word in words]
