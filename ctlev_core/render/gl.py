@@ -48,9 +48,9 @@ def gl_available() -> str | None:
 
 
 def render_normals_gl(
-    vertices: np.ndarray, faces: np.ndarray, intrinsics: np.ndarray, image_size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """`render_normals` by OpenGL, arguments checked and of their final dtypes.
+    vertices: np.ndarray, faces: np.ndarray, intrinsics: np.ndarray, normals: np.ndarray, depth_inverse: np.ndarray
+) -> None:
+    """`render_normals` by OpenGL into arrays of the final shapes, arguments checked and of their final dtypes.
 
     Triangles meet the pixels on a grid of OpenGL's choice, often 1/256 px, so pixels at an edge can differ from those
     of the numba rasteriser.
@@ -58,17 +58,15 @@ def render_normals_gl(
     Raises:
         DataError: no OpenGL here; the message names what to install.
     """
-    width, height = image_size
-    normals = np.zeros((len(vertices), height, width, 3), np.float32)
-    depth_inverse = np.zeros((len(vertices), height, width), np.float32)
     if vertices.size == 0 or len(faces) == 0:
-        return normals, depth_inverse
+        normals[:], depth_inverse[:] = 0.0, 0.0
+        return
+    height, width = depth_inverse.shape[1:]
     with _context():
-        scene = _scene(faces, vertices.shape[1], image_size)
+        scene = _scene(faces, vertices.shape[1], (width, height))
         for i, (corners, camera) in enumerate(zip(vertices, intrinsics, strict=True)):
             pixels = scene.render(corners, camera)
             normals[i], depth_inverse[i] = pixels[..., :3], pixels[..., 3]
-    return normals, depth_inverse
 
 
 def _context() -> AbstractContextManager[None]:

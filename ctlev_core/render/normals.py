@@ -37,6 +37,7 @@ def render_normals(
     *,
     renderer: str = "numba",
     workers: int = 1,
+    out: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normals and inverse depth of a mesh in N poses.
 
@@ -50,27 +51,37 @@ def render_normals(
         image_size: (width, height) px.
         renderer: one of `RENDERERS`: "numba", a z-buffer on the CPU, which needs nothing else; "pyrender", OpenGL.
         workers: threads of "numba", 1 or more. OpenGL renders in one.
+        out: normals and depth_inverse of an earlier call, to write over; new memory when None, which costs the system
+            about as much as a third of the drawing.
     Returns:
         normals: [N, H, W, 3] float32, unit length; 0 where there is nothing.
         depth_inverse: [N, H, W] float32, 1 / m; 0 where there is nothing.
     Raises:
         DataError: shapes disagree, the image has no pixels, a face names a vertex that does not exist, intrinsics are
             not finite or a focal length is not positive; "pyrender" finds no OpenGL.
-        ValueError: unknown renderer, or fewer than one worker.
+        ValueError: unknown renderer, fewer than one worker, or an `out` of another shape or dtype.
     """
     vertices, triangles, cameras = _checked(vertices_cam, faces, intrinsics, image_size, renderer, workers)
+    width, height = image_size
+    shape = len(vertices), height, width
+    if out is None:
+        normals, depth_inverse = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
+    else:
+        normals, depth_inverse = out
+        _check_out(normals, (*shape, 3))
+        _check_out(depth_inverse, shape)
     if renderer == "pyrender":
         from ctlev_core.render.gl import render_normals_gl
 
-        return render_normals_gl(vertices, triangles, cameras, image_size)
-    width, height = image_size
-    normals = np.zeros((len(vertices), height, width, 3), np.float32)
-    depth_inverse = np.zeros((len(vertices), height, width), np.float32)
+        render_normals_gl(vertices, triangles, cameras, normals, depth_inverse)
+        return normals, depth_inverse
     remaining = iter(range(0, len(vertices), FRAMES_AT_A_TIME))
 
     def work() -> None:
         for start in remaining:
             some = slice(start, start + FRAMES_AT_A_TIME)
+            if out is not None:
+                normals[some], depth_inverse[some] = 0.0, 0.0
             rasterise_normals(vertices[some], triangles, cameras[some], NEAR_M, normals[some], depth_inverse[some])
 
     _in_threads(work, workers)
@@ -113,10 +124,12 @@ def render_normal_maps(
     if renderer == "pyrender":
         from ctlev_core.render.gl import render_normals_gl
 
-        for start in range(0, len(vertices), FRAMES_AT_A_TIME):
-            some = slice(start, start + FRAMES_AT_A_TIME)
-            normals, _ = render_normals_gl(vertices[some], triangles, cameras[some], image_size)
-            _colour(normals, *_COLOURS[convention], images[some])
+        normals = np.empty((1, height, width, 3), np.float32)
+        depth_inverse = np.empty((1, height, width), np.float32)
+        for i in range(len(vertices)):
+            one = slice(i, i + 1)
+            render_normals_gl(vertices[one], triangles, cameras[one], normals, depth_inverse)
+            _colour(normals, *_COLOURS[convention], images[one])
         return images
     remaining = iter(range(len(vertices)))
 
@@ -211,6 +224,11 @@ def _checked(
         np.ascontiguousarray(faces, np.int32),
         np.ascontiguousarray(intrinsics, np.float64),
     )
+
+
+def _check_out(array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if array.shape != shape or array.dtype != np.float32 or not array.flags.c_contiguous:
+        raise ValueError(f"out must hold {shape} float32, contiguous, got {array.shape} {array.dtype}")
 
 
 def _check_convention(convention: str) -> None:

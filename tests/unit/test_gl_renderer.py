@@ -96,6 +96,11 @@ def test_behind_the_camera_and_no_faces(opengl):
     assert not render_normals(vertices, FACES, intrinsics, (64, 64), renderer="pyrender")[1].any()
     empty = render_normals(vertices, np.zeros((0, 3), int), intrinsics, (64, 64), renderer="pyrender")
     assert not empty[1].any()
+    used = np.ones((1, 64, 64, 3), np.float32), np.ones((1, 64, 64), np.float32)
+    for faces in (FACES, np.zeros((0, 3), int)):
+        render_normals(vertices, faces, intrinsics, (64, 64), renderer="pyrender", out=used)
+        assert not used[0].any() and not used[1].any()
+        used[0][:], used[1][:] = 1.0, 1.0
 
 
 @pytest.mark.parametrize("distance", [3.0, 30.0, 300.0])

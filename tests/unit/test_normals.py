@@ -146,6 +146,20 @@ def test_frames_depend_on_nothing_but_themselves(workers):
         np.testing.assert_array_equal(together[i], np.concatenate([one[i] for one in expected]), err_msg=name)
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_memory_of_an_earlier_call_is_written_over(workers):
+    vertices, faces = ball()
+    first = render(np.stack([vertices] * 11), faces)
+    moved = np.stack([vertices + np.array([0.4, 0.2, 0.5], np.float32)] * 11)
+    expected, again = render(moved, faces), render(moved, faces, out=first, workers=workers)
+    for one, other, old in zip(again, expected, first, strict=True):
+        assert one is old
+        np.testing.assert_array_equal(one, other)
+    for bad in ((first[0][:5], first[1]), (first[0].astype(float), first[1]), (first[0], first[1][:, ::-1])):
+        with pytest.raises(ValueError, match="out must hold"):
+            render(moved, faces, out=bad)
+
+
 @pytest.mark.parametrize("workers", [1, 2, 5])
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_maps_without_normals_in_between_are_the_same(convention, workers):
