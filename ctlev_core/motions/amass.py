@@ -24,9 +24,6 @@ from data_contracts.errors import DataError
 VERSION = 1
 SUFFIXES = (".npz",)
 
-POSE_COLUMNS = {156: "SMPL-H", 165: "SMPL-X"}
-NUM_BODY = 66
-"""Columns of the root and the 21 body joints."""
 RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")
 
 
@@ -45,6 +42,8 @@ def read(path: Path) -> MotionClip:
     rate_key = next((key for key in RATE_KEYS if key in list_npz(path)), RATE_KEYS[0])
     names = ("poses", "trans", "betas", rate_key)
     poses, transl, betas, rate = read_npz(path, names, "a motion of AMASS").values()
+    from ctlev_core.body.smpl_files import POSE_COLUMNS, smpl_pose_from_smplh
+
     if poses.ndim != 2 or poses.shape[1] not in POSE_COLUMNS:
         known = " or ".join(f"[T, {columns}] ({name})" for columns, name in POSE_COLUMNS.items())
         raise DataError(f"{path}: poses must be {known}, got {list(poses.shape)}")
@@ -55,7 +54,5 @@ def read(path: Path) -> MotionClip:
     rate_hz = float(rate.reshape(()))
     if not 0 < rate_hz < np.inf:
         raise DataError(f"{path}: the frame rate must be positive, got {rate_hz}")
-    pose = np.zeros((len(poses), 72))
-    pose[:, :NUM_BODY] = poses[:, :NUM_BODY]
-    clip = MotionClip(pose, betas[:10], transl, np.arange(len(poses)) / rate_hz)
+    clip = MotionClip(smpl_pose_from_smplh(poses), betas[:10], transl, np.arange(len(poses)) / rate_hz)
     return move_world(check_clip(clip, str(path)), Z_UP_TO_Y_UP, np.zeros(3))

@@ -8,7 +8,7 @@ import cv2
 import numba
 import numpy as np
 
-from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, shape_vertices, skin
+from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, pose_offsets, shape_vertices, skin
 from ctlev_core.camera import Camera, project
 from ctlev_core.render.rasteriser import NEAR_M, rasterise
 from ctlev_core.skeletons import SMPL_JOINTS
@@ -139,13 +139,15 @@ def render_body_frames(
     in_camera = camera.R @ transforms
     in_camera[..., 3] += camera.translation
     rest, K = shape_vertices(body, subject.betas), camera.scaled(SUPERSAMPLING).K
+    offsets = pose_offsets(body, rotations)
     backdrop = background.repeat(SUPERSAMPLING, axis=0).repeat(SUPERSAMPLING, axis=1).astype(np.float32)
     vertices, normals, colours = np.empty_like(rest), np.empty_like(rest), np.empty_like(subject.albedo)
     image, depth_inverse = np.empty_like(backdrop), np.empty(backdrop.shape[:2], dtype=np.float32)
     out = np.empty((len(transforms), *shape), dtype=np.float32)
     # The loop stays in Python: numba's cache does not notice when a kernel called from another module changes.
     for frame, moves in enumerate(in_camera.astype(np.float32)):
-        skin(rest, body.normals, body.weight_indices, body.weight_values, moves, vertices, normals)
+        unposed = rest if offsets is None else rest + offsets[frame]
+        skin(unposed, body.normals, body.weight_indices, body.weight_values, moves, vertices, normals)
         _shade(normals, subject.albedo, light.direction, light.ambient, colours)
         image[:] = backdrop
         depth_inverse[:] = 0.0
