@@ -9,10 +9,10 @@ frame: fastest and median round by the clock, and the least of the processor's t
 against spheres and capsules whose rays are solved exactly, away from the silhouette by more than 4 px and nearer to it;
 `px` is how many pixels only mesh or surface covers. `body` is the bundled one, walking.
 
-`numba` is the project's default, vertex normals included, skinning not. `pyrender ..., tuned` is its second renderer:
-normals shader, one renderer, vertex buffers rewritten, floats, one sample a pixel. `default, colours` gives pyrender
-normals as colours of the vertices; `default, lit` is a scene with one lamp made anew for each frame from a trimesh, as
-in pyrender's examples, and shows no normals.
+`numba` is the project's default, vertex normals included, skinning not, into memory that is used again. `pyrender ...,
+tuned` is its second renderer: normals shader, one renderer, vertex buffers rewritten, floats, one sample a pixel.
+`default, colours` gives pyrender normals as colours of the vertices; `default, lit` is a scene with one lamp made anew
+for each frame from a trimesh, as in pyrender's examples, and shows no normals.
 
 EGL and OSMesa are measured in processes of their own, where they work. OSMesa needs PyOpenGL 3.1.10, which pyrender
 0.1.45 does not ask for: pip install --no-deps --target FOLDER PyOpenGL==3.1.10
@@ -128,10 +128,12 @@ def batches(rounds: int) -> list[tuple[str, str, str, bool]]:
     rotations, transl = walk(BATCH)
     vertices, _ = pose_vertices(body, rotations, np.zeros(10), transl)
     scene = vertices, body.faces, camera, (size, size)
+    used = render_normals(*scene)
     jobs: dict[str, Callable[[], object]] = {
         "skinning": lambda: pose_vertices(body, rotations, np.zeros(10), transl),
-        "normals": lambda: render_normals(*scene),
-        "normals, two cores": lambda: render_normals(*scene, workers=2),
+        "normals into new memory": lambda: render_normals(*scene),
+        "normals": lambda: render_normals(*scene, out=used),
+        "normals, two cores": lambda: render_normals(*scene, workers=2, out=used),
         "pictures of normals": lambda: render_normal_maps(*scene, "controlnet"),
         "pictures of normals, two cores": lambda: render_normal_maps(*scene, "controlnet", workers=2),
         "arithmetic": lambda: in_threads(count_up, 1),

@@ -130,6 +130,7 @@ def vertex_normals(vertices, faces):
 @numba.njit(cache=True, nogil=True)
 def _average_normals(vertices, faces, normals):
     """What `vertex_normals` returns, into `normals`."""
+    one = normals.dtype.type(1.0)
     normals[:] = 0.0
     for f in range(faces.shape[0]):
         a, b, c = np.uint32(faces[f, 0]), np.uint32(faces[f, 1]), np.uint32(faces[f, 2])
@@ -143,11 +144,11 @@ def _average_normals(vertices, faces, normals):
             normals[vertex, 1] += ny
             normals[vertex, 2] += nz
     for i in range(vertices.shape[0]):
-        length = np.sqrt(normals[i, 0] ** 2 + normals[i, 1] ** 2 + normals[i, 2] ** 2)
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        length = np.sqrt(x * x + y * y + z * z)
         if length > 0.0:
-            normals[i, 0] /= length
-            normals[i, 1] /= length
-            normals[i, 2] /= length
+            scale = one / length
+            normals[i, 0], normals[i, 1], normals[i, 2] = x * scale, y * scale, z * scale
 
 
 @numba.njit(cache=True, nogil=True)
