@@ -27,10 +27,11 @@ class Options(Frozen):
     """Options of the normal map."""
 
     prompt: str = Field(default="A moving human", description="The same prompt for every image, as in the paper.")
-    convention: Literal["controlnet", "rgb"] = Field(
+    convention: Literal["controlnet", "controlnet_unreversed", "rgb"] = Field(
         default="controlnet",
-        description="which axis is which colour: that of ControlNet v1.0, blue for left and red for near, or x, y, z "
-        "as red, green, blue; see ctlev_core/render/normals.py",
+        description="which axis is which colour: as ControlNet v1.0 sees it, red for near and blue for left; the same "
+        "in the order of v1.0's annotator, for a ControlNet whose config says `bgr` and reverses it itself; or right, "
+        "up, near as red, green, blue",
     )
     body: Path | None = Field(
         default=None,
@@ -74,7 +75,7 @@ def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds:
     """
     from ctlev_core.body.layer import load_body, pose_vertices
     from ctlev_core.body.rotations import matrix_from_axis_angle
-    from ctlev_core.render.normals import normal_map, render_normals
+    from ctlev_core.render.normals import render_normal_maps
 
     if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
         raise DataError("condition 'normals': the labels have no SMPL parameters; use condition 'skeleton' for joints")
@@ -92,8 +93,8 @@ def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds:
     for start in range(0, len(labels), BATCH):
         rows = slice(start, start + BATCH)
         vertices, _ = pose_vertices(body, rotations[rows], labels.smpl_betas[rows], labels.smpl_transl[rows])
-        normals, _ = render_normals(
-            vertices, body.faces, labels.intrinsics[rows], image_size, renderer=options.renderer, workers=workers
+        intrinsics = labels.intrinsics[rows]
+        images[rows] = render_normal_maps(
+            vertices, body.faces, intrinsics, image_size, options.convention, renderer=options.renderer, workers=workers
         )
-        images[rows] = normal_map(normals, options.convention)
     return Conditions((options.prompt,) * len(labels), images)

@@ -19,9 +19,10 @@ from ctlev_core.render.rasteriser import NEAR_M, rasterise_normals
 from data_contracts.errors import DataError
 
 RENDERERS = ("numba", "pyrender")
-CONVENTIONS = ("controlnet", "rgb")
+CONVENTIONS = ("controlnet", "controlnet_unreversed", "rgb")
 _COLOURS = {
     "controlnet": ((2, 1, 0), (-127.5, -127.5, -127.5), 127.5, (255, 127, 127)),
+    "controlnet_unreversed": ((0, 1, 2), (-127.5, -127.5, -127.5), 127.5, (127, 127, 255)),
     "rgb": ((0, 1, 2), (127.5, -127.5, -127.5), 128.0, (0, 0, 0)),
 }
 """Component behind each channel, factors, offset (half a unit more rounds what is then cut), background."""
@@ -152,10 +153,11 @@ def normal_map(normals: np.ndarray, convention: str) -> np.ndarray:
     `controlnet`: ControlNet v1.0's "normal" condition. Its x and y are Sobel derivatives of MiDaS' inverse depth, which
     grows towards a surface's near side: positive where the surface faces left, and up. Its z points to the camera.
     Hence it is the negative of our normal. 127.5 x + 127.5, cut to whole numbers; the background is flat, (0, 0, 1).
-    Its app then reverses the channels, and so do we: the network sees (z, y, x). A ControlNet whose config has
-    `controlnet_conditioning_channel_order: bgr` reverses once more by itself; give it `normal_map(...)[..., ::-1]`.
-    Our normals are true ones. Those of v1.0 have the same direction on the screen, where pixels are square, but
+    Its app then reverses the channels, and so do we: the network sees (z, y, x). Our normals are true ones. Those of v1.0 have the same direction on the screen, where pixels are square, but
     another tilt: 2 pi stands in for the unknown scale of MiDaS' depth.
+
+    `controlnet_unreversed`: (x, y, z), before the app reverses them: for a ControlNet whose config has
+    `controlnet_conditioning_channel_order: bgr`, and which therefore reverses them by itself.
 
     `rgb`: red = right, green = up, blue = towards the camera, as OpenGL's normal maps have it; 127.5 x + 127.5,
     rounded. The background is black, which no normal is.
@@ -164,7 +166,7 @@ def normal_map(normals: np.ndarray, convention: str) -> np.ndarray:
         normals: [N, H, W, 3] float, unit length or 0, as `render_normals` returns them.
         convention: one of `CONVENTIONS`.
     Returns:
-        [N, H, W, 3] uint8, channels in the order in which the network takes them.
+        [N, H, W, 3] uint8 RGB.
     Raises:
         DataError: another shape.
         ValueError: unknown convention.

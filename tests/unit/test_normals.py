@@ -279,3 +279,12 @@ def test_wrong_pictures_are_named():
         render_normal_maps(np.zeros((1, 3, 3)), np.array([[0, 1, 2]]), INTRINSICS[None], SIZE, "blue")
     with pytest.raises(DataError, match=r"\[N, H, W, 3\]"):
         normal_map(np.zeros((2, 2, 3)), "rgb")
+
+
+def test_the_unreversed_convention_is_the_reversed_one_reversed():
+    """What a ControlNet with the channel order `bgr` makes of it must be what v1.0's network sees."""
+    normals = np.random.default_rng(0).normal(size=(2, 6, 5, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals[0, :2] = 0.0
+    reversed_by_config = normal_map(normals, "controlnet_unreversed")[..., ::-1]
+    np.testing.assert_array_equal(reversed_by_config, normal_map(normals, "controlnet"))
