@@ -153,8 +153,9 @@ def normal_map(normals: np.ndarray, convention: str) -> np.ndarray:
     `controlnet`: ControlNet v1.0's "normal" condition. Its x and y are Sobel derivatives of MiDaS' inverse depth, which
     grows towards a surface's near side: positive where the surface faces left, and up. Its z points to the camera.
     Hence it is the negative of our normal. 127.5 x + 127.5, cut to whole numbers; the background is flat, (0, 0, 1).
-    Its app then reverses the channels, and so do we: the network sees (z, y, x). Our normals are true ones. Those of v1.0 have the same direction on the screen, where pixels are square, but
-    another tilt: 2 pi stands in for the unknown scale of MiDaS' depth.
+    Its app then reverses the channels, and so do we: the network sees (z, y, x). Our normals are true ones. Those of
+    v1.0 have the same direction on the screen, where pixels are square, but another tilt: 2 pi stands in for the
+    unknown scale of MiDaS' depth.
 
     `controlnet_unreversed`: (x, y, z), before the app reverses them: for a ControlNet whose config has
     `controlnet_conditioning_channel_order: bgr`, and which therefore reverses them by itself.
