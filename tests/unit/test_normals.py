@@ -273,9 +273,9 @@ def test_wrong_calls_are_named(changes, error, message):
 
 
 def test_wrong_pictures_are_named():
-    with pytest.raises(ValueError, match="controlnet, rgb"):
+    with pytest.raises(ValueError, match="controlnet, controlnet_unreversed, rgb"):
         normal_map(np.zeros((1, 2, 2, 3)), "blue")
-    with pytest.raises(ValueError, match="controlnet, rgb"):
+    with pytest.raises(ValueError, match="controlnet, controlnet_unreversed, rgb"):
         render_normal_maps(np.zeros((1, 3, 3)), np.array([[0, 1, 2]]), INTRINSICS[None], SIZE, "blue")
     with pytest.raises(DataError, match=r"\[N, H, W, 3\]"):
         normal_map(np.zeros((2, 2, 3)), "rgb")
