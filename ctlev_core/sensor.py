@@ -26,8 +26,6 @@ stepped, and noise does not depend on the frame rate.
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 
 from ctlev_core import sensor_kernels as kernels
@@ -80,8 +78,13 @@ class Sensor:
         """Events sent so far."""
         self.num_frames = 0
         """Frames seen so far."""
-        flat = {field.name: getattr(self.maps, field.name).ravel() for field in fields(PixelMaps)}
-        self._maps = kernels.FlatMaps(**flat | {"leak": 1e-6 * flat["leak"]})
+        self._traits = kernels.PixelTraits(
+            self.maps.threshold_on.ravel(),
+            self.maps.threshold_off.ravel(),
+            1e-6 * self.maps.leak.ravel(),
+            1e-6 * self.maps.shot_rate_hz.ravel(),
+            1e-6 * self.maps.hot_rate_hz.ravel(),
+        )
         self._physics = kernels.Physics(
             options.log_floor,
             options.cutoff_dark_hz or 0.0,
@@ -90,9 +93,8 @@ class Sensor:
             float(options.refractory_us),
         )
         self._seed = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
-        num_pixels = sensor_size[0] * sensor_size[1]
-        self._state = np.zeros(num_pixels, kernels.PIXEL_STATE)
-        self._due_us = np.zeros(num_pixels)
+        planes = {name: np.zeros(sensor_size[0] * sensor_size[1]) for name in kernels.PixelState._fields}
+        self._state = kernels.PixelState(**planes | {"random": planes["random"].astype(np.uint64)})
         self._frame = np.zeros(0, np.float32)
         self._first_t_us = self._last_t_us = 0
         # Rows for the events of one interval: exact time, pixel, polarity.
@@ -135,7 +137,7 @@ class Sensor:
 
     def _start(self, frame: np.ndarray, time_us: int) -> None:
         settled = self.options.starts_settled
-        kernels.start(frame, self._maps, self._physics, settled, self._seed, self._state, self._due_us)
+        kernels.start(frame, self._traits, self._physics, settled, self._seed, self._state)
         # Copies, because the caller may render into the same array again.
         self._frame, self._first_t_us, self._last_t_us, self.num_frames = frame.copy(), time_us, time_us, 1
 
@@ -147,14 +149,14 @@ class Sensor:
         pixel, count = 0, 0
         while True:
             pixel, count, needed = kernels.advance(
-                self._frame, frame, begin_us, end_us, self._maps, self._physics, self._state, self._due_us, pixel,
+                self._frame, frame, begin_us, end_us, self._traits, self._physics, self._state, pixel,
                 self._rows[0], self._rows[1], self._rows[2], count,
             )  # fmt: skip
             if pixel == len(frame):
                 break
-            self._rows = tuple(_enlarged(column, needed) for column in self._rows)
             if self.max_events is not None and self.num_events + needed > self.max_events:
                 break  # `push_exact` puts everything back
+            self._rows = tuple(_enlarged(column, needed) for column in self._rows)
         exact_us, pixels, polarity = (column[:count] for column in self._rows)
         span_us = time_us - self._last_t_us
         if span_us <= 4 * count + 4096:
@@ -176,12 +178,12 @@ class Sensor:
         return check_events(Events(t, x, y, p, self.sensor_size), "sensor"), exact_us
 
     def _snapshot(self) -> tuple:
-        state, due_us = self._state.copy(), self._due_us.copy()
-        return self.num_frames, self.num_events, state, due_us, self._frame, self._first_t_us, self._last_t_us
+        state = kernels.PixelState(*(plane.copy() for plane in self._state))
+        return self.num_frames, self.num_events, state, self._frame, self._first_t_us, self._last_t_us
 
     def _restore(self, snapshot: tuple) -> None:
-        self.num_frames, self.num_events, self._state, self._due_us = snapshot[:4]
-        self._frame, self._first_t_us, self._last_t_us = snapshot[4:]
+        self.num_frames, self.num_events, self._state = snapshot[:3]
+        self._frame, self._first_t_us, self._last_t_us = snapshot[3:]
 
 
 def simulate_events(

@@ -8,6 +8,8 @@ the difference to the level of the last event, is a line and a decaying exponent
 That is followed exactly, also between frames: crossings are roots of this expression. The state of a pixel is its knot,
 the last moment at which its light began or ceased to change. While light stands still, the knot stays where it is, and
 a pixel is not looked at before something can happen (`due_us`): a still pixel costs two comparisons a frame.
+
+The two large functions are inlined because a call that hands on an array costs as much as a pixel takes.
 """
 
 from __future__ import annotations
@@ -18,17 +20,43 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-PIXEL_STATE = np.dtype(
-    [
-        ("knot_us", np.float64),  # since the first frame
-        ("signal", np.float64),  # log response to the light at the knot
-        ("lag", np.float64),  # low-passed signal less signal, at the knot
-        ("difference", np.float64),  # low-passed signal less reference level, at the knot; thresholds are taken off it
-        ("allowance", np.float64),  # noise strikes when the rate summed since the knot has used up this
-        ("sent_us", np.float64),  # time of the last event that was not suppressed
-        ("random", np.uint64),  # a generator a pixel: no result depends on what other pixels did
-    ]
-)
+
+class PixelState(NamedTuple):
+    """What a pixel remembers, [P] each."""
+
+    knot_us: np.ndarray
+    """float64, since the first frame."""
+    signal: np.ndarray
+    """float64, log response to the light at the knot."""
+    lag: np.ndarray
+    """float64, low-passed signal less signal, at the knot."""
+    difference: np.ndarray
+    """float64, low-passed signal less reference level, at the knot; thresholds that are crossed are taken off it."""
+    allowance: np.ndarray
+    """float64: noise strikes when the rate summed since the knot has used up this."""
+    sent_us: np.ndarray
+    """float64, time of the last event that was not suppressed."""
+    random: np.ndarray
+    """uint64, a generator a pixel: no result depends on what other pixels did."""
+    due_us: np.ndarray
+    """float64: nothing happens earlier to a pixel whose light stays as it is; -inf = nobody knows."""
+
+
+class PixelTraits(NamedTuple):
+    """`PixelMaps` in raster order, [P] float64 each."""
+
+    threshold_on: np.ndarray
+    threshold_off: np.ndarray
+    leak: np.ndarray
+    """Log intensity per us."""
+    shot_rate: np.ndarray
+    """Per us, in the dark."""
+    hot_rate: np.ndarray
+    """Per us."""
+
+
+BLOCK = 16
+"""Pixels that are looked at together, whether any of them has something to do."""
 
 
 class Physics(NamedTuple):
@@ -41,48 +69,36 @@ class Physics(NamedTuple):
     refractory_us: float
 
 
-class FlatMaps(NamedTuple):
-    """`PixelMaps` in raster order, [P] float64 each; the leak in log intensity per us."""
-
-    threshold_on: np.ndarray
-    threshold_off: np.ndarray
-    leak: np.ndarray
-    shot_rate_hz: np.ndarray
-    hot_rate_hz: np.ndarray
-
-
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def first_bad(intensity):
     """Index of the first value of [P] that is not finite or negative; P = there is none."""
+    # Without a way out of the loop the processor takes several values at once.
+    num_good = 0
     for i in range(len(intensity)):
-        if not (intensity[i] >= 0.0 and intensity[i] < np.inf):
-            return i
+        num_good += (intensity[i] >= 0.0) & (intensity[i] < np.inf)
+    if num_good < len(intensity):
+        for i in range(len(intensity)):
+            if not (intensity[i] >= 0.0 and intensity[i] < np.inf):
+                return i
     return len(intensity)
 
 
-@numba.njit(cache=True, nogil=True)
-def start(intensity, maps, physics, starts_settled, seed, state, due_us):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def start(intensity, traits, physics, starts_settled, seed, state):
     """The state of all pixels at the first frame, [P] intensity."""
     for i in range(len(intensity)):
-        on, off = maps.threshold_on[i], maps.threshold_off[i]
+        on, off = traits.threshold_on[i], traits.threshold_off[i]
         random, share = _uniform(_mix(seed ^ _mix(np.uint64(i))))
-        random, allowance = _exponential(random)
+        state.random[i], state.allowance[i] = _exponential(random)
         # A pixel that has been running for long may be anywhere between its two thresholds.
-        difference = share * (on + off) - off if starts_settled else 0.0
-        light = np.float64(intensity[i])
-        state[i].knot_us = 0.0
-        state[i].signal = _log_response(light, physics.log_floor)
-        state[i].lag = 0.0
-        state[i].difference = difference
-        state[i].allowance = allowance
-        state[i].sent_us = -np.inf
-        state[i].random = random
-        rate, _ = _noise(light, i, maps, physics)
-        due_us[i] = _due_us(0.0, difference, 0.0, maps.leak[i], on, off, allowance, rate)
+        state.difference[i] = share * (on + off) - off if starts_settled else 0.0
+        state.signal[i] = _log_response(np.float64(intensity[i]), physics.log_floor)
+        state.knot_us[i] = state.lag[i] = 0.0
+        state.sent_us[i] = state.due_us[i] = -np.inf
 
 
-@numba.njit(cache=True, nogil=True)
-def advance(before, after, begin_us, end_us, maps, physics, state, due_us, pixel, exact_us, pixels, polarity, count):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exact_us, pixels, polarity, count):
     """All pixels, from `pixel` on, from one frame to the next.
 
     Args:
@@ -90,10 +106,9 @@ def advance(before, after, begin_us, end_us, maps, physics, state, due_us, pixel
         after: [P] intensity at `end_us`, of the same dtype.
         begin_us: since the first frame.
         end_us: since the first frame.
-        maps: of the sensor.
-        physics: of its kind.
-        state: [P] of `PIXEL_STATE`, updated.
-        due_us: [P], updated.
+        traits: of the pixels.
+        physics: of the kind of sensor.
+        state: of the pixels, updated.
         pixel: where to begin.
         exact_us: [R] the times of the events found, since the first frame.
         pixels: [R] their pixels.
@@ -101,62 +116,82 @@ def advance(before, after, begin_us, end_us, maps, physics, state, due_us, pixel
         count: rows that are filled already.
     Returns:
         The pixel to go on with, the rows filled, and the rows needed. When the first is P, all is done. Otherwise there
-        was no room: that pixel was left as it is, and wants so many rows.
+        was no room: that pixel was left as it is, and wants so many rows at least.
     """
-    room = len(exact_us)
-    span_us = end_us - begin_us
-    for i in range(pixel, len(after)):
-        light_before, light = np.float64(before[i]), np.float64(after[i])
-        if light == light_before and end_us < due_us[i]:
+    due_us = state.due_us
+    for first in range(pixel - pixel % BLOCK, len(after), BLOCK):
+        last = min(first + BLOCK, len(after))
+        is_busy = False
+        for i in range(first, last):
+            is_busy |= (before[i] != after[i]) | (end_us >= due_us[i])
+        if not is_busy:
             continue
-        here = state[i]
-        knot_us, signal, lag, difference, allowance = (
-            here.knot_us, here.signal, here.lag, here.difference, here.allowance,
-        )  # fmt: skip
-        on, off, leak = maps.threshold_on[i], maps.threshold_off[i], maps.leak[i]
-        rate, on_share = _noise(light_before, i, maps, physics)
-        still_us = begin_us - knot_us
-        if light == light_before:
-            s, s_end, slope, gain, lag_us = still_us, end_us - knot_us, leak, -lag, _lag_us(light, physics)
-            signal_after = signal
-        else:
-            if still_us > 0.0:
-                settled = lag * _arrived(still_us, _lag_us(light_before, physics), lag)
-                difference += leak * still_us - settled
-                lag -= settled
-                allowance -= rate * still_us
-            signal_after = _log_response(light, physics.log_floor)
-            middle = 0.5 * (light_before + light)
-            rate, on_share = _noise(middle, i, maps, physics)
-            ramp, lag_us = (signal_after - signal) / span_us, _lag_us(middle, physics)
-            knot_us, s, s_end, slope, gain = begin_us, 0.0, span_us, ramp + leak, -(lag + ramp * lag_us)
-        arrived = _arrived(s_end, lag_us, gain)
-        difference, allowance, sent_us, random, end = _follow(
-            knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, on_share,
-            physics.refractory_us, here.sent_us, here.random, exact_us, polarity, count,
-        )  # fmt: skip
-        if end > room:
-            return i, count, end
-        if light != light_before:
-            difference += slope * s_end + gain * arrived
-            lag += gain * arrived
-            allowance -= rate * s_end
-            knot_us, signal = end_us, signal_after
-            rate, _ = _noise(light, i, maps, physics)
-        pixels[count:end] = i
-        count = end
-        here.knot_us, here.signal, here.lag, here.difference = knot_us, signal, lag, difference
-        here.allowance, here.sent_us, here.random = allowance, sent_us, random
-        due_us[i] = _due_us(knot_us, difference, lag, leak, on, off, allowance, rate)
+        for i in range(max(first, pixel), last):
+            light_before, light = np.float64(before[i]), np.float64(after[i])
+            if light_before == light and end_us < due_us[i]:
+                continue
+            (knot_us, signal, lag, difference, allowance, sent_us, random, due), end = _advance_pixel(
+                light_before, light, begin_us, end_us,
+                traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_rate[i],
+                traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i], state.allowance[i],
+                state.sent_us[i], state.random[i], exact_us, polarity, count,
+            )  # fmt: skip
+            if end > len(exact_us):
+                return i, count, end
+            state.knot_us[i], state.signal[i], state.lag[i], state.difference[i] = knot_us, signal, lag, difference
+            state.allowance[i], state.sent_us[i], state.random[i], due_us[i] = allowance, sent_us, random, due
+            for row in range(count, end):
+                pixels[row] = i
+            count = end
     return len(after), count, count
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _advance_pixel(
+    light_before, light, begin_us, end_us, on, off, leak, shot, hot, physics, knot_us, signal, lag, difference,
+    allowance, sent_us, random, exact_us, polarity, count,
+):  # fmt: skip
+    """One pixel from one frame to the next: its new `PixelState`, and the rows filled."""
+    still_us = begin_us - knot_us
+    is_still = light == light_before
+    if is_still:
+        rate = hot + _shot_rate(light, shot, physics)
+        s, s_end, slope, gain, lag_us = still_us, end_us - knot_us, leak, -lag, _lag_us(light, physics)
+    else:
+        if still_us > 0.0:
+            settled = lag * _arrived(still_us, _lag_us(light_before, physics), lag)
+            difference += leak * still_us - settled
+            lag -= settled
+            allowance -= (hot + _shot_rate(light_before, shot, physics)) * still_us
+        middle = 0.5 * (light_before + light)
+        rate = hot + _shot_rate(middle, shot, physics)
+        signal_before, signal = signal, _log_response(light, physics.log_floor)
+        s_end, lag_us = end_us - begin_us, _lag_us(middle, physics)
+        ramp = (signal - signal_before) / s_end
+        knot_us, s, slope, gain = begin_us, 0.0, ramp + leak, -(lag + ramp * lag_us)
+    arrived = _arrived(s_end, lag_us, gain)
+    difference, allowance, sent_us, random, end = _follow(
+        knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot,
+        physics.refractory_us, sent_us, random, exact_us, polarity, count,
+    )  # fmt: skip
+    # When it is due is worked out once it stands still.
+    due_us = -np.inf
+    if is_still:
+        due_us = _due_us(knot_us, difference, lag, leak, on, off, allowance, rate)
+    else:
+        knot_us = end_us
+        lag += gain * arrived
+        difference += slope * s_end + gain * arrived
+        allowance -= rate * s_end
+    return (knot_us, signal, lag, difference, allowance, sent_us, random, due_us), end
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _follow(
-    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, on_share, refractory_us,
+    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, refractory_us,
     sent_us, random, exact_us, polarity, count,
 ):  # fmt: skip
-    """Events of one pixel from s to s_end after its knot; writes as far as there is room, counts on all the same.
+    """Events of one pixel from s to s_end after its knot; writes as far as there is room, then counts on.
 
     `arrived` is 1 - exp(-s_end / lag_us). Thresholds that are crossed are taken off the `difference` at the knot.
     """
@@ -173,15 +208,16 @@ def _follow(
                 difference, slope, gain, lag_us, on, off, s, turn, curve_turn, rises_first, s_end, curve_end, rises_last
             )
             seeks = False
-        noise_at = max(allowance / rate, s) if rate > 0.0 else np.inf
+        noise_at = max(allowance / rate, s) if rate * s_end >= allowance else np.inf
         at = min(crossing_at, noise_at)
-        if at > s_end:
+        # Far too little room: what is missing is not counted to its end.
+        if at > s_end or count > 2 * len(exact_us):
             return difference, allowance, sent_us, random, count
         is_on = rises
         if noise_at < crossing_at:
             random, choice = _uniform(random)
             random, more = _exponential(random)
-            is_on = choice < on_share
+            is_on = choice * rate < 0.5 * (rate + hot)
             allowance += more
         else:
             difference -= on if rises else -off
@@ -195,7 +231,7 @@ def _follow(
             count += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _seek(
     difference, slope, gain, lag_us, on, off, s, turn, curve_turn, rises_first, s_end, curve_end, rises_last
 ):  # fmt: skip
@@ -211,7 +247,7 @@ def _seek(
     return np.inf, False
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _turn(slope, gain, lag_us, arrived, s_end, curve_end):
     """Where line and exponential pull apart, the difference may turn round once; s_end = it does not.
 
@@ -224,7 +260,7 @@ def _turn(slope, gain, lag_us, arrived, s_end, curve_end):
     return turn, slope * turn - gain * math.expm1(-turn / lag_us), rises_first, rises_last
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _crossing(target, slope, gain, lag_us, low, high, rises):
     """Where slope s + gain (1 - exp(-s / lag_us)), monotonic from low to high, reaches `target`.
 
@@ -260,13 +296,13 @@ def _crossing(target, slope, gain, lag_us, low, high, rises):
     return low + x * lag_us
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _arrived(s, lag_us, gain):
     """1 - exp(-s / lag_us), where there is anything to multiply it by."""
     return -math.expm1(-s / lag_us) if gain != 0.0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _due_us(knot_us, difference, lag, leak, on, off, allowance, rate):
     """Before this time nothing happens to a pixel whose light stays as it is; -inf = nobody knows."""
     highest, lowest = difference + max(-lag, 0.0), difference + min(-lag, 0.0)
@@ -277,15 +313,13 @@ def _due_us(knot_us, difference, lag, leak, on, off, allowance, rate):
     return knot_us + min(leaks_at, noise_at)
 
 
-@numba.njit(cache=True, nogil=True)
-def _noise(light, i, maps, physics):
-    """Noise events a us of pixel i under this light, and the share of ON events among them."""
-    shot_hz = maps.shot_rate_hz[i] * (1.0 - (1.0 - physics.shot_rate_bright) * min(light, 1.0))
-    rate_hz = shot_hz + maps.hot_rate_hz[i]
-    return 1e-6 * rate_hz, (0.5 * shot_hz + maps.hot_rate_hz[i]) / rate_hz if rate_hz > 0.0 else 0.0
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _shot_rate(light, shot, physics):
+    """Shot noise events a us under this light."""
+    return shot * (1.0 - (1.0 - physics.shot_rate_bright) * min(light, 1.0))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _lag_us(light, physics):
     """Time constant of the photoreceptor under this light; 0 = there is no low-pass."""
     if physics.cutoff_dark_hz <= 0.0:
@@ -294,7 +328,7 @@ def _lag_us(light, physics):
     return 1e6 / (2.0 * math.pi * cutoff_hz)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _log_response(light, log_floor):
     """Log above the floor, its tangent below: finite at zero, without a kink."""
     if light > log_floor:
@@ -302,7 +336,7 @@ def _log_response(light, log_floor):
     return math.log(log_floor) + (light - log_floor) / log_floor
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def stamp_positions(exact_us, begin_us, counters):
     """Row of each event of an interval in the order of its time in whole us, events of one us in the order given.
 
@@ -325,7 +359,7 @@ def stamp_positions(exact_us, begin_us, counters):
     return position
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def write_columns(exact_us, pixels, polarity, position, begin_us, begin_t_us, width, t, x, y, p, exact_sorted_us):
     """The columns of `Events` from what `advance` found; `begin_t_us` is `begin_us` on the clock of the frames."""
     for i in range(len(exact_us)):
@@ -337,7 +371,7 @@ def write_columns(exact_us, pixels, polarity, position, begin_us, begin_t_us, wi
         exact_sorted_us[row] = exact_us[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mix(value):
     """The finaliser of splitmix64: every bit of the result depends on every bit of the value."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -345,14 +379,14 @@ def _mix(value):
     return value ^ (value >> np.uint64(31))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _uniform(random):
     """The next state of a generator, and a number in [0, 1)."""
     random = random + np.uint64(0x9E3779B97F4A7C15)
     return random, (_mix(random) >> np.uint64(11)) * (1.0 / (1 << 53))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _exponential(random):
     random, uniform = _uniform(random)
     return random, -math.log1p(-uniform)
