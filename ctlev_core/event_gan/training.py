@@ -36,6 +36,7 @@ from data_contracts.labels import History
 
 # Entropy that keeps random streams apart.
 _SPLIT_STREAM, _WEIGHT_STREAM, _BATCH_STREAM, _CALIBRATION_STREAM = 20, 21, 22, 23
+MAX_VALIDATION = 128
 # What the averaged generator sees before it is judged.
 CALIBRATION_BATCHES, CALIBRATION_BATCH_SIZE = 16, 16
 
@@ -261,8 +262,8 @@ _STATEFUL = ("generator", "discriminator", "averaged", "generator_optimizer", "d
 
 
 def split_rows(count: int, validation_fraction: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows to train on and rows held back, at least one of the latter if the fraction is positive; ascending."""
-    num_validation = min(math.ceil(count * validation_fraction), count - 1)
+    """Rows to train on and rows held back, ascending; of the latter one to 128 if the fraction is positive."""
+    num_validation = min(math.ceil(count * validation_fraction), count - 1, MAX_VALIDATION)
     order = np.random.default_rng([seed, _SPLIT_STREAM]).permutation(count)
     return np.sort(order[num_validation:]), np.sort(order[:num_validation])
 

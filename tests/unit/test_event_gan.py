@@ -234,7 +234,9 @@ def test_without_validation_the_last_average_is_kept_and_all_rows_train(tmp_path
     assert len(gan.data.frames) == 5 and len(gan.validation.frames) == 0
 
 
-@pytest.mark.parametrize(("count", "fraction", "held_back"), [(20, 0.1, 2), (21, 0.1, 3), (1, 0.5, 0), (3, 0.99, 2)])
+@pytest.mark.parametrize(
+    ("count", "fraction", "held_back"), [(20, 0.1, 2), (21, 0.1, 3), (1, 0.5, 0), (3, 0.99, 2), (5000, 0.1, 128)]
+)
 def test_split_is_disjoint_and_complete(count, fraction, held_back):
     train, validation = training.split_rows(count, fraction, seed=7)
     assert sorted([*train, *validation]) == list(range(count)) and len(validation) == held_back
