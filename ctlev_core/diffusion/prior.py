@@ -71,7 +71,8 @@ def load_prior(
 
     Args:
         path: a diffusers pipeline folder; the bundled small prior when None.
-        controlnet: a separate ControlNet folder; otherwise the subfolder `controlnet` where there is one.
+        controlnet: name of a subfolder of the prior, or a separate ControlNet folder; otherwise the subfolder
+            `controlnet` where there is one.
         with_controlnet: False leaves the ControlNet on disk.
         dtype: of all weights in memory.
         device: where the weights go.

@@ -15,7 +15,7 @@ def check_prior_folder(folder: Path, *, controlnet: Path | None = None, needs_co
 
     Args:
         folder: with the subfolders of `COMPONENTS`, and perhaps `controlnet`.
-        controlnet: a separate ControlNet folder.
+        controlnet: as for `find_controlnet`.
         needs_controlnet: raise where there is neither the subfolder nor the separate folder.
     Returns:
         The folder.
@@ -43,14 +43,23 @@ def check_prior_folder(folder: Path, *, controlnet: Path | None = None, needs_co
 
 
 def find_controlnet(folder: Path, controlnet: Path | None) -> Path | None:
-    """The separate ControlNet folder where one is given, else the subfolder of the prior, else None.
+    """The ControlNet that is asked for, else the subfolder `controlnet` of the prior, else None.
 
+    Args:
+        folder: the prior.
+        controlnet: name of a subfolder of the prior, such as `controlnet_normals`, or a folder elsewhere.
     Raises:
-        DataError: the separate folder does not exist.
+        DataError: there is no such folder.
     """
+    if controlnet is not None and len(controlnet.parts) == 1 and (folder / controlnet).is_dir():
+        return folder / controlnet
     if controlnet is not None:
         if not controlnet.is_dir():
-            raise DataError(f"{controlnet}: the ControlNet must be a diffusers folder, but there is no such folder")
+            inside = ", ".join(sorted(path.name for path in folder.glob("controlnet*")))
+            raise DataError(
+                f"{controlnet}: the ControlNet must be a diffusers folder, but there is no such folder; "
+                f"those of the prior: {inside or 'none'}"
+            )
         return controlnet
     inside = folder / "controlnet"
     return inside if inside.is_dir() else None

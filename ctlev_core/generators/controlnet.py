@@ -31,7 +31,8 @@ class Options(FineTuningOptions):
     controlnet: Path | None = Field(
         default=None,
         json_schema_extra=RUN_SETTING,
-        description="separate diffusers folder of the ControlNet; the prior's own subfolder when null",
+        description="subfolder of the prior, such as `controlnet_normals` of the bundled one, or a diffusers folder "
+        "elsewhere; the prior's subfolder `controlnet` when null",
     )
 
 
@@ -45,10 +46,11 @@ def prior_folders(options: Options) -> list[Path]:
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder
+    from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder, find_controlnet
 
     prior = check_prior_folder(options.prior or BUNDLED_PRIOR, controlnet=options.controlnet, needs_controlnet=True)
-    return [prior] if options.controlnet is None else [prior, options.controlnet]
+    chosen = find_controlnet(prior, options.controlnet) if options.controlnet else None
+    return [prior] if chosen is None else [prior, chosen]
 
 
 def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
