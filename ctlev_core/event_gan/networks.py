@@ -37,8 +37,8 @@ def _convolution(
 class RevivableReLU(torch.autograd.Function):
     """ReLU whose gradient also reaches values at or below 0 where it would raise them.
 
-    Most pixels of an event image are 0. With plain ReLU a network with one or two output channels dies within a few
-    steps of the absolute difference: no pixel is above 0 and none gets a gradient any more. The function is the same.
+    Most pixels of an event image are 0. With plain ReLU a network of one or two output channels can die within a few
+    steps of the absolute difference: no pixel is above 0, and none gets a gradient any more. The function is the same.
     """
 
     @staticmethod

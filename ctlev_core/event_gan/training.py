@@ -20,12 +20,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from ctlev_core.event_gan import losses
-from ctlev_core.event_gan.event_images import (
-    NUM_CHANNELS,
-    Palette,
-    frames_to_volumes,
-    pairs_to_tensor,
-)
+from ctlev_core.event_gan.batches import Batch, Pairs, make_batch, split_rows
+from ctlev_core.event_gan.event_images import NUM_CHANNELS, pairs_to_tensor
 from ctlev_core.event_gan.local_statistics import local_statistics_error
 from ctlev_core.event_gan.networks import EventVolumeUNet, build_discriminator, generator_arguments
 from ctlev_core.event_gan.options import SamplingOptions, TrainingOptions
@@ -34,32 +30,10 @@ from ctlev_core.supervised import batch_rows, build_seeded, resolve_device
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
-# Entropy that keeps random streams apart.
-_SPLIT_STREAM, _WEIGHT_STREAM, _BATCH_STREAM, _CALIBRATION_STREAM = 20, 21, 22, 23
-MAX_VALIDATION = 128
+# Entropy that keeps random streams apart, see also `batches`.
+_WEIGHT_STREAM, _CALIBRATION_STREAM = 22, 23
 # What the averaged generator sees before it is judged.
 CALIBRATION_BATCHES, CALIBRATION_BATCH_SIZE = 16, 16
-
-
-@dataclass(frozen=True, eq=False)
-class Pairs:
-    """Intensity pairs and the event images between them.
-
-    Attributes:
-        conditions: [N, H, W, 3] uint8 as in `check_pairs`.
-        frames: [N, H, W, 3] uint8 event images.
-        palette: of the event images.
-        one_event: value of one event, in (0, 1].
-    """
-
-    conditions: np.ndarray
-    frames: np.ndarray
-    palette: Palette
-    one_event: float
-
-    def take(self, rows: np.ndarray) -> Pairs:
-        """The given rows."""
-        return Pairs(self.conditions[rows], self.frames[rows], self.palette, self.one_event)
 
 
 @dataclass
@@ -69,16 +43,6 @@ class Curves:
     history: History = field(default_factory=History)
     discriminator_loss: list[float] = field(default_factory=list)
     best_step: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """Tensors of one update; `seen` is the pair as the generator sees it, its brightness changed."""
-
-    seen: Tensor
-    pairs: Tensor
-    volumes: Tensor
-    random: np.random.Generator
 
 
 class EventGAN:
@@ -114,21 +78,6 @@ class EventGAN:
         self.pending: list[tuple[float, float]] = []
         self.best: dict[str, Tensor] | None = None
 
-    def batch(self, number: int) -> Batch:
-        """Batch `number` of the run: its rows, mirrored at random, and the pair brightened at random."""
-        options = self.options
-        rows = batch_rows(len(self.data.frames), options.batch_size, self.seed, number)
-        random = np.random.default_rng([self.seed, _BATCH_STREAM, number])
-        pairs = pairs_to_tensor(self.data.conditions[rows])
-        volumes = frames_to_volumes(self.data.frames[rows], self.data.palette)
-        for axis in (-1, -2):
-            is_mirrored = torch.from_numpy(random.random(len(rows)) < options.flip)[:, None, None, None]
-            pairs = torch.where(is_mirrored, pairs.flip(axis), pairs)
-            volumes = torch.where(is_mirrored, volumes.flip(axis), volumes)
-        gain, gamma = random.uniform(1 - options.appearance, 1 + options.appearance, (2, len(rows), 1, 1, 1))
-        seen = change_appearance(pairs, torch.from_numpy(gain).float(), torch.from_numpy(gamma).float())
-        return Batch(seen.to(self.device), pairs.to(self.device), volumes.to(self.device), random)
-
     def train_discriminator(self, batch: Batch) -> float:
         """One update of the discriminator; the first half of the pairs it sees generated, the second half real."""
         half = len(batch.volumes) // 2
@@ -157,6 +106,9 @@ class EventGAN:
                 average.lerp_(parameter, 1 - decay)
         return value
 
+    def _batch(self, number: int) -> Batch:
+        return make_batch(self.data, self.options, self.seed, number, self.device)
+
     def _update(self, loss: Tensor, optimizer: torch.optim.Optimizer, name: str) -> float:
         value = loss.item()
         if not math.isfinite(value):
@@ -173,8 +125,8 @@ class EventGAN:
         """The discriminator's updates, then the generator's, each on a batch of its own."""
         rounds = self.options.discriminator_steps + 1
         first = self.step * rounds
-        discriminator_losses = [self.train_discriminator(self.batch(first + part)) for part in range(rounds - 1)]
-        generator_loss = self.train_generator(self.batch(first + rounds - 1))
+        discriminator_losses = [self.train_discriminator(self._batch(first + part)) for part in range(rounds - 1)]
+        generator_loss = self.train_generator(self._batch(first + rounds - 1))
         self.pending.append((generator_loss, float(np.mean(discriminator_losses))))
         self.step += 1
 
@@ -183,7 +135,16 @@ class EventGAN:
 
         Batch statistics and singular vectors belong to weights; those of averaged weights are measured on
         training pairs, the same ones every time.
+
+        Raises:
+            TrainingError: a weight is not finite, which the losses show only a step later.
         """
+        if not all(torch.isfinite(parameter).all() for parameter in self.averaged.parameters()):
+            raise TrainingError(
+                f"Event-GAN: a weight of the generator is not finite after step {self.step} of "
+                f"{self.options.num_steps}; lower generator_learning_rate "
+                f"(now {self.options.generator_learning_rate:g})"
+            )
         self.averaged.load_state_dict({**self.averaged.state_dict(), **dict(self.generator.named_buffers())})
         for layer in self.averaged.modules():
             if isinstance(layer, nn.BatchNorm2d):
@@ -259,18 +220,6 @@ class EventGAN:
 
 
 _STATEFUL = ("generator", "discriminator", "averaged", "generator_optimizer", "discriminator_optimizer")
-
-
-def split_rows(count: int, validation_fraction: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows to train on and rows held back, ascending; of the latter one to 128 if the fraction is positive."""
-    num_validation = min(math.ceil(count * validation_fraction), count - 1, MAX_VALIDATION)
-    order = np.random.default_rng([seed, _SPLIT_STREAM]).permutation(count)
-    return np.sort(order[num_validation:]), np.sort(order[:num_validation])
-
-
-def change_appearance(pairs: Tensor, gain: Tensor, gamma: Tensor) -> Tensor:
-    """Gain x intensity^gamma of pairs in [-1, 1], clipped; the same for both frames of a pair, so that motion stays."""
-    return (2 * gain * ((1 + pairs) / 2) ** gamma - 1).clamp(-1, 1)
 
 
 def train_generator(data: Pairs, options: TrainingOptions, *, seed: int, work: Path, identity: str) -> EventGAN:

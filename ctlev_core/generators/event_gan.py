@@ -63,14 +63,14 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
         TrainingError: a loss is not finite, or `work` holds the state of another run.
     """
     from ctlev_core import supervised
-    from ctlev_core.event_gan import event_images, networks, sampling, training
+    from ctlev_core.event_gan import batches, event_images, networks, sampling, training
 
     pairs = event_images.check_pairs(conditions, "train Event-GAN")
     palette = event_images.check_event_images(frames, pairs, "train Event-GAN")
     height, width = frames.shape[1:3]
     networks.check_image_size(height, width, options)
     one_event = event_images.one_event_value(frames)
-    data = training.Pairs(pairs, frames, palette, one_event)
+    data = batches.Pairs(pairs, frames, palette, one_event)
     material = cache_material(options)
     identity = supervised.digest(sampling.NAME, VERSION, material, seed, frames, pairs)
     gan = training.train_generator(data, options, seed=seed, work=work, identity=identity)

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.event_gan import losses
+from ctlev_core.event_gan.batches import change_appearance
 from ctlev_core.event_gan.event_images import one_event_value, volumes_to_frames
 from ctlev_core.event_gan.local_statistics import local_statistics_error
 from ctlev_core.event_gan.networks import EventVolumeUNet, PatchDiscriminator, RevivableReLU, without_spectral_norm
 from ctlev_core.event_gan.options import SamplingOptions
-from ctlev_core.event_gan.training import change_appearance
 
 PUBLISHED = {
     "base_channels": 32,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ctlev_core import supervised
-from ctlev_core.event_gan import training
+from ctlev_core.event_gan import batches, training
 from ctlev_core.event_gan.event_images import pairs_to_tensor
 from ctlev_core.generators import event_gan
 from data_contracts.errors import DataError, TrainingError
@@ -73,7 +73,7 @@ def images_of(conditions):
 
 def square_pairs(count):
     frames, conditions = moving_squares(count)
-    return training.Pairs(images_of(conditions), frames, "grey", 1.0)
+    return batches.Pairs(images_of(conditions), frames, "grey", 1.0)
 
 
 def weights(folder):
@@ -238,17 +238,16 @@ def test_without_validation_the_last_average_is_kept_and_all_rows_train(tmp_path
     ("count", "fraction", "held_back"), [(20, 0.1, 2), (21, 0.1, 3), (1, 0.5, 0), (3, 0.99, 2), (5000, 0.1, 128)]
 )
 def test_split_is_disjoint_and_complete(count, fraction, held_back):
-    train, validation = training.split_rows(count, fraction, seed=7)
+    train, validation = batches.split_rows(count, fraction, seed=7)
     assert sorted([*train, *validation]) == list(range(count)) and len(validation) == held_back
     if count == 21:
-        assert not np.array_equal(validation, training.split_rows(count, fraction, seed=8)[1])
+        assert not np.array_equal(validation, batches.split_rows(count, fraction, seed=8)[1])
 
 
 def test_augmentation_mirrors_pair_and_events_alike():
-    data = square_pairs(8)
-    fixed = {**TINY, "validation_fraction": 0, "batch_size": 8}
-    straight = training.EventGAN(data, event_gan.Options(**fixed, flip=0, appearance=0), seed=0, identity="").batch(3)
-    mirrored = training.EventGAN(data, event_gan.Options(**fixed, flip=1, appearance=0.2), seed=0, identity="").batch(3)
+    data, cpu = square_pairs(8), torch.device("cpu")
+    straight = batches.make_batch(data, event_gan.Options(batch_size=8, flip=0, appearance=0), 0, 3, cpu)
+    mirrored = batches.make_batch(data, event_gan.Options(batch_size=8, flip=1, appearance=0.2), 0, 3, cpu)
     rows = supervised.batch_rows(8, 8, 0, 3)
     assert torch.equal(straight.pairs, pairs_to_tensor(data.conditions[rows]))
     assert torch.equal(straight.seen, straight.pairs)
@@ -276,6 +275,14 @@ def test_loss_that_is_not_finite_stops_the_training(tmp_path):
     with pytest.raises(TrainingError, match=r"loss is \S+ at step \d+ of 60; lower \w+_learning_rate"):
         run(tmp_path, {"generator_learning_rate": 1e30, "discriminator_learning_rate": 1e30, "num_steps": 60})
     assert not (tmp_path / "model").exists()
+
+
+def test_weights_that_are_not_finite_are_never_kept():
+    gan = training.EventGAN(square_pairs(5), event_gan.Options.model_validate(TINY), seed=0, identity="")
+    with torch.no_grad():
+        next(gan.averaged.parameters())[0] = torch.nan
+    with pytest.raises(TrainingError, match=r"not finite after step 0 of 6; lower generator_learning_rate \(now 0.001"):
+        gan.finish()
 
 
 def test_bad_training_sets_are_named(tmp_path):
