@@ -133,8 +133,8 @@ def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exac
             (knot_us, signal, lag, difference, allowance, sent_us, random, due), end = _advance_pixel(
                 light_before, light, begin_us, end_us,
                 traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_rate[i],
-                traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i], state.allowance[i],
-                state.sent_us[i], state.random[i], exact_us, polarity, count,
+                traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i],
+                state.allowance[i], state.sent_us[i], state.random[i], exact_us, polarity, count,
             )  # fmt: skip
             if end > len(exact_us):
                 return i, count, end
