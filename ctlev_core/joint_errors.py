@@ -66,7 +66,7 @@ def compute_joint_errors_mm(predicted: Mapping[str, Any], target: Labels, alignm
         raise ValueError(
             f"predicted joint {joint} of row {row} is {points[row, joint].tolist()}, not a finite position"
         )
-    known = np.isfinite(joints).all(axis=-1)
+    known = np.asarray(np.isfinite(joints).all(axis=-1))
     if not known.any():
         raise ValueError(f"no joint is known in any of the {len(target)} target rows")
     if alignment == "pelvis":
