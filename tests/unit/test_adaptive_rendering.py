@@ -64,9 +64,10 @@ def test_few_frames_give_the_events_of_many(way, preset):
     for pixel in range(WIDTH * HEIGHT):
         few, many = (e.t[e.y.astype(int) * WIDTH + e.x == pixel] for e in (events, dense))
         if preset == "ideal":
-            # In px, for what creeps takes its time: the chord of an eighth of a pixel misses the curve by far less.
+            # In px, for what creeps takes its time: the chord of an eighth of a pixel may miss the curve
+            # by a quarter of that where the edge enters the pixel, and elsewhere by far less.
             assert len(few) == len(many)
-            assert np.abs(place(1e-6 * few) - place(1e-6 * many)).max(initial=0) < 0.02
+            assert np.abs(place(1e-6 * few) - place(1e-6 * many)).max(initial=0) < 0.125 / 4
     assert abs(len(events) - len(dense)) <= 0.01 * len(dense)
 
 
