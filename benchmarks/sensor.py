@@ -4,9 +4,9 @@
     python benchmarks/sensor.py --part speed --frames 100
 
 `error`: event times of signals whose crossings are known in closed form, against the number of frames: at fixed steps,
-where the sensor asks for frames as the pictures change (`tolerance`) or as things move (`max_displacement_px`), and for
+where the sensor asks for frames as pictures change (`tolerance`) or things move (`max_displacement_px`), and for
 v2e at the same fixed steps. `pauses`: the frames that fixed steps need for the errors of adaptive ones, in a scene that
-rests, creeps and jumps. `speed`: 346 x 260 px, one thread, with threshold mismatch, refractory time, leak and shot noise
+rests, creeps and jumps. `speed`: 346 x 260 px, one thread, with threshold mismatch, refractory time, leak, shot noise
 in both; events of v2e differ in their times, and a little in number. Medians of CPU seconds over interleaved rounds.
 
 The reference is the published algorithm in plain NumPy (Hu et al., v2e: From video frames to realistic DVS events,
@@ -27,7 +27,6 @@ import numpy as np
 
 from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
 from ctlev_core.sensor import PRESETS, PixelMaps, Sensor, SensorOptions, sample_pixel_maps, simulate_events
-from data_contracts.events import Events
 
 IDEAL = PRESETS["ideal"].model_copy(update={"log_floor": 1e-4})
 STEPS_US = (20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
