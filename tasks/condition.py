@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from ctlev_core import plugins
-from ctlev_core.body.virtual_camera import with_joints
+from ctlev_core.body_views import with_joints
 from ctlev_core.labelling import labels_in_image
 from ctlev_core.plugins import Plugin
 from ctlev_core.windows import spread

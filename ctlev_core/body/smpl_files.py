@@ -2,7 +2,7 @@
 
 The pickles were written by Python 2: the regressor of the joints is a sparse matrix of scipy, and some arrays of the
 older files are expressions of the autodiff package chumpy, which no longer installs. Of both only the numbers are
-taken (`dataset_files.safe_pickle`); neither package is imported to read them.
+taken (`safe_files.safe_pickle`); neither package is imported to read them.
 
     v_template     [6890, 3]        m, the mean shape in its rest pose
     f              [13776, 3]       the faces
@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.dataset_files import numpy_files, safe_pickle
-from ctlev_core.dataset_files.plain_unpickler import StandIn
+from ctlev_core.safe_files import numpy_files, safe_pickle
+from ctlev_core.safe_files.plain_unpickler import StandIn
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
 from data_contracts.errors import DataError
 

@@ -74,7 +74,7 @@ def read_pose(path: Path) -> Pose:
     Raises:
         DataError: not these five arrays, or an SMPL parameter is not finite.
     """
-    from ctlev_core.dataset_files.safe_pickle import load_joblib
+    from ctlev_core.safe_files.safe_pickle import load_joblib
 
     values = load_joblib(path)
     if not isinstance(values, (list, tuple)) or len(values) != 5:

@@ -114,9 +114,8 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     Raises:
         DataError: the recording is not one of the studio with these options.
     """
-    from ctlev_core.body.body_labels import labels_in_camera
     from ctlev_core.body.motions import pose_at
-    from ctlev_core.body.virtual_camera import with_joints
+    from ctlev_core.body_views import labels_in_camera, with_joints
 
     performance = _perform(recording, options)
     t_us = _times_us(options.label_rate_hz, options) if recording.has_events else np.zeros(1, dtype=np.int64)

@@ -18,10 +18,10 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from ctlev_core.body.body_labels import labels_in_camera
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motions import SEEN, UNSEEN, pose_at, sample_style
 from ctlev_core.body.rotations import matrix_from_euler
+from ctlev_core.body_views import labels_in_camera
 from ctlev_core.camera import is_inside, project
 from ctlev_core.conditions import normals
 from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object

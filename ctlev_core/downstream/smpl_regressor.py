@@ -80,7 +80,7 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
 
     data = _check_training_set(frames, labels)
     device = supervised.resolve_device(options.device)
-    model = supervised.build_seeded(lambda: _build(options), seed)
+    model: Any = supervised.build_seeded(lambda: _build(options), seed)
     model.start_from(*(torch.from_numpy(array).float() for array in (data.rotations, data.betas, data.transl)))
     model.to(device)
     body = BodyLayer(load_body()).to(device)

@@ -2,7 +2,7 @@
 
     smpl_poses [T, 72], smpl_trans [T, 3], smpl_scaling [1], smpl_loss
 
-The pickles are read by `dataset_files.safe_pickle` without running what they may carry. Positions are those of a body
+The pickles are read by `safe_files.safe_pickle` without running what they may carry. Positions are those of a body
 `smpl_scaling` times as large as SMPL's, about centimetres: trans / scaling are metres of SMPL's body, as the authors'
 own feature extraction has it. y is up. Shape coefficients are not given: the mean body (zeros) dances.
 
@@ -44,7 +44,7 @@ def read(path: Path) -> MotionClip:
         DataError: the file cannot be read, holds code, lacks a key, has other shapes, no frames, or numbers that are
             not finite.
     """
-    from ctlev_core.dataset_files import safe_pickle
+    from ctlev_core.safe_files import safe_pickle
 
     loaded = safe_pickle.load(path)
     if not isinstance(loaded, dict):

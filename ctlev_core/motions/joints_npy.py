@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.body.motion_clip import MotionClip, check_clip
-from ctlev_core.dataset_files import numpy_files
+from ctlev_core.safe_files import numpy_files
 from data_contracts.errors import DataError
 
 VERSION = 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctlev_core.body.layer import BUNDLED_BODY
-from ctlev_core.body.virtual_camera import with_joints
+from ctlev_core.body_views import with_joints
 from ctlev_core.conditions import normals
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError

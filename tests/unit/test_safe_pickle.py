@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from ctlev_core.dataset_files import safe_pickle
+from ctlev_core.safe_files import safe_pickle
 from data_contracts.errors import DataError
 
 ARRAYS = {

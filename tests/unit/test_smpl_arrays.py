@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from ctlev_core import motion_formats
 from ctlev_core.body.motion_clip import REST_PELVIS, MotionClip, take
-from ctlev_core.dataset_files import numpy_files
 from ctlev_core.motions import smpl_arrays
+from ctlev_core.safe_files import numpy_files
 from data_contracts.errors import DataError
 
 NUM_FRAMES = 7

@@ -7,7 +7,7 @@ import pytest
 
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from ctlev_core.body.virtual_camera import with_joints
+from ctlev_core.body_views import with_joints
 from ctlev_core.conditions import normals
 from ctlev_core.downstream import smpl_regressor
 from ctlev_core.skeletons import JOINT_SETS

@@ -21,8 +21,8 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from ctlev_core.dataset_files.bounded_reader import BoundedReader
-from ctlev_core.dataset_files.plain_unpickler import NDARRAY, Marker, PlainUnpickler, array_of, count_bytes, dtype_of
+from ctlev_core.safe_files.bounded_reader import BoundedReader
+from ctlev_core.safe_files.plain_unpickler import NDARRAY, Marker, PlainUnpickler, array_of, count_bytes, dtype_of
 from data_contracts.errors import DataError
 
 MAX_BYTES = 4 * 2**30

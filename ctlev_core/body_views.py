@@ -1,4 +1,4 @@
-"""Bodies given as SMPL parameters, before a camera: the joints that a 2D label of them would have."""
+"""Bodies before a camera as labels: SMPL parameters in its frame, and the joints that a label of them would have."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ctlev_core.body.layer import joint_transforms, load_body, pose_vertices
+from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, pose_vertices
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from ctlev_core.camera import camera_from_intrinsics, is_inside, project
+from ctlev_core.camera import Camera, camera_from_intrinsics, is_inside, project
 from ctlev_core.skeletons import joint_indices
 from ctlev_core.virtual_camera import CameraRange, sample_camera
 from data_contracts.errors import DataError
@@ -22,6 +22,47 @@ OCCLUSION_SIDE_PX = 256
 OCCLUSION_BATCH = 64
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 """Camera frame of a level camera to a world with y up, in which who faces the camera faces +z."""
+
+
+def labels_in_camera(
+    rotations: np.ndarray,
+    transl: np.ndarray,
+    betas: np.ndarray,
+    camera: Camera,
+    *,
+    class_name: str,
+    t_us: np.ndarray,
+    body: BodyModel | None = None,
+) -> Labels:
+    """SMPL labels in the frame of a camera.
+
+    SMPL turns a body about its own pelvis J: x = R (x_rest - J) + J + transl. Seen from a camera at X' = A X + a, this
+    is R' = A R and transl' = A (J + transl) + a - J, where J is that of the shape `betas`.
+
+    Args:
+        rotations: [T, 24, 3, 3] relative to the parent, the root's in the world.
+        transl: [T, 3] m, world.
+        betas: [10] shape.
+        camera: who looks; its distortion is not part of the labels.
+        class_name: of every row.
+        t_us: [T] int64.
+        body: the bundled body when None.
+    Returns:
+        T rows with SMPL parameters in the camera frame and the camera's intrinsics.
+    """
+    body = body or load_body()
+    pelvis = body.joints[0] + body.joint_shapedirs[0] @ np.asarray(betas, dtype=np.float64)
+    seen = rotations.copy()
+    seen[:, 0] = camera.R @ rotations[:, 0]
+    count = len(rotations)
+    return Labels(
+        class_names=(class_name,) * count,
+        t_us=t_us,
+        smpl_pose=axis_angle_from_matrix(seen).reshape(count, 72).astype(np.float32),
+        smpl_betas=np.tile(np.asarray(betas, dtype=np.float32), (count, 1)),
+        smpl_transl=((pelvis + transl) @ camera.R.T + camera.translation - pelvis).astype(np.float32),
+        intrinsics=np.tile(camera.intrinsics.astype(np.float32), (count, 1)),
+    )
 
 
 def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str, occlusion: bool = False) -> Labels:

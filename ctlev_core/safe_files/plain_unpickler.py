@@ -1,4 +1,4 @@
-"""An unpickler that makes plain data and nothing else; `ctlev_core.dataset_files.safe_pickle` reads files with it.
+"""An unpickler that makes plain data and nothing else; `ctlev_core.safe_files.safe_pickle` reads files with it.
 
 A pickle is a program. Here it may build dicts, lists, tuples, sets, numbers, strings, bytes, None, and NumPy arrays
 and scalars of plain types (bool, int, float, complex, bytes, str). The globals a file names are never imported:
@@ -22,7 +22,7 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from ctlev_core.dataset_files.bounded_reader import BoundedReader
+from ctlev_core.safe_files.bounded_reader import BoundedReader
 from data_contracts.errors import DataError
 
 _PLAIN_DTYPE = re.compile(r"[<>=|]?(\?|[biufc]\d{1,2}|[SU]\d{1,9})")
