@@ -23,12 +23,13 @@ def sample(out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling:
     folder = checkpoint.ref.path / "checkpoint"
     frames = plugin.module.sample(folder, conditions_of(conditions), plugin.options, seeds=seeds, work=out.work)
     out.write_array("frames", frames)
+    # Generators that are no diffusion models make an image in one step, without scheduler or guidance.
     options: dict[str, Any] = plugin.options.model_dump()
     same = {
         "split": "train",
         "generator": f"{plugin.name} {plugin.version}",
         "checkpoint_digest": checkpoint.ref.digest,
-        "scheduler": options["scheduler"],
+        "scheduler": options.get("scheduler", ""),
     }
     names = [f"synthetic/{row:06d}" for row in range(count)]
     carried = ("source_id", "subject", "class_name", "prompt", "joint_set", *LABEL_COLUMNS.values())
@@ -39,8 +40,8 @@ def sample(out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling:
             "condition_id": conditions.table["sample_id"],
             **{name: conditions.table[name] for name in carried},
             **{name: pa.array([value] * count, pa.string()) for name, value in same.items()},
-            "num_inference_steps": pa.array([options["num_inference_steps"]] * count, pa.int32()),
-            "guidance_scale": pa.array([float(options["guidance_scale"])] * count, pa.float64()),
+            "num_inference_steps": pa.array([options.get("num_inference_steps", 1)] * count, pa.int32()),
+            "guidance_scale": pa.array([float(options.get("guidance_scale", 1.0))] * count, pa.float64()),
             "seed": pa.array(seeds, pa.int64()),
         }
     )
