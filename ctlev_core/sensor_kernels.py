@@ -125,10 +125,13 @@ def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exac
     responses = np.empty(BLOCK)
     for first in range(pixel - pixel % BLOCK, len(after), BLOCK):
         last = min(first + BLOCK, len(after))
-        is_busy = False
+        # Sums and minima, because the processor takes those of several pixels at once.
+        change, soonest_us = 0.0, np.inf
         for i in range(first, last):
-            is_busy |= (before[i] != after[i]) | (end_us >= due_us[i])
-        if not is_busy:
+            change += abs(np.float64(after[i]) - np.float64(before[i]))
+        for i in range(first, last):
+            soonest_us = min(soonest_us, due_us[i])
+        if change == 0.0 and end_us < soonest_us:
             continue
         for i in range(first, last):
             responses[i - first] = _log_response(np.float64(after[i]), physics.log_floor)
@@ -176,10 +179,15 @@ def _advance_pixel(
         ramp = (signal - signal_before) / s_end
         knot_us, s, slope, gain = begin_us, 0.0, ramp + leak, -(lag + ramp * lag_us)
     arrived = _arrived(s_end, lag_us, gain)
-    difference, allowance, sent_us, random, end = _follow(
-        knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot,
-        physics.refractory_us, sent_us, random, exact_us, polarity, count,
-    )  # fmt: skip
+    end = count
+    highest = difference + max(slope * s_end, 0.0) + max(gain, 0.0)
+    lowest = difference + min(slope * s_end, 0.0) + min(gain, 0.0)
+    may_cross = highest >= on or lowest <= -off
+    if may_cross or rate * s_end >= allowance:
+        difference, allowance, sent_us, random, end = _follow(
+            knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, may_cross,
+            physics.refractory_us, sent_us, random, exact_us, polarity, count,
+        )  # fmt: skip
     # When it is due is worked out once it stands still.
     due_us = -np.inf
     if is_still:
@@ -194,16 +202,15 @@ def _advance_pixel(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _follow(
-    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, refractory_us,
+    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, seeks, refractory_us,
     sent_us, random, exact_us, polarity, count,
 ):  # fmt: skip
     """Events of one pixel from s to s_end after its knot; writes as far as there is room, then counts on.
 
-    `arrived` is 1 - exp(-s_end / lag_us). Thresholds that are crossed are taken off the `difference` at the knot.
+    `arrived` is 1 - exp(-s_end / lag_us); `seeks` says whether a threshold is within reach. Thresholds that are crossed
+    are taken off the `difference` at the knot.
     """
     curve_end = slope * s_end + gain * arrived
-    reach = abs(slope) * s_end + abs(gain)
-    seeks = reach > 0.0 and (difference + reach >= on or difference - reach <= -off)
     turn, curve_turn, rises_first, rises_last = s_end, curve_end, slope > 0.0, slope > 0.0
     if seeks and gain != 0.0:
         turn, curve_turn, rises_first, rises_last = _turn(slope, gain, lag_us, arrived, s_end, curve_end)
@@ -341,10 +348,10 @@ def _log_response(light, log_floor):
     The logarithm is worked out here, to an ulp or two, because the library's does one number at a time, and a loop
     over this one takes several: log(2^k m) = k log(2) + 2 artanh((m - 1) / (m + 1)) with m in [0.71, 1.41].
     """
-    above = max(light, log_floor)
-    bits = above.view(np.int64)
+    above = np.float64(max(light, log_floor))
+    bits = np.int64(above.view(np.int64))
     exponent = (bits - HALF_ROOT_BITS) >> 52
-    mantissa = (bits - (exponent << 52)).view(np.float64)
+    mantissa = np.int64(bits - (exponent << 52)).view(np.float64)
     z = (mantissa - 1.0) / (mantissa + 1.0)
     w = z * z
     series = 1 / 19 + w * (1 / 21 + w * (1 / 23))
