@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ctlev_core import sensor_columns
 from ctlev_core import sensor_kernels as kernels
 from ctlev_core.sensor_options import PRESETS, PixelMaps, SensorOptions, read_preset, sample_pixel_maps
 from data_contracts.errors import DataError
@@ -160,12 +161,12 @@ class Sensor:
         exact_us, pixels, polarity = (column[:count] for column in self._rows)
         span_us = time_us - self._last_t_us
         if span_us <= 4 * count + 4096:
-            position = kernels.stamp_positions(exact_us, begin_us, np.empty(span_us + 2, np.int64))
+            position = sensor_columns.stamp_positions(exact_us, begin_us, np.empty(span_us + 2, np.int64))
         else:
             position = np.empty(count, np.int64)
             position[np.argsort(np.floor(exact_us - begin_us + 0.5), kind="stable")] = np.arange(count)
         columns = _empty_columns(count)
-        kernels.write_columns(
+        sensor_columns.write_columns(
             exact_us, pixels, polarity, position, begin_us, self._last_t_us, self.sensor_size[0], *columns
         )
         self._frame, self._last_t_us = frame.copy(), time_us
@@ -248,7 +249,7 @@ def _check_frames(intensity: np.ndarray, t_us: np.ndarray, sensor_size: SensorSi
         raise DataError(f"sensor: frame times must increase, got t = {t_us[0]} us after the frame of {last_us} us")
     dtype = np.float32 if intensity.dtype == np.float32 else np.float64
     intensity = np.ascontiguousarray(intensity, dtype)
-    bad = kernels.first_bad(intensity.reshape(-1))
+    bad = sensor_columns.first_bad(intensity.reshape(-1))
     if bad < intensity.size:
         frame, y, x = (int(index) for index in np.unravel_index(bad, shape))
         raise DataError(

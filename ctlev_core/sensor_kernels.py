@@ -73,20 +73,6 @@ class Physics(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def first_bad(intensity):
-    """Index of the first value of [P] that is not finite or negative; P = there is none."""
-    # Without a way out of the loop the processor takes several values at once.
-    num_good = 0
-    for i in range(len(intensity)):
-        num_good += (intensity[i] >= 0.0) & (intensity[i] < np.inf)
-    if num_good < len(intensity):
-        for i in range(len(intensity)):
-            if not (intensity[i] >= 0.0 and intensity[i] < np.inf):
-                return i
-    return len(intensity)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def start(intensity, traits, physics, starts_settled, seed, state):
     """The state of all pixels at the first frame, [P] intensity."""
     for i in range(len(intensity)):
@@ -359,41 +345,6 @@ def _log_response(light, log_floor):
     series = 1 / 7 + w * (1 / 9 + w * (1 / 11 + w * series))
     series = w * (1 / 3 + w * (1 / 5 + w * series))
     return exponent * math.log(2.0) + (2.0 * z + 2.0 * z * series) + min(light - log_floor, 0.0) / log_floor
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def stamp_positions(exact_us, begin_us, counters):
-    """Row of each event of an interval in the order of its time in whole us, events of one us in the order given.
-
-    Args:
-        exact_us: [N], from begin_us to at most begin_us + C - 2.
-        begin_us: where the interval begins; a whole number of us.
-        counters: [C] int64, overwritten.
-    """
-    counters[:] = 0
-    position = np.empty(len(exact_us), np.int64)
-    for i in range(len(exact_us)):
-        position[i] = np.int64(exact_us[i] - begin_us + 0.5)
-        counters[position[i] + 1] += 1
-    for value in range(1, len(counters)):
-        counters[value] += counters[value - 1]
-    for i in range(len(exact_us)):
-        value = position[i]
-        position[i] = counters[value]
-        counters[value] += 1
-    return position
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def write_columns(exact_us, pixels, polarity, position, begin_us, begin_t_us, width, t, x, y, p, exact_sorted_us):
-    """The columns of `Events` from what `advance` found; `begin_t_us` is `begin_us` on the clock of the frames."""
-    for i in range(len(exact_us)):
-        row = position[i]
-        t[row] = begin_t_us + np.int64(exact_us[i] - begin_us + 0.5)
-        y[row] = pixels[i] // width
-        x[row] = pixels[i] - (pixels[i] // width) * width
-        p[row] = polarity[i]
-        exact_sorted_us[row] = exact_us[i]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
