@@ -82,7 +82,7 @@ def ramps() -> Signal:
 
 def sinusoids() -> Signal:
     """Log intensity swings by 1.1 at 1 to 8 Hz, from its middle."""
-    frequencies, swing = np.linspace(1.0, 8.0, PIXELS), 1.1
+    frequencies, swing = np.linspace(1.05, 7.95, PIXELS), 1.1
 
     def crossings(k: int) -> list[float]:
         omega, theta, found = 2 * math.pi * frequencies[k], IDEAL.threshold, []
