@@ -84,9 +84,13 @@ def _hips(joint_set: str) -> list[int]:
     return [names.index("left_hip"), names.index("right_hip")]
 
 
+def row_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sum and number [N] of the entries of [N, J] that are not NaN: what means over any rows are made of."""
+    known = ~np.isnan(values)
+    return np.where(known, values, 0.0).sum(axis=-1), known.sum(axis=-1)
+
+
 def row_means(values: np.ndarray) -> np.ndarray:
     """Mean over the last axis of [N, J] without the NaN entries; NaN for a row of nothing else."""
-    known = ~np.isnan(values)
-    count = known.sum(axis=-1)
-    total = np.where(known, values, 0.0).sum(axis=-1)
+    total, count = row_sums(values)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -240,6 +240,14 @@ class MetricOfRows(Metric, Protocol):
         ...
 
 
+class MetricOfSums(Metric, Protocol):
+    """A metric whose scores are quotients of sums over rows, so that resampling rows need not compare them again."""
+
+    def compute_sums(self, predicted: Any, target: Any, options: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """For each score of `compute`, by name, numerators [N] and denominators [N] of the rows."""
+        ...
+
+
 @dataclass(frozen=True)
 class Plugin:
     """A loaded plug-in together with its validated options."""

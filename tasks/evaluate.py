@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 
-@stage(version=3, schema=tables.SCORES)
+@stage(version=4, schema=tables.SCORES)
 def score_model(
     out: Output,
     model: Manifest,
@@ -90,18 +90,37 @@ def _score(
 ) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
     """The scores of some rows, and the ends of their intervals."""
 
-    def compute(chosen: np.ndarray) -> dict[str, float]:
-        picked = {
+    def pick(chosen: np.ndarray) -> dict[str, Any]:
+        return {
             name: values if name == "classes" else np.asarray(values)[members[chosen]]
             for name, values in prediction.items()
         }
-        return metric.module.compute(picked, labels.take(chosen), metric.options)
 
-    scores = compute(np.arange(len(members)))
+    def compute(chosen: np.ndarray) -> dict[str, float]:
+        return metric.module.compute(pick(chosen), labels.take(chosen), metric.options)
+
+    every = np.arange(len(members))
+    scores = compute(every)
     if len(set(recordings.tolist())) < MIN_RECORDINGS:
         return scores, {}, {}
-    low, high = cluster_bootstrap(compute, recordings)
+    resampled = compute
+    if hasattr(metric.module, "compute_sums"):
+        resampled = _quotients(metric.module.compute_sums(pick(every), labels, metric.options))
+    low, high = cluster_bootstrap(resampled, recordings)
     return scores, low, high
+
+
+def _quotients(
+    sums: dict[str, tuple[np.ndarray, np.ndarray]],
+) -> Callable[[np.ndarray], dict[str, float]]:
+    """The scores of any rows from the sums of each."""
+
+    def compute(chosen: np.ndarray) -> dict[str, float]:
+        if not all(count[chosen].any() for _, count in sums.values()):
+            raise ValueError("nothing to score in these rows")
+        return {name: float(total[chosen].sum() / count[chosen].sum()) for name, (total, count) in sums.items()}
+
+    return compute
 
 
 def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manifest], split: str) -> None:

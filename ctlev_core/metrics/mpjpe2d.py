@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.joint_errors import compute_joint_errors_px, row_means
+from ctlev_core.joint_errors import compute_joint_errors_px, row_means, row_sums
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
@@ -34,6 +34,13 @@ def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> d
         ValueError: shapes differ, or no joint is visible.
     """
     return {"mpjpe2d_px": float(np.nanmean(compute_joint_errors_px(predicted, target)))}
+
+
+def compute_sums(
+    predicted: Mapping[str, Any], target: Labels, options: Options
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Of each row the sum [N] px and number [N] of its errors; `compute` is their quotient over all rows."""
+    return {"mpjpe2d_px": row_sums(compute_joint_errors_px(predicted, target))}
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:

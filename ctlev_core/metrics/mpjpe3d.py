@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.joint_errors import Alignment, compute_joint_errors_mm, row_means
+from ctlev_core.joint_errors import Alignment, compute_joint_errors_mm, row_means, row_sums
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
@@ -40,8 +40,16 @@ def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> d
     Raises:
         ValueError: see `compute_joint_errors_mm`.
     """
+    sums = compute_sums(predicted, target, options)
+    return {name: float(total.sum() / count.sum()) if count.any() else np.nan for name, (total, count) in sums.items()}
+
+
+def compute_sums(
+    predicted: Mapping[str, Any], target: Labels, options: Options
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Of each row the sum [N] mm and number [N] of its errors; `compute` is their quotient over all rows."""
     order = sorted(NAMES, key=lambda alignment: alignment != options.alignment)
-    return {NAMES[a]: float(np.nanmean(compute_joint_errors_mm(predicted, target, a))) for a in order}
+    return {NAMES[a]: row_sums(compute_joint_errors_mm(predicted, target, a)) for a in order}
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:

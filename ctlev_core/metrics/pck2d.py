@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.joint_errors import compute_joint_errors_px, row_means
+from ctlev_core.joint_errors import compute_joint_errors_px, row_means, row_sums
 from ctlev_core.skeletons import JOINT_SETS
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
@@ -46,6 +46,13 @@ def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> d
     if np.isnan(correct).all():
         raise ValueError(f"no row with a visible joint has a {options.normaliser} length to measure the threshold with")
     return {f"pck_{options.normaliser}{options.threshold:g}": float(np.nanmean(correct))}
+
+
+def compute_sums(
+    predicted: Mapping[str, Any], target: Labels, options: Options
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Of each row the number [N] of correct joints and of scored ones; `compute` is their quotient over all rows."""
+    return {f"pck_{options.normaliser}{options.threshold:g}": row_sums(_correct(predicted, target, options))}
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:

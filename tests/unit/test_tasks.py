@@ -8,8 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctlev_core.metrics import mpjpe2d, mpjpe3d, pck2d
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
+from data_contracts.labels import Labels
 from tasks.condition import _choose, balanced_choice
+from tasks.evaluate import _quotients
 
 
 @given(st.lists(st.sampled_from("abc"), min_size=1, max_size=30), st.integers(1, 60), st.integers(0, 1000))
@@ -35,6 +38,28 @@ def test_balanced_choice_of_more_rows_starts_with_the_same_rows():
 def test_in_time_moments_keep_their_order_and_are_evenly_spread(count, expected):
     moments = pa.table({"class_name": list("abacbc"), "t_us": [0, 10, 20, 0, 10, 20]})
     assert _choose(moments, count, "in_time", seed=0).equals(moments.take(expected))
+
+
+@pytest.mark.parametrize("module", [mpjpe2d, pck2d, mpjpe3d], ids=lambda module: module.__name__.rpartition(".")[2])
+def test_scores_of_resampled_rows_are_those_of_their_sums(module):
+    """The bootstrap adds up sums; comparing the resampled rows themselves is the slow way to the same numbers."""
+    random = np.random.default_rng(0)
+    joints2d, joints3d = random.uniform(5, 60, (30, 13, 2)), random.normal([0, 0, 3000], 300, (30, 13, 3))
+    visible = random.random((30, 13)) < 0.7
+    joints3d[~visible] = np.nan
+    labels = Labels(
+        ("",) * 30, np.arange(30), joints2d.astype(np.float32), visible, "dhp19", joints3d.astype(np.float32)
+    )
+    predicted = {
+        "joints2d": joints2d + random.normal(0, 3, joints2d.shape),
+        "joints3d": np.nan_to_num(joints3d) + random.normal(0, 40, joints3d.shape),
+    }
+    options = module.Options()
+    resampled = _quotients(module.compute_sums(predicted, labels, options))
+    for rows in (np.arange(30), random.integers(0, 30, 30), np.array([3, 3, 4])):
+        picked = {name: values[rows] for name, values in predicted.items()}
+        expected = module.compute(picked, labels.take(rows), options)
+        assert resampled(rows) == pytest.approx(expected, rel=1e-12)
 
 
 def row(setting, value, metric="mpjpe2d_px"):
