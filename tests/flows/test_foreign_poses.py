@@ -4,8 +4,11 @@ import pickle
 
 import numpy as np
 import pytest
+import scipy.sparse
 from flow_scripts import run_script
 
+from ctlev_core.body.layer import BUNDLED_BODY
+from ctlev_core.skeletons import SMPL_PARENTS
 from data_contracts.manifest import ManifestRef, read_manifest
 
 STUDIO = "{num_train_recordings: 4, num_test_recordings: 2, num_condition_recordings: 0}"
@@ -41,19 +44,39 @@ def aist(root):
     (root / "ignore_list.txt").write_text("")
 
 
+def smpl(path):
+    """The bundled body as SMPL's own file: a pickle, the joint regressor sparse, correctives and the tree's root."""
+    with np.load(BUNDLED_BODY) as arrays:
+        tree = dict(arrays)
+    tree["J_regressor"] = scipy.sparse.csc_matrix(tree["J_regressor"])
+    tree["posedirs"] = np.zeros((len(tree["v_template"]), 3, 207), np.float32)
+    tree["kintree_table"] = np.array([[4294967295, *SMPL_PARENTS[1:]], range(24)], np.uint32)
+    path.write_bytes(pickle.dumps(tree, protocol=2))
+    return path
+
+
 @pytest.mark.parametrize(
     ("preset", "write", "condition"),
-    [("amass", amass, "skeleton"), ("amass", amass, "normals"), ("aist", aist, "skeleton"), ("aist", aist, "normals")],
+    [
+        ("amass", amass, "skeleton"),
+        ("amass", amass, "normals"),
+        ("aist", aist, "skeleton"),
+        ("aist", aist, "normals of an SMPL file"),
+    ],
 )
 def test_prepare_dataset(preset, write, condition, tmp_path):
     root, home = tmp_path / "poses", tmp_path / "home"
     write(root)
+    condition, _, smpl_file = condition.partition(" of an ")
     settings = (
         f"poses.options.root={root}",
         f"dataset.options={STUDIO}",
         "num_synthetic=6",
         f"condition.name={condition}",
     )
+    if smpl_file:
+        body = smpl(tmp_path / "basicModel_neutral_lbs_10_207_0_v1.0.0.pkl")
+        settings = (*settings, f"condition.options={{body: {body}}}")
     options = [word for setting in settings for word in ("--set", setting)]
     finished = run_script("prepare_dataset", "--preset", preset, *options, home=home)
     assert finished.status == 0, finished.errors
