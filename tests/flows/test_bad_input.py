@@ -25,7 +25,7 @@ def refused(home, *arguments, preset="folder"):
     [
         (
             ("--preset", "nonesuch"),
-            "unknown preset 'nonesuch'; known: aist, amass, cdehp, demo, dhp19, event_hpe, folder, ",
+            "unknown preset 'nonesuch'; known: aist, amass, body, cdehp, demo, dhp19, event_hpe, folder, ",
         ),
         (("--set", "nonesuch=1"), "unknown option 'nonesuch'; known: name,"),
         (("--set", "windows.num_events=0"), "option 'windows.num_events': input should be greater than 0, got 0"),

@@ -116,12 +116,15 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
     ("override", "changed"),
     [
         ("downstream.options.num_steps=21", {"train_downstream: pose2d", "score_model", "report"}),
-        ("num_synthetic=9", {"condition_samples", "sample", "synthetic", "labels of synthetic", "report"}),
+        (
+            "num_synthetic=9",
+            {"condition_samples", "sample", "synthetic", "labels of synthetic", "report", "contact_sheet"},
+        ),
         (
             "encoding.options.normalisation=max",
             {"encode", "condition", "finetune", "sample", "train", "score", "report"},
         ),
-        ("name=renamed", {"report"}),
+        ("name=renamed", {"report", "contact_sheet"}),
     ],
 )
 def test_changing_an_option_reruns_exactly_what_depends_on_it(smoke_home, override, changed):

@@ -2,16 +2,17 @@
 
 import itertools
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from conftest import REAL_DATA
 from mpmath import mp, mpf
 
 from ctlev_core.sensor import PRESETS, Sensor, SensorOptions, sample_pixel_maps, simulate_events
 
 mp.dps = 40
+REAL_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "real"
 
 
 def precise_response(light, floor):

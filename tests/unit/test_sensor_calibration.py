@@ -1,8 +1,9 @@
 """Sensors of known options are recovered from the events they send."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from conftest import REAL_DATA
 
 from ctlev_core.realism.summary import summarise_events
 from ctlev_core.sensor import PRESETS, SensorOptions, read_preset, sample_pixel_maps, simulate_events
@@ -10,6 +11,7 @@ from ctlev_core.sensor_calibration import calibrate, main
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
+REAL_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "real"
 WIDTH, HEIGHT, SECONDS = 96, 72, 6
 
 
