@@ -20,6 +20,7 @@ from data_contracts.config import (
 
 Setting = Literal["real", "synthetic", "real+synthetic"]
 PoseOrder = Literal["random", "in_time"]
+PoseViews = Literal["labelled", "new"]
 
 
 class Experiment(Frozen):
@@ -38,6 +39,9 @@ class Experiment(Frozen):
     )
     pose_order: PoseOrder = Field(
         "random", description="of the labels to sample from: classes in turn and at random, or as they follow in time"
+    )
+    pose_views: PoseViews = Field(
+        "labelled", description="bodies to sample from as their own camera sees them, or from new, random sides"
     )
     windows: Windows = Windows()
     encoding: EncodingChoice

@@ -50,6 +50,7 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         encoding=experiment.encoding,
         count=experiment.num_synthetic,
         order=experiment.pose_order,
+        views=experiment.pose_views,
         seed=experiment.seed,
         label=f"{experiment.condition.name}, to sample",
     )

@@ -14,17 +14,20 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from ctlev_core import plugins
-from ctlev_core.body_views import with_joints
+from ctlev_core.body_views import from_new_side, with_joints
 from ctlev_core.labelling import labels_in_image
 from ctlev_core.plugins import Plugin
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import ConditionChoice, EncodingChoice
 from data_contracts.errors import DataError
-from data_contracts.experiment import PoseOrder
+from data_contracts.events import SensorSize
+from data_contracts.experiment import PoseOrder, PoseViews
 from data_contracts.labels import Labels
-from data_contracts.manifest import Manifest, label_columns, labels_of
+from data_contracts.manifest import Manifest, concat_labels, label_columns, labels_of
 from tasks.stage import Output, stage
+
+VIEW_STREAM = 30
 
 
 def _input_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
@@ -45,7 +48,7 @@ def condition_frames(
     return _render(out, names, names, subjects, frames.labels.take(rows), plugin, _image_size(frames), seed)
 
 
-@stage(version=3, schema=tables.CONDITIONS, raw_files=_input_files)
+@stage(version=4, schema=tables.CONDITIONS, raw_files=_input_files)
 def condition_samples(
     out: Output,
     poses: Manifest,
@@ -56,6 +59,7 @@ def condition_samples(
     encoding: EncodingChoice,
     count: int,
     order: PoseOrder,
+    views: PoseViews,
     seed: int,
 ) -> pa.Table:
     """Choose `count` labels to sample from and render them.
@@ -64,14 +68,17 @@ def condition_samples(
     such, and otherwise from the training frames. In random order classes take turns; within a class the order is
     random, and starts over when it is used up. In order of time the recordings follow one another, `count` moments
     evenly spread over them. `poses` are the recordings of the experiment or those of another dataset; bodies without 2D
-    joints are seen by a virtual camera.
+    joints are seen by a virtual camera. New views turn each body, or in order of time each recording, to a camera of
+    its own.
     """
     moments = _label_only(poses)
     if moments.num_rows:
         chosen = _choose(moments, count, order, seed)
-        labels = _seen(labels_of(chosen), recordings, frames, encoding)
-        times = chosen["t_us"].to_pylist()
-        source_ids = [f"{name}:{t}" for name, t in zip(chosen["recording_id"].to_pylist(), times, strict=True)]
+        names, times = chosen["recording_id"].to_pylist(), chosen["t_us"].to_pylist()
+        together = np.arange(count) if order == "random" else np.unique(names, return_inverse=True)[1]
+        turned = None if views == "labelled" else together
+        labels = _seen(labels_of(chosen), recordings, frames, encoding, turned, seed)
+        source_ids = [f"{name}:{t}" for name, t in zip(names, times, strict=True)]
     elif poses.ref.key != recordings.ref.key:
         raise DataError(f"{poses.ref.path}: the dataset of poses has no recording in split 'condition'")
     else:
@@ -111,20 +118,41 @@ def _label_only(poses: Manifest) -> pa.Table:
     return table.filter(pc.is_in(table["recording_id"], pa.array(wanted, pa.string())))
 
 
-def _seen(labels: Labels, recordings: Manifest, frames: Manifest, encoding: EncodingChoice) -> Labels:
+def _seen(
+    labels: Labels,
+    recordings: Manifest,
+    frames: Manifest,
+    encoding: EncodingChoice,
+    turned: np.ndarray | None,
+    seed: int,
+) -> Labels:
     """Label-only rows as labels in image pixels.
 
     A label-only recording has no sensor of its own: its labels are in the frame of the dataset's sensor, or a virtual
-    camera with that sensor looks at its bodies.
+    camera with that sensor looks at its bodies; at those of one number in `turned` [N] from one new side.
     """
     with_events = recordings.table.to_pylist()
     size = next((r["sensor_width_px"], r["sensor_height_px"]) for r in with_events if r["sensor_width_px"])
+    if turned is not None:
+        labels = _from_new_sides(labels, turned, size, seed)
     if labels.joints2d is None and labels.smpl_pose is not None:
         labels = with_joints(labels, size, frames.labels.joint_set or "smpl")
     plugin = plugins.load_options(encoding)
     return labels_in_image(
         labels, lambda points: plugin.module.map_points(points, size, plugin.options), _image_size(frames)
     )
+
+
+def _from_new_sides(labels: Labels, turned: np.ndarray, sensor_size: SensorSize, seed: int) -> Labels:
+    """Bodies before new cameras, one for each number in `turned` [N]; row order stays."""
+    if labels.smpl_pose is None:
+        raise DataError("pose_views 'new' needs bodies (SMPL parameters) to turn; these labels have joints or classes")
+    groups = [np.flatnonzero(turned == number) for number in np.unique(turned)]
+    seen = [
+        from_new_side(labels.take(rows), np.random.default_rng([seed, VIEW_STREAM, number]), sensor_size)
+        for number, rows in enumerate(groups)
+    ]
+    return concat_labels(seen).take(np.argsort(np.concatenate(groups), kind="stable"))
 
 
 def _load_condition(condition: ConditionChoice, recordings: Manifest) -> Plugin:

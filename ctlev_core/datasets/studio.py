@@ -64,6 +64,9 @@ class Options(Frozen):
     joint_set: Literal["dhp19", "smpl"] = Field(
         default="dhp19", description="13 markers as DHP19 labels them, or the 24 joints of SMPL as Event-HPE does"
     )
+    occlusion: bool = Field(
+        default=False, description="joints that the body itself hides are not visible; markers' labels do not say"
+    )
     yaw_range_deg: tuple[float, float] = Field(
         default=(0.0, 360.0), description="from where the camera looks at people who face +z; 0 = from the front"
     )
@@ -123,7 +126,8 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     labels = labels_in_camera(
         rotations, transl, performance.betas, performance.camera, class_name=recording.class_name, t_us=t_us
     )
-    return check_labels(with_joints(labels, options.sensor_size, options.joint_set), recording.recording_id)
+    seen = with_joints(labels, options.sensor_size, options.joint_set, options.occlusion)
+    return check_labels(seen, recording.recording_id)
 
 
 def read_events(recording: Recording, options: Options) -> Events:

@@ -127,7 +127,7 @@ def test_only_the_zero_shot_classes_are_sampled_and_none_of_them_is_learnt(root,
     frames = run_stage(encode, recordings=recordings, encoding=encoding, windows=Windows(method="whole"))
     text = ConditionChoice(name="text")
     learnt = run_stage(condition_frames, recordings=recordings, frames=frames, condition=text, seed=0)
-    asked = {"encoding": encoding, "count": 6, "order": "random", "seed": 0}
+    asked = {"encoding": encoding, "count": 6, "order": "random", "views": "labelled", "seed": 0}
     both = {"poses": recordings, "recordings": recordings, "frames": frames}
     sampled = run_stage(condition_samples, **both, condition=text, **asked)
     names = [set(read_manifest(manifest).column("prompt")) for manifest in (learnt, sampled)]

@@ -170,3 +170,12 @@ def test_importing_the_plugin_is_cheap():
     code += "print([name for name in ('torch', 'numba', 'cv2', 'scipy') if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_joints_that_the_body_hides_can_be_left_out():
+    hidden = OPTIONS.model_copy(update={"occlusion": True})
+    visible, in_sight = (
+        np.concatenate([studio.read_labels(recording, options).visible for recording in of_split("condition")])
+        for options in (OPTIONS, hidden)
+    )
+    assert not (in_sight & ~visible).any() and 0.4 < in_sight.sum() / visible.sum() < 0.95

@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctlev_core.body_views import with_joints
 from ctlev_core.metrics import mpjpe2d, mpjpe3d, pck2d
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
+from data_contracts.errors import DataError
 from data_contracts.labels import Labels
-from tasks.condition import _choose, balanced_choice
+from tasks.condition import _choose, _from_new_sides, balanced_choice
 from tasks.evaluate import _quotients
 
 
@@ -60,6 +62,35 @@ def test_scores_of_resampled_rows_are_those_of_their_sums(module):
         picked = {name: values[rows] for name, values in predicted.items()}
         expected = module.compute(picked, labels.take(rows), options)
         assert resampled(rows) == pytest.approx(expected, rel=1e-12)
+
+
+def bodies(count=4):
+    pose = np.zeros((count, 72), np.float32)
+    pose[:, 0] = np.pi
+    transl = np.tile(np.array([0, 0.2, 3], np.float32), (count, 1))
+    return Labels(
+        ("walk",) * count,
+        np.arange(count),
+        smpl_pose=pose,
+        smpl_betas=np.zeros((count, 10), np.float32),
+        smpl_transl=transl,
+        intrinsics=np.tile(np.array([90, 90, 32, 32], np.float32), (count, 1)),
+    )
+
+
+def test_new_views_are_one_for_each_number_whatever_the_order_of_rows():
+    seen = _from_new_sides(bodies(), np.array([1, 0, 1, 0]), (64, 64), seed=3)
+    roots = seen.smpl_pose[:, :3]
+    np.testing.assert_array_equal(roots[[0, 1]], roots[[2, 3]])
+    assert np.abs(roots[0] - roots[1]).max() > 0.05 and seen.t_us.tolist() == [0, 1, 2, 3]
+    more = _from_new_sides(bodies(6), np.arange(6), (64, 64), seed=3)
+    np.testing.assert_array_equal(more.smpl_pose[:4], _from_new_sides(bodies(), np.arange(4), (64, 64), 3).smpl_pose)
+    assert with_joints(more, (64, 64), "dhp19").visible.mean() > 0.9
+
+
+def test_new_views_of_labels_without_bodies_are_refused():
+    with pytest.raises(DataError, match="needs bodies"):
+        _from_new_sides(Labels(("a",), np.zeros(1, np.int64)), np.zeros(1, int), (64, 64), 0)
 
 
 def row(setting, value, metric="mpjpe2d_px"):
