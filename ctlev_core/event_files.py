@@ -29,16 +29,8 @@ def find_format(path: Path) -> ModuleType:
     if not path.is_file():
         raise DataError(f"{path}: expected an event file, got {'a folder' if path.is_dir() else 'nothing there'}")
     formats = {name: plugins.load("formats", name) for name in plugins.names("formats")}
-    for has_signature in (True, False):
-        asked = [name for name in formats if getattr(formats[name], "HAS_SIGNATURE", True) == has_signature]
-        try:
-            claims = [name for name in asked if formats[name].sniff(path)]
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read: {error}") from error
-        if len(claims) > 1:
-            raise DataError(f"{path}: could be any of the formats {', '.join(claims)}; expected exactly one to fit")
-        if claims:
-            return formats[claims[0]]
+    if (module := plugins.recognise(formats, path)) is not None:
+        return module
     known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in formats.items())
     raise DataError(
         f"{path}: not an event file of a known format ({path.stat().st_size} bytes); known formats: {known}"

@@ -26,18 +26,7 @@ def find_format(path: Path) -> ModuleType | None:
     """
     if not path.is_file():
         raise DataError(f"{path}: expected a motion file, got {'a folder' if path.is_dir() else 'nothing there'}")
-    formats = list_formats()
-    for has_signature in (True, False):
-        asked = [name for name in formats if getattr(formats[name], "HAS_SIGNATURE", True) == has_signature]
-        try:
-            claims = [name for name in asked if formats[name].sniff(path)]
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read: {error}") from error
-        if len(claims) > 1:
-            raise DataError(f"{path}: could be any of the formats {', '.join(claims)}; expected exactly one to fit")
-        if claims:
-            return formats[claims[0]]
-    return None
+    return plugins.recognise(list_formats(), path)
 
 
 def read_motion(path: Path, rate_hz: float | None = None) -> MotionClip:

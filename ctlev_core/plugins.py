@@ -20,6 +20,7 @@ from pydantic import BaseModel, ValidationError
 
 from ctlev_core.body.motion_clip import MotionClip
 from data_contracts.config import Choice, Frozen
+from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 from data_contracts.labels import Conditions, History, ImageTrack, Labels, Recording
 
@@ -269,6 +270,27 @@ def names(kind: str) -> list[str]:
         raise PluginError(f"unknown plug-in kind {kind!r}; known kinds: {', '.join(KINDS)}")
     package = importlib.import_module(f"ctlev_core.{kind}")
     return sorted(module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_"))
+
+
+def recognise(formats: Mapping[str, ModuleType], path: Path) -> ModuleType | None:
+    """The one of `formats` whose `sniff` recognises the content of `path`; None where none does.
+
+    Formats with a signature are asked first, all of them; those without only where no signature is found.
+
+    Raises:
+        DataError: the file cannot be read, or several formats recognise it.
+    """
+    for has_signature in (True, False):
+        asked = [name for name in formats if getattr(formats[name], "HAS_SIGNATURE", True) == has_signature]
+        try:
+            claims = [name for name in asked if formats[name].sniff(path)]
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read: {error}") from error
+        if len(claims) > 1:
+            raise DataError(f"{path}: could be any of the formats {', '.join(claims)}; expected exactly one to fit")
+        if claims:
+            return formats[claims[0]]
+    return None
 
 
 def load(kind: str, name: str) -> ModuleType:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from ctlev_core.image_shifts import shift_images
 from ctlev_core.skeletons import JOINT_SETS
 from ctlev_core.supervised_options import SupervisedOptions
 from data_contracts.config import cache_material
@@ -188,16 +189,8 @@ def _shift(
     """Shift each image [B, H, W] and its points [B, J, 2] by its own whole number of px."""
     if not shift_px:
         return images, points
-    height, width = images.shape[1:]
     shifts = generator.integers(-shift_px, shift_px + 1, size=(len(images), 2))
-    padded = np.pad(images, ((0, 0), (shift_px, shift_px), (shift_px, shift_px)))
-    shifted = np.stack(
-        [
-            image[shift_px - dy : shift_px - dy + height, shift_px - dx : shift_px - dx + width]
-            for image, (dx, dy) in zip(padded, shifts, strict=True)
-        ]
-    )
-    return shifted, points + shifts[:, None].astype(points.dtype)
+    return shift_images(images, shifts), points + shifts[:, None].astype(points.dtype)
 
 
 def _flip_half(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from ctlev_core.image_shifts import shift_images
 from ctlev_core.skeletons import JOINT_SETS, joint_indices
 from ctlev_core.supervised_options import SupervisedOptions
 from data_contracts.config import cache_material
@@ -218,18 +219,10 @@ def _shift(batch: _TrainingSet, shift_px: int, generator: np.random.Generator) -
     """
     if not shift_px:
         return batch
-    height, width = batch.frames.shape[1:3]
     shifts = generator.integers(-shift_px, shift_px + 1, size=(len(batch.frames), 2))
-    padded = np.pad(batch.frames, ((0, 0), (shift_px, shift_px), (shift_px, shift_px), (0, 0)))
-    frames = np.stack(
-        [
-            image[shift_px - dy : shift_px - dy + height, shift_px - dx : shift_px - dx + width]
-            for image, (dx, dy) in zip(padded, shifts, strict=True)
-        ]
-    )
     transl = batch.transl.copy()
     transl[:, :2] += batch.transl[:, 2:] * shifts.astype(np.float32) / batch.intrinsics[:, :2]
-    return batch._replace(frames=frames, transl=transl)
+    return batch._replace(frames=shift_images(batch.frames, shifts), transl=transl)
 
 
 def _project(joints: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:
