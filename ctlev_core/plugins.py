@@ -22,7 +22,7 @@ from ctlev_core.body.motion_clip import MotionClip
 from data_contracts.config import Choice, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
-from data_contracts.labels import Conditions, History, ImageTrack, Labels, Recording
+from data_contracts.labels import BodyMotions, Conditions, History, ImageTrack, Labels, Recording
 
 KINDS = ("datasets", "formats", "motions", "encodings", "conditions", "generators", "downstream", "metrics")
 
@@ -182,6 +182,34 @@ class Condition(Protocol):
         ...
 
 
+class ConditionOfPairs(Protocol):
+    """A condition made of the grey pictures taken at a window's start and end: `NEEDS = "intensity"`."""
+
+    VERSION: int
+    NEEDS: str
+    Options: type[Frozen]
+
+    def render(
+        self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int], pairs: np.ndarray
+    ) -> Conditions:
+        """As `Condition.render`; `pairs` [N, H, W, 2] uint8 are the pictures, in image pixels."""
+        ...
+
+
+class ConditionOfMotions(Protocol):
+    """A condition that is what a body does around the moment it is labelled at: `NEEDS = "motion"`."""
+
+    VERSION: int
+    NEEDS: str
+    Options: type[Frozen]
+
+    def render(
+        self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int], motions: BodyMotions
+    ) -> Conditions:
+        """As `Condition.render`; row i of `motions` is the body of row i of `labels`."""
+        ...
+
+
 class Generator(Protocol):
     """Learns frames from conditions, then makes new frames for new conditions."""
 
@@ -203,6 +231,23 @@ class Generator(Protocol):
         self, checkpoint: Path, conditions: Conditions, options: Any, *, seeds: Sequence[int], work: Path
     ) -> np.ndarray:
         """Frames [N, H, W, 3] uint8; row i depends on conditions[i] and seeds[i] alone."""
+        ...
+
+
+class EventGenerator(Protocol):
+    """Simulates events instead of frames, and learns nothing; its events are encoded as the real ones are."""
+
+    VERSION: int
+    Options: type[Frozen]
+    SampleOptions: type[Frozen]
+
+    def sample_events(
+        self, conditions: Conditions, image_size: tuple[int, int], options: Any, *, seeds: Sequence[int]
+    ) -> Iterator[Events]:
+        """The events of each row in turn, from its first key pose to its last, before a sensor of `image_size`.
+
+        Those of row i depend on row i of `conditions` and seeds[i] alone. A row may have no events.
+        """
         ...
 
 

@@ -175,16 +175,74 @@ def check_labels(labels: Labels, where: str) -> Labels:
 
 
 @dataclass(frozen=True, eq=False)
+class BodyMotions:
+    """What the bodies of N rows do around the moment they are labelled at, seen by one still camera each.
+
+    Attributes:
+        t_us: [N, K] int64, times of K key poses, strictly ascending, on the clock of the row's label.
+        moment_us: [N] int64, the labelled moment; not before the first key pose nor after the last.
+        smpl_pose: [N, K, 72] float32, rad, as in `Labels`.
+        smpl_transl: [N, K, 3] float32, m, camera frame.
+        smpl_betas: [N, 10] float32.
+        intrinsics: [N, 4] float32, px: fx, fy, cx, cy of the image to be made.
+    """
+
+    t_us: np.ndarray
+    moment_us: np.ndarray
+    smpl_pose: np.ndarray
+    smpl_transl: np.ndarray
+    smpl_betas: np.ndarray
+    intrinsics: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.moment_us)
+
+
+def check_body_motions(motions: BodyMotions, where: str) -> BodyMotions:
+    """Raise `DataError` unless shapes agree, numbers are finite, and times ascend around the labelled moment."""
+    if motions.t_us.ndim != 2 or motions.t_us.shape[1] < 2 or motions.t_us.dtype != np.int64:
+        raise DataError(f"{where}: t_us must be [N, 2 or more] int64, got {motions.t_us.shape} {motions.t_us.dtype}")
+    count, keys = motions.t_us.shape
+    expected = {
+        "moment_us": ((count,), np.int64),
+        "smpl_pose": ((count, keys, 72), np.float32),
+        "smpl_transl": ((count, keys, 3), np.float32),
+        "smpl_betas": ((count, 10), np.float32),
+        "intrinsics": ((count, 4), np.float32),
+    }
+    for name, (shape, dtype) in expected.items():
+        array = getattr(motions, name)
+        if array.shape != shape or array.dtype != dtype:
+            got = f"{list(array.shape)} {array.dtype}"
+            raise DataError(f"{where}: {name} must be {list(shape)} {np.dtype(dtype).name}, got {got}")
+        if not np.isfinite(array).all():
+            raise DataError(f"{where}: {name} of row {int(np.argwhere(~np.isfinite(array))[0, 0])} is not finite")
+    wrong = (np.diff(motions.t_us) <= 0).any(axis=1)
+    wrong |= (motions.moment_us < motions.t_us[:, 0]) | (motions.moment_us > motions.t_us[:, -1])
+    wrong |= (motions.t_us[:, 0] < 0) | (motions.intrinsics[:, :2] <= 0).any(axis=1)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise DataError(
+            f"{where}: row {row} needs ascending times, none negative, with its moment among them, and positive focal "
+            f"lengths; got {motions.t_us[row].tolist()} us, {motions.moment_us[row]} us and "
+            f"{motions.intrinsics[row, :2].tolist()} px"
+        )
+    return motions
+
+
+@dataclass(frozen=True, eq=False)
 class Conditions:
     """What a generator is asked for, one row per image.
 
     Attributes:
         prompts: N text prompts.
         images: [N, H, W, 3] uint8 condition images, or None for the text route.
+        motions: what N bodies do, for a generator that films them; else None.
     """
 
     prompts: tuple[str, ...]
     images: np.ndarray | None = None
+    motions: BodyMotions | None = None
 
     def __len__(self) -> int:
         return len(self.prompts)
