@@ -20,14 +20,33 @@ PROTOCOLS = {
     "downstream": plugins.Downstream,
     "metrics": plugins.Metric,
 }
+CONDITIONS_BY_NEEDS = {
+    None: plugins.Condition,
+    "intensity": plugins.ConditionOfPairs,
+    "motion": plugins.ConditionOfMotions,
+}
 WITHOUT_OPTIONS = ("formats", "motions")
 ALL = [(kind, name) for kind in plugins.KINDS for name in plugins.names(kind)]
+
+
+def protocol_of(kind, module):
+    """The contract of a kind; a condition says by `NEEDS`, a generator by its functions, which of several it keeps."""
+    if kind == "conditions":
+        return CONDITIONS_BY_NEEDS[getattr(module, "NEEDS", None)]
+    if kind == "generators" and hasattr(module, "sample_events"):
+        return plugins.EventGenerator
+    return PROTOCOLS[kind]
+
+
+def keyword_only(function):
+    parameters = inspect.signature(function).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
 
 
 @pytest.mark.parametrize(("kind", "name"), ALL)
 def test_module_keeps_its_protocol(kind, name):
     module = plugins.load(kind, name)
-    protocol = PROTOCOLS[kind]
+    protocol = protocol_of(kind, module)
     assert isinstance(module.VERSION, int) and module.VERSION >= 1
     assert module.__doc__
     for attribute in protocol.__annotations__:
@@ -39,6 +58,23 @@ def test_module_keeps_its_protocol(kind, name):
         assert function.__doc__, f"{kind}/{name}.{function_name} has no docstring"
         wanted = list(inspect.signature(expected).parameters)[1:]
         assert list(inspect.signature(function).parameters)[: len(wanted)] == wanted, f"{kind}/{name}.{function_name}"
+        assert keyword_only(function) == keyword_only(expected), f"{kind}/{name}.{function_name}"
+
+
+@pytest.mark.parametrize("name", plugins.names("generators"))
+def test_a_generator_makes_frames_or_events_and_not_both(name):
+    """Callers tell the two apart by `sample_events`; a module with half of each contract would fail late."""
+    module = plugins.load("generators", name)
+    functions = [f for f in ("train", "sample", "prior_folders", "sample_events") if hasattr(module, f)]
+    assert functions in (["train", "sample", "prior_folders"], ["sample_events"])
+
+
+@pytest.mark.parametrize("name", plugins.names("conditions"))
+def test_a_condition_asks_for_no_more_than_it_needs(name):
+    module = plugins.load("conditions", name)
+    protocol = CONDITIONS_BY_NEEDS[getattr(module, "NEEDS", None)]
+    wanted = list(inspect.signature(protocol.render).parameters)[1:]
+    assert list(inspect.signature(module.render).parameters) == wanted
 
 
 @pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, name in ALL if kind not in WITHOUT_OPTIONS])

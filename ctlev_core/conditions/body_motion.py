@@ -1,0 +1,127 @@
+"""What a body does around the moment it is labelled at: the condition of generators that film a moving body.
+
+The generator is handed the motion; the picture beside it, a normal map of the labelled pose, is for looking at. What
+the simulated camera sees besides (clothes, light, background) is drawn by the generator, from its own seed.
+
+Source: ControlEvents (Hu et al., WACV 2026), the comparison with SMPL-ESIM, which simulates events from a sequence of
+SMPL poses; the poses are those that the other generators get.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from data_contracts.config import RUN_SETTING, Frozen
+from data_contracts.errors import DataError
+from data_contracts.labels import BodyMotions, Conditions, Labels, check_body_motions
+
+VERSION = 1
+NEEDS = "motion"
+BATCH = 64
+"""Bodies posed at a time: 64 of SMPL's are 5 MB."""
+SAME_TOLERANCE = 1e-3
+"""Relative: coefficients and intrinsics of a label and of its motion differ by rounding at most."""
+
+
+class Options(Frozen):
+    """Options of the motion of a body."""
+
+    prompt: str = Field(default="A moving human", description="The same prompt for every image, as in the paper.")
+    body: Path | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="SMPL file (.pkl, .npz) of the labels' body; the bundled body when null",
+    )
+    workers: int | None = Field(
+        default=None, ge=1, json_schema_extra=RUN_SETTING, description="threads; one a core when null"
+    )
+
+
+def input_files(options: Options) -> list[Path]:
+    """The body file where one is given; its content enters the cache key.
+
+    Raises:
+        DataError: no such file.
+    """
+    if options.body is None:
+        return []
+    if not options.body.is_file():
+        raise DataError(f"condition 'body_motion': {options.body}: no such file; expected an SMPL body (.pkl or .npz)")
+    return [options.body]
+
+
+def render(
+    labels: Labels, image_size: tuple[int, int], options: Options, seeds: Sequence[int], motions: BodyMotions
+) -> Conditions:
+    """Check the motions and render the labelled pose of each row; nothing is random, so `seeds` only has to fit.
+
+    Args:
+        labels: N rows with SMPL parameters in the camera frame, and the intrinsics of an image of `image_size`.
+        image_size: (width, height) px.
+        options: see `Options`.
+        seeds: N integers, unused.
+        motions: N motions of the same bodies before the same cameras.
+    Returns:
+        N conditions with `motions` as they came, and images [N, H, W, 3] uint8: normal maps in ControlNet's colours.
+    Raises:
+        DataError: the labels have no SMPL parameters or no intrinsics, a motion is malformed or is that of another body
+            or camera, the numbers of rows differ, or the body file is wrong.
+    """
+    if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
+        raise DataError("condition 'body_motion': the labels have no SMPL parameters")
+    if labels.intrinsics is None:
+        raise DataError(
+            "condition 'body_motion': the labels have no camera intrinsics, so bodies have no place in the image"
+        )
+    if not len(seeds) == len(motions) == len(labels):
+        raise DataError(
+            f"condition 'body_motion': {len(labels)} labels but {len(motions)} motions and {len(seeds)} seeds"
+        )
+    check_body_motions(motions, "condition 'body_motion'")
+    _check_same("smpl_betas", labels.smpl_betas, motions.smpl_betas)
+    _check_same("intrinsics", labels.intrinsics, motions.intrinsics)
+    pose = labels.smpl_pose, labels.smpl_betas, labels.smpl_transl
+    images = _render_poses(*pose, labels.intrinsics, image_size, options)
+    return Conditions((options.prompt,) * len(labels), images, motions)
+
+
+def _check_same(name: str, labelled: np.ndarray, moving: np.ndarray) -> None:
+    differs = ~np.isclose(moving, labelled, rtol=SAME_TOLERANCE, atol=SAME_TOLERANCE).all(axis=1)
+    if differs.any():
+        row = int(np.argmax(differs))
+        raise DataError(
+            f"condition 'body_motion': {name} of row {row} are {labelled[row].tolist()} in the label but "
+            f"{moving[row].tolist()} in the motion"
+        )
+
+
+def _render_poses(
+    pose: np.ndarray,
+    betas: np.ndarray,
+    transl: np.ndarray,
+    intrinsics: np.ndarray,
+    image_size: tuple[int, int],
+    options: Options,
+) -> np.ndarray:
+    """Normal maps [N, H, W, 3] uint8 of SMPL parameters in the camera frame."""
+    from ctlev_core.body.layer import load_body, pose_vertices
+    from ctlev_core.body.rotations import matrix_from_axis_angle
+    from ctlev_core.render.normals import render_normal_maps
+
+    body = load_body(options.body)
+    workers = options.workers or os.cpu_count() or 1
+    width, height = image_size
+    images = np.empty((len(pose), height, width, 3), dtype=np.uint8)
+    for start in range(0, len(pose), BATCH):
+        rows = slice(start, start + BATCH)
+        rotations = matrix_from_axis_angle(pose[rows].reshape(-1, 24, 3))
+        vertices, _ = pose_vertices(body, rotations, betas[rows], transl[rows])
+        images[rows] = render_normal_maps(
+            vertices, body.faces, intrinsics[rows], image_size, "controlnet", workers=workers
+        )
+    return images
