@@ -9,13 +9,14 @@ import numba
 import numpy as np
 
 from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, pose_offsets, shape_vertices, skin
+from ctlev_core.body.skinning import abreast, skin_frames
 from ctlev_core.camera import Camera, project
 from ctlev_core.render.rasteriser import NEAR_M, rasterise
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 __all__ = [
-    "Camera", "Light", "Subject", "project", "render_body_frames", "render_person", "sample_background",
+    "BodyPainter", "Camera", "Light", "Subject", "project", "render_body_frames", "render_person", "sample_background",
     "sample_betas", "sample_light", "sample_subject",
 ]  # fmt: skip
 
@@ -106,6 +107,77 @@ def sample_background(rng: np.random.Generator, image_size: tuple[int, int], col
     return np.clip(wall, DARKEST, 1.0).astype(np.float32)
 
 
+class BodyPainter:
+    """Paints one person before a still background, pose by pose, and touches only the box around the body.
+
+    An instance keeps pictures to draw on, so that several threads must not share it.
+
+    Args:
+        subject: the person.
+        camera: the view; its image size is the size of the background. Its distortion is ignored.
+        background: [H, W, C] float32 in (0, 1], C as in `subject.albedo`.
+        light: the lamp.
+        body: the bundled body when None.
+    Raises:
+        DataError: the background does not fit the camera or the subject.
+    """
+
+    def __init__(
+        self, subject: Subject, camera: Camera, background: np.ndarray, light: Light, body: BodyModel | None = None
+    ) -> None:
+        self.body = body or load_body()
+        width, height = camera.image_size
+        shape = (height, width, subject.albedo.shape[1])
+        if background.shape != shape:
+            raise DataError(f"background must be {shape} for this camera and subject, got {background.shape}")
+        self.subject, self.camera, self.light = subject, camera, light
+        self.background = np.ascontiguousarray(background, np.float32)
+        self._K = np.ascontiguousarray(camera.scaled(SUPERSAMPLING).K, np.float64)
+        self.rest = shape_vertices(self.body, subject.betas)
+        self._vertices, self._normals = np.empty_like(self.rest), np.empty_like(self.rest)
+        self._colours = np.empty_like(subject.albedo)
+        self._image = self.background.repeat(SUPERSAMPLING, axis=0).repeat(SUPERSAMPLING, axis=1)
+        self._depth_inverse = np.zeros(self._image.shape[:2], np.float32)
+
+    def in_camera(self, rotations: np.ndarray, transl: np.ndarray) -> np.ndarray:
+        """The map of each bone from the rest pose to the camera frame, [T, 24, 3, 4] float32, of T poses."""
+        transforms, _ = joint_transforms(self.body, rotations, self.subject.betas, transl)
+        moves = self.camera.R @ transforms
+        moves[..., 3] += self.camera.translation
+        return moves.astype(np.float32)
+
+    def pose(self, rotations: np.ndarray, transl: np.ndarray) -> np.ndarray:
+        """Vertices [T, V, 3] float32, m, camera frame, of T poses."""
+        offsets, moves = pose_offsets(self.body, rotations), self.in_camera(rotations, transl)
+        posed = np.empty((len(moves), *self.rest.shape), np.float32) if offsets is None else offsets
+        body, has_offsets = self.body, offsets is not None
+        skin_frames(self.rest, body.weight_indices, body.weight_values, abreast(moves), has_offsets, posed)
+        return posed
+
+    def paint(self, moves: np.ndarray, offsets: np.ndarray | None) -> tuple[int, int, np.ndarray]:
+        """The part of the picture that the body may cover: skin, shade (Lambert), rasterise at twice the size, average.
+
+        Args:
+            moves: [24, 3, 4], one of those of `in_camera`.
+            offsets: [V, 3] of `pose_offsets`, or None.
+        Returns:
+            left and top in px, and [h, w, C] float32 in (0, 1] with the background between; [0, 0, C] without a body.
+        """
+        # These stay separate calls: numba's cache does not notice when a kernel called from another module changes.
+        body, unposed = self.body, self.rest if offsets is None else self.rest + offsets
+        skin(unposed, body.normals, body.weight_indices, body.weight_values, moves, self._vertices, self._normals)
+        left, top, right, bottom = _find_box(self._vertices, self._K, NEAR_M, *self.camera.image_size)
+        patch = np.empty((bottom - top, right - left, self._colours.shape[1]), np.float32)
+        if patch.size:
+            _shade(self._normals, self.subject.albedo, self.light.direction, self.light.ambient, self._colours)
+            rasterise(
+                self._vertices, body.faces, self._colours, self._K, NEAR_M, True, self._image, self._depth_inverse
+            )
+            _average_blocks(self._image, left, top, patch)
+            _restore(self.background, left, top, right, bottom, self._image, self._depth_inverse)
+        return left, top, patch
+
+
 def render_body_frames(
     subject: Subject,
     rotations: np.ndarray,
@@ -115,7 +187,7 @@ def render_body_frames(
     light: Light,
     body: BodyModel | None = None,
 ) -> np.ndarray:
-    """Linear-intensity pictures of a moving person: skin, shade (Lambert), rasterise at twice the size, average.
+    """Linear-intensity pictures of a moving person; see `BodyPainter`.
 
     Args:
         subject: the person.
@@ -130,29 +202,12 @@ def render_body_frames(
     Raises:
         DataError: the background does not fit the camera or the subject.
     """
-    body = body or load_body()
-    width, height = camera.image_size
-    shape = (height, width, subject.albedo.shape[1])
-    if background.shape != shape:
-        raise DataError(f"background must be {shape} for this camera and subject, got {background.shape}")
-    transforms, _ = joint_transforms(body, rotations, subject.betas, transl)
-    in_camera = camera.R @ transforms
-    in_camera[..., 3] += camera.translation
-    rest, K = shape_vertices(body, subject.betas), camera.scaled(SUPERSAMPLING).K
-    offsets = pose_offsets(body, rotations)
-    backdrop = background.repeat(SUPERSAMPLING, axis=0).repeat(SUPERSAMPLING, axis=1).astype(np.float32)
-    vertices, normals, colours = np.empty_like(rest), np.empty_like(rest), np.empty_like(subject.albedo)
-    image, depth_inverse = np.empty_like(backdrop), np.empty(backdrop.shape[:2], dtype=np.float32)
-    out = np.empty((len(transforms), *shape), dtype=np.float32)
-    # The loop stays in Python: numba's cache does not notice when a kernel called from another module changes.
-    for frame, moves in enumerate(in_camera.astype(np.float32)):
-        unposed = rest if offsets is None else rest + offsets[frame]
-        skin(unposed, body.normals, body.weight_indices, body.weight_values, moves, vertices, normals)
-        _shade(normals, subject.albedo, light.direction, light.ambient, colours)
-        image[:] = backdrop
-        depth_inverse[:] = 0.0
-        rasterise(vertices, body.faces, colours, K, NEAR_M, True, image, depth_inverse)
-        _average_blocks(image, out[frame])
+    painter = BodyPainter(subject, camera, background, light, body)
+    offsets = pose_offsets(painter.body, rotations)
+    out = np.repeat(painter.background[None], len(rotations), axis=0)
+    for frame, moves in enumerate(painter.in_camera(rotations, transl)):
+        left, top, patch = painter.paint(moves, None if offsets is None else offsets[frame])
+        out[frame, top : top + patch.shape[0], left : left + patch.shape[1]] = patch
     return out
 
 
@@ -196,13 +251,52 @@ def _shade(normals, albedo, lamp, ambient, colours):
 
 
 @numba.njit(cache=True, nogil=True)
-def _average_blocks(image, out):
-    """Mean over blocks of SUPERSAMPLING x SUPERSAMPLING pixels."""
+def _find_box(vertices, K, near, width, height):
+    """Left, top, right and bottom (exclusive), px of the averaged picture, of all that the mesh may cover.
+
+    What crosses the near plane is cut there and may be anywhere: then the box is the whole picture.
+    """
+    left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
+    behind = 0
+    for i in range(vertices.shape[0]):
+        if vertices[i, 2] > near:
+            inverse = 1.0 / vertices[i, 2]
+            x, y = K[0, 0] * vertices[i, 0] * inverse + K[0, 2], K[1, 1] * vertices[i, 1] * inverse + K[1, 2]
+            left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+        else:
+            behind += 1
+    if behind == vertices.shape[0]:
+        return 0, 0, 0, 0
+    if behind > 0:
+        return 0, 0, width, height
+    # Clamped before the cast: far outside the picture a position need not fit an integer.
+    first_column = int(np.floor(min(max(left / SUPERSAMPLING, 0.0), float(width))))
+    first_row = int(np.floor(min(max(top / SUPERSAMPLING, 0.0), float(height))))
+    last_column = int(np.ceil(max(min(right / SUPERSAMPLING, float(width)), 0.0)))
+    last_row = int(np.ceil(max(min(bottom / SUPERSAMPLING, float(height)), 0.0)))
+    if first_column >= last_column or first_row >= last_row:
+        return 0, 0, 0, 0
+    return first_column, first_row, last_column, last_row
+
+
+@numba.njit(cache=True, nogil=True)
+def _average_blocks(image, left, top, out):
+    """Means over blocks of SUPERSAMPLING x SUPERSAMPLING pixels, into `out`, whose first is at (left, top)."""
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             for k in range(out.shape[2]):
                 total = np.float32(0.0)
                 for dy in range(SUPERSAMPLING):
                     for dx in range(SUPERSAMPLING):
-                        total += image[SUPERSAMPLING * row + dy, SUPERSAMPLING * column + dx, k]
+                        total += image[SUPERSAMPLING * (top + row) + dy, SUPERSAMPLING * (left + column) + dx, k]
                 out[row, column, k] = total / np.float32(SUPERSAMPLING * SUPERSAMPLING)
+
+
+@numba.njit(cache=True, nogil=True)
+def _restore(background, left, top, right, bottom, image, depth_inverse):
+    """Put the background back into a box of the picture that is drawn on."""
+    for row in range(SUPERSAMPLING * top, SUPERSAMPLING * bottom):
+        for column in range(SUPERSAMPLING * left, SUPERSAMPLING * right):
+            depth_inverse[row, column] = 0.0
+            for k in range(image.shape[2]):
+                image[row, column, k] = background[row // SUPERSAMPLING, column // SUPERSAMPLING, k]
