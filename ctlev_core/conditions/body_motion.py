@@ -25,7 +25,7 @@ NEEDS = "motion"
 BATCH = 64
 """Bodies posed at a time: 64 of SMPL's are 5 MB."""
 SAME_TOLERANCE = 1e-3
-"""Relative: coefficients and intrinsics of a label and of its motion differ by rounding at most."""
+"""Shape coefficients of a label and of its motion differ by rounding at most."""
 
 
 class Options(Frozen):
@@ -65,12 +65,12 @@ def render(
         image_size: (width, height) px.
         options: see `Options`.
         seeds: N integers, unused.
-        motions: N motions of the same bodies before the same cameras.
+        motions: N motions of the same bodies; their intrinsics are those of the sensor, not of the image.
     Returns:
         N conditions with `motions` as they came, and images [N, H, W, 3] uint8: normal maps in ControlNet's colours.
     Raises:
-        DataError: the labels have no SMPL parameters or no intrinsics, a motion is malformed or is that of another body
-            or camera, the numbers of rows differ, or the body file is wrong.
+        DataError: the labels have no SMPL parameters or no intrinsics, a motion is malformed or that of a body of another
+            shape, the numbers of rows differ, or the body file is wrong.
     """
     if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
         raise DataError("condition 'body_motion': the labels have no SMPL parameters")
@@ -83,19 +83,19 @@ def render(
             f"condition 'body_motion': {len(labels)} labels but {len(motions)} motions and {len(seeds)} seeds"
         )
     check_body_motions(motions, "condition 'body_motion'")
-    _check_same("smpl_betas", labels.smpl_betas, motions.smpl_betas)
-    _check_same("intrinsics", labels.intrinsics, motions.intrinsics)
+    _check_same_bodies(labels.smpl_betas, motions.smpl_betas)
     pose = labels.smpl_pose, labels.smpl_betas, labels.smpl_transl
     images = _render_poses(*pose, labels.intrinsics, image_size, options)
     return Conditions((options.prompt,) * len(labels), images, motions)
 
 
-def _check_same(name: str, labelled: np.ndarray, moving: np.ndarray) -> None:
+def _check_same_bodies(labelled: np.ndarray, moving: np.ndarray) -> None:
+    """Raise `DataError` unless the shape coefficients [N, 10] of labels and motions agree."""
     differs = ~np.isclose(moving, labelled, rtol=SAME_TOLERANCE, atol=SAME_TOLERANCE).all(axis=1)
     if differs.any():
         row = int(np.argmax(differs))
         raise DataError(
-            f"condition 'body_motion': {name} of row {row} are {labelled[row].tolist()} in the label but "
+            f"condition 'body_motion': row {row} has smpl_betas {labelled[row].tolist()} in the label but "
             f"{moving[row].tolist()} in the motion"
         )
 

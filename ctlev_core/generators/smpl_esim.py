@@ -31,7 +31,7 @@ from pydantic import Field
 
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
-from data_contracts.events import Events
+from data_contracts.events import Events, SensorSize
 from data_contracts.labels import BodyMotions, Conditions, check_body_motions
 
 if TYPE_CHECKING:
@@ -84,16 +84,16 @@ def input_files(options: SampleOptions) -> list[Path]:
 
 
 def sample_events(
-    conditions: Conditions, image_size: tuple[int, int], options: SampleOptions, *, seeds: Sequence[int]
+    conditions: Conditions, sensor_size: SensorSize, options: SampleOptions, *, seeds: Sequence[int]
 ) -> Iterator[Events]:
-    """The events of each row in turn, from its first key pose to its last, before a sensor of `image_size`.
+    """The events of each row in turn, from its first key pose to its last, before a sensor of `sensor_size`.
 
     Those of row i depend on row i of the motions and on seeds[i] alone. A body that the camera does not see, or that
     keeps still, sends no events. The caller picks the window and encodes it as real events are.
 
     Args:
         conditions: N rows with motions; their images are not used.
-        image_size: (width, height) px, that of the motions' intrinsics.
+        sensor_size: (width, height) px, of the sensor that the motions' intrinsics are for.
         options: see `SampleOptions`.
         seeds: N integers: of the person's looks, the light and the background.
     Yields:
@@ -109,22 +109,22 @@ def sample_events(
         raise ValueError("generator 'smpl_esim' needs the motions of bodies; use condition 'body_motion'")
     if not len(seeds) == len(motions) == len(conditions):
         raise ValueError(f"{len(conditions)} conditions but {len(motions)} motions and {len(seeds)} seeds")
-    if min(image_size) < 1:
-        raise ValueError(f"image_size must be (width, height) of 1 px or more, got {image_size}")
+    if min(sensor_size) < 1:
+        raise ValueError(f"sensor_size must be (width, height) of 1 px or more, got {sensor_size}")
     check_body_motions(motions, "generator 'smpl_esim'")
     body = load_body(options.body)
     # Checked now rather than when the first row is asked for.
-    return (_film(motions, row, image_size, options, seed, body) for row, seed in enumerate(seeds))
+    return (_film(motions, row, sensor_size, options, seed, body) for row, seed in enumerate(seeds))
 
 
 def _film(
-    motions: BodyMotions, row: int, image_size: tuple[int, int], options: SampleOptions, seed: int, body: BodyModel
+    motions: BodyMotions, row: int, sensor_size: SensorSize, options: SampleOptions, seed: int, body: BodyModel
 ) -> Events:
     """The events of one row."""
     from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
     from ctlev_core.sensor import PRESETS
 
-    scene = _scene(motions, row, image_size, options, seed, body)
+    scene = _scene(motions, row, sensor_size, options, seed, body)
     start_us, stop_us = (int(time_us) for time_us in motions.t_us[row, [0, -1]])
     try:
         events, _ = simulate_rendered(
@@ -149,7 +149,7 @@ def _film(
 
 
 def _scene(
-    motions: BodyMotions, row: int, image_size: tuple[int, int], options: SampleOptions, seed: int, body: BodyModel
+    motions: BodyMotions, row: int, sensor_size: SensorSize, options: SampleOptions, seed: int, body: BodyModel
 ) -> MovingBody:
     """A random person in the motion of a row, before its camera; time 0 is the first key pose.
 
@@ -163,7 +163,7 @@ def _scene(
     rng = np.random.default_rng(seed)
     subject = replace(sample_subject(rng, colour=False, body=body), betas=motions.smpl_betas[row])
     light = sample_light(rng)
-    background = sample_background(rng, image_size, colour=False)
+    background = sample_background(rng, sensor_size, colour=False)
     if not options.textured:
         subject = replace(subject, albedo=np.full_like(subject.albedo, PLAIN_ALBEDO))
         background = np.full_like(background, background.mean())
@@ -172,7 +172,7 @@ def _scene(
         1e-6 * (motions.t_us[row] - motions.t_us[row, 0]),
         matrix_from_axis_angle(motions.smpl_pose[row].reshape(-1, 24, 3)),
         motions.smpl_transl[row].astype(np.float64),
-        camera_from_intrinsics(motions.intrinsics[row], image_size),
+        camera_from_intrinsics(motions.intrinsics[row], sensor_size),
         background,
         light,
         body,

@@ -99,8 +99,8 @@ def test_labels_that_show_no_body_are_refused(change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: replace(m, intrinsics=m.intrinsics * 2), "intrinsics of row 0 are .* in the label but"),
-        (lambda m: replace(m, smpl_betas=-m.smpl_betas), "smpl_betas of row 0"),
+        (lambda m: replace(m, intrinsics=-m.intrinsics), "row 0 needs .* positive focal lengths"),
+        (lambda m: replace(m, smpl_betas=-m.smpl_betas), "row 0 has smpl_betas .* in the label but"),
         (lambda m: replace(m, t_us=m.t_us[:, ::-1]), "row 0 needs ascending times"),
         (lambda m: replace(m, moment_us=m.moment_us - 1), "row 0 needs ascending times"),
         (lambda m: replace(m, smpl_transl=m.smpl_transl * np.float32(np.nan)), "smpl_transl of row 0 is not finite"),

@@ -259,7 +259,7 @@ def test_wrong_calls_are_refused_before_the_first_row():
         smpl_esim.sample_events(Conditions(("", "")), SIZE, options, seeds=[0, 1])
     with pytest.raises(ValueError, match="2 conditions but 2 motions and 1 seeds"):
         smpl_esim.sample_events(Conditions(("", ""), None, motions), SIZE, options, seeds=[0])
-    with pytest.raises(ValueError, match=r"image_size must be .* got \(40, 0\)"):
+    with pytest.raises(ValueError, match=r"sensor_size must be .* got \(40, 0\)"):
         smpl_esim.sample_events(Conditions(("", ""), None, motions), (40, 0), options, seeds=[0, 1])
     backwards = replace(motions, t_us=motions.t_us[:, ::-1])
     with pytest.raises(DataError, match="row 0 needs ascending times"):
