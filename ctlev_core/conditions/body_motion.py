@@ -69,7 +69,7 @@ def render(
     Returns:
         N conditions with `motions` as they came, and images [N, H, W, 3] uint8: normal maps in ControlNet's colours.
     Raises:
-        DataError: the labels have no SMPL parameters or no intrinsics, a motion is malformed or that of a body of another
+        DataError: the labels have no SMPL parameters or no intrinsics, a motion is malformed or of a body of another
             shape, the numbers of rows differ, or the body file is wrong.
     """
     if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
