@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, pose_vertices
+from ctlev_core.body.rigid_motion import move_roots
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ctlev_core.camera import Camera, camera_from_intrinsics, is_inside, project
 from ctlev_core.skeletons import joint_indices
@@ -34,10 +35,7 @@ def labels_in_camera(
     t_us: np.ndarray,
     body: BodyModel | None = None,
 ) -> Labels:
-    """SMPL labels in the frame of a camera.
-
-    SMPL turns a body about its own pelvis J: x = R (x_rest - J) + J + transl. Seen from a camera at X' = A X + a, this
-    is R' = A R and transl' = A (J + transl) + a - J, where J is that of the shape `betas`.
+    """SMPL labels in the frame of a camera (`ctlev_core.body.rigid_motion`).
 
     Args:
         rotations: [T, 24, 3, 3] relative to the parent, the root's in the world.
@@ -50,17 +48,16 @@ def labels_in_camera(
     Returns:
         T rows with SMPL parameters in the camera frame and the camera's intrinsics.
     """
-    body = body or load_body()
-    pelvis = body.joints[0] + body.joint_shapedirs[0] @ np.asarray(betas, dtype=np.float64)
     seen = rotations.copy()
-    seen[:, 0] = camera.R @ rotations[:, 0]
+    pelvis = rest_pelvis(np.asarray(betas), body)
+    seen[:, 0], moved = move_roots(rotations[:, 0], transl, pelvis, camera.R, camera.translation)
     count = len(rotations)
     return Labels(
         class_names=(class_name,) * count,
         t_us=t_us,
         smpl_pose=axis_angle_from_matrix(seen).reshape(count, 72).astype(np.float32),
         smpl_betas=np.tile(np.asarray(betas, dtype=np.float32), (count, 1)),
-        smpl_transl=((pelvis + transl) @ camera.R.T + camera.translation - pelvis).astype(np.float32),
+        smpl_transl=moved.astype(np.float32),
         intrinsics=np.tile(camera.intrinsics.astype(np.float32), (count, 1)),
     )
 
@@ -115,8 +112,7 @@ def from_new_side(
     """The same bodies as another still camera sees them, drawn at random around the space they move in.
 
     The camera that the labels come from is taken to stand upright and level: yaw and pitch of the new one count from
-    its view. A rigid motion X' = A X + a of the world turns the root to A R and moves SMPL's translation to
-    A (J + transl) + a - J, since SMPL turns a body about its own pelvis J.
+    its view.
 
     Args:
         labels: N rows with SMPL parameters, one or more.
@@ -131,15 +127,19 @@ def from_new_side(
     """
     joints = smpl_joints(labels)
     camera = sample_camera(rng, joints @ UPRIGHT.T, sensor_size, ranges)
-    turn = camera.R @ UPRIGHT
-    pose, _, transl = _bodies(labels)
-    root = turn @ matrix_from_axis_angle(pose[:, :3].astype(np.float64))
-    moved = joints[:, 0] @ turn.T + camera.translation - joints[:, 0]
+    pose, betas, transl = _bodies(labels)
+    root, moved = move_roots(
+        matrix_from_axis_angle(pose[:, :3].astype(np.float64)),
+        transl.astype(np.float64),
+        rest_pelvis(betas),
+        camera.R @ UPRIGHT,
+        camera.translation,
+    )
     pose = np.concatenate([axis_angle_from_matrix(root), pose[:, 3:]], axis=1)
     return replace(
         labels,
         smpl_pose=pose.astype(np.float32),
-        smpl_transl=(transl + moved).astype(np.float32),
+        smpl_transl=moved.astype(np.float32),
         intrinsics=np.tile(camera.intrinsics.astype(np.float32), (len(labels), 1)),
         joints2d=None,
         visible=None,
@@ -153,6 +153,12 @@ def default_intrinsics(sensor_size: SensorSize) -> np.ndarray:
     width, height = sensor_size
     focal = FOCAL_PER_SIDE * min(sensor_size)
     return np.array([focal, focal, width / 2, height / 2], dtype=np.float32)
+
+
+def rest_pelvis(betas: np.ndarray, body: BodyModel | None = None) -> np.ndarray:
+    """The root joint [..., 3] float64, m, at rest of the body (the bundled one if None) shaped by `betas` [..., 10]."""
+    body = body or load_body()
+    return body.joints[0] + np.asarray(betas, np.float64) @ body.joint_shapedirs[0].T
 
 
 def smpl_joints(labels: Labels) -> np.ndarray:

@@ -242,9 +242,9 @@ class EventGenerator(Protocol):
     SampleOptions: type[Frozen]
 
     def sample_events(
-        self, conditions: Conditions, image_size: tuple[int, int], options: Any, *, seeds: Sequence[int]
+        self, conditions: Conditions, sensor_size: SensorSize, options: Any, *, seeds: Sequence[int]
     ) -> Iterator[Events]:
-        """The events of each row in turn, from its first key pose to its last, before a sensor of `image_size`.
+        """The events of each row in turn, from its first key pose to its last.
 
         Those of row i depend on row i of `conditions` and seeds[i] alone. A row may have no events.
         """

@@ -49,6 +49,28 @@ def cut_chunks(chunks: Iterable[np.ndarray], windows: Windows) -> np.ndarray:
     return ranges[spread(len(ranges), windows.max_windows)]
 
 
+def window_around(t_us: np.ndarray, moment_us: int, duration_us: int, windows: Windows) -> tuple[int, int]:
+    """The one window around a moment, as `cut` would make it if recordings started half a window before.
+
+    Args:
+        t_us: [N] int64, times of events, non-decreasing.
+        moment_us: the middle of the window.
+        duration_us: its length where `windows` does not fix it (`whole`, `dataset`).
+        windows: how to cut.
+    Returns:
+        Start and stop in events. With `count` as many events on either side, as far as there are so many; fewer in all
+        only where the recording has fewer.
+    """
+    if windows.method == "count":
+        middle = int(np.searchsorted(t_us, moment_us))
+        start = min(max(middle - windows.num_events // 2, 0), max(len(t_us) - windows.num_events, 0))
+        return start, min(start + windows.num_events, len(t_us))
+    span_us = windows.duration_us if windows.method == "duration" else duration_us
+    start_us = moment_us - span_us // 2
+    start, stop = np.searchsorted(t_us, [start_us, start_us + span_us])
+    return int(start), int(stop)
+
+
 class Cutter:
     """Windows of a recording that is read piece by piece: those that `add` completes, then those that `finish` does.
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from data_contracts.config import (
     ConditionChoice,
@@ -23,11 +24,26 @@ PoseOrder = Literal["random", "in_time"]
 PoseViews = Literal["labelled", "new"]
 
 
+class Baseline(Frozen):
+    """Another generator to compare with, from the same frames and the same labels to sample from."""
+
+    condition: ConditionChoice
+    generator: GeneratorChoice
+    sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
+
+    @property
+    def sampling_choice(self) -> SamplingChoice:
+        """The generator's sampling options as a plug-in choice."""
+        return SamplingChoice(name=self.generator.name, options=self.sampling)
+
+
 class Experiment(Frozen):
     """One experiment: data, generator, how much to sample, and what to train and score with it.
 
-    `sampling` are the generator's `SampleOptions`. `feature_extractor` is the classifier, trained on real frames, in
-    whose features real and synthetic frames are compared; None leaves the comparison out.
+    `baselines` are rows of the tables: a baseline `X` adds the settings `X` and `real+X` beside `synthetic` and
+    `real+synthetic`, where those are asked for. `sampling` are the generator's `SampleOptions`. `feature_extractor` is
+    the classifier, trained on real frames, in whose features real and synthetic frames are compared; None leaves the
+    comparison out.
     """
 
     name: str = Field(pattern=r"^[A-Za-z0-9._-]+$", description="names the experiment and its report")
@@ -48,12 +64,26 @@ class Experiment(Frozen):
     condition: ConditionChoice
     generator: GeneratorChoice
     sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
-    num_synthetic: int = Field(gt=0, description="synthetic frames to sample")
+    num_synthetic: int = Field(gt=0, description="synthetic frames to sample, of the generator and of each baseline")
+    baselines: dict[str, Baseline] = Field(default_factory=dict, description="other generators, by a name of each")
     downstream: DownstreamChoice
     settings: tuple[Setting, ...] = Field(("real", "synthetic", "real+synthetic"), min_length=1)
     downstream_seeds: tuple[int, ...] = Field((0,), min_length=1, description="one training per setting and seed")
     metrics: tuple[MetricChoice, ...] = Field(min_length=1)
     feature_extractor: DownstreamChoice | None = None
+    realism_reference: DatasetChoice | None = Field(
+        None, description="recordings that the experiment's own are compared with, number by number, in the report"
+    )
+
+    @field_validator("baselines")
+    @classmethod
+    def _names_are_free(cls, baselines: dict[str, Baseline]) -> dict[str, Baseline]:
+        for name in baselines:
+            if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in ("real", "synthetic"):
+                raise ValueError(
+                    f"a baseline's name is made of a-z, 0-9 and _, and is not real or synthetic, got {name!r}"
+                )
+        return baselines
 
     @property
     def sampling_choice(self) -> SamplingChoice:
@@ -64,5 +94,17 @@ class Experiment(Frozen):
     def choices(self) -> list[Any]:
         """Every plug-in the experiment names."""
         chosen = [self.dataset, self.encoding, self.condition, self.generator, self.sampling_choice, self.downstream]
-        optional = [choice for choice in (self.poses, self.feature_extractor) if choice]
-        return [*chosen, *optional, *self.metrics]
+        optional = [choice for choice in (self.poses, self.feature_extractor, self.realism_reference) if choice]
+        others = [c for b in self.baselines.values() for c in (b.condition, b.generator, b.sampling_choice)]
+        return [*chosen, *optional, *others, *self.metrics]
+
+    @property
+    def generator_names(self) -> list[str]:
+        """What the rows of each generator are called: `synthetic` is the experiment's own."""
+        return ["synthetic", *self.baselines]
+
+    @property
+    def trained_settings(self) -> list[str]:
+        """What downstream models are trained on, in the order of the tables."""
+        names = [setting.replace("synthetic", name) for setting in self.settings for name in self.generator_names]
+        return list(dict.fromkeys(names))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -184,7 +184,7 @@ class BodyMotions:
         smpl_pose: [N, K, 72] float32, rad, as in `Labels`.
         smpl_transl: [N, K, 3] float32, m, camera frame.
         smpl_betas: [N, 10] float32.
-        intrinsics: [N, 4] float32, px: fx, fy, cx, cy of the image to be made.
+        intrinsics: [N, 4] float32, px: fx, fy, cx, cy on the sensor that is to see them.
     """
 
     t_us: np.ndarray
@@ -196,6 +196,10 @@ class BodyMotions:
 
     def __len__(self) -> int:
         return len(self.moment_us)
+
+    def take(self, rows: slice) -> BodyMotions:
+        """Some of the rows."""
+        return BodyMotions(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
 def check_body_motions(motions: BodyMotions, where: str) -> BodyMotions:
@@ -246,6 +250,12 @@ class Conditions:
 
     def __len__(self) -> int:
         return len(self.prompts)
+
+    def take(self, rows: slice) -> Conditions:
+        """Some of the rows."""
+        images = None if self.images is None else self.images[rows]
+        motions = None if self.motions is None else self.motions.take(rows)
+        return Conditions(self.prompts[rows], images, motions)
 
 
 @dataclass

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -20,13 +20,15 @@ import pyarrow.parquet as pq
 
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
-from data_contracts.labels import LABEL_ARRAYS, Conditions, History, Labels
+from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, History, Labels
 from data_contracts.tables import TABLES, TableSchema, check_table
 
 MANIFEST_FILE = "manifest.parquet"
 RUN_FILE = "run.json"
 _FILES_KEY = b"ctlev.files"
 _SCHEMA_KEY = b"ctlev.schema"
+_MOTION_PREFIX = "motion_"
+_MOTION_ARRAYS = tuple(field.name for field in fields(BodyMotions))
 
 
 class ManifestRef(Frozen):
@@ -238,7 +240,19 @@ def concat_labels(parts: Iterable[Labels], *, common: bool = False) -> Labels:
 def conditions_of(manifest: Manifest) -> Conditions:
     """The conditions of a manifest of conditions; row i is row i of its table."""
     images = manifest.array("images") if "images.npy" in manifest.files else None
-    return Conditions(tuple(manifest.column("prompt")), images)
+    arrays = {name: f"{_MOTION_PREFIX}{name}" for name in _MOTION_ARRAYS}
+    motions = None
+    if all(f"{array}.npy" in manifest.files for array in arrays.values()):
+        motions = BodyMotions(**{name: np.asarray(manifest.array(array)) for name, array in arrays.items()})
+    return Conditions(tuple(manifest.column("prompt")), images, motions)
+
+
+def condition_arrays(conditions: Conditions) -> dict[str, np.ndarray]:
+    """The arrays to attach to a manifest of conditions, by name, from which `conditions_of` makes them again."""
+    arrays = {} if conditions.images is None else {"images": conditions.images}
+    if conditions.motions is not None:
+        arrays |= {f"{_MOTION_PREFIX}{name}": getattr(conditions.motions, name) for name in _MOTION_ARRAYS}
+    return arrays
 
 
 def history_table(history: History) -> pa.Table:

@@ -157,7 +157,7 @@ FRAMES = TableSchema(
 )
 CONDITIONS = TableSchema(
     "conditions",
-    3,
+    4,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key"),
@@ -165,6 +165,8 @@ CONDITIONS = TableSchema(
         _SUBJECT,
         _CLASS,
         Column("prompt", pa.string(), "text prompt"),
+        Column("t_start_us", pa.int64(), "first event of the window, or where it would be", minimum=0),
+        Column("t_end_us", pa.int64(), "last event of the window, or where it would be", minimum=0),
         *_LABELS,
     ),
 )

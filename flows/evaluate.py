@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import sys
 
-from data_contracts.config import Frozen
+from data_contracts.config import DownstreamChoice, Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
+from flows.baselines import BaselineFrames, baselines
 from flows.command_line import main
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from flows.synthesize import synthesize
 from tasks.downstream import train_downstream
-from tasks.evaluate import score_distance, score_model
+from tasks.evaluate import LABELS_OF, score_distance, score_model
 from tasks.stage import call_flow
 
 
@@ -26,22 +27,26 @@ class Evaluation(Frozen):
 
 @flow(name="evaluate")
 def evaluate(
-    experiment: Experiment, dataset: PreparedDataset | None = None, synthetic: ManifestRef | None = None
+    experiment: Experiment,
+    dataset: PreparedDataset | None = None,
+    synthetic: ManifestRef | None = None,
+    compared: dict[str, BaselineFrames] | None = None,
 ) -> Evaluation:
-    """Train and score every setting and seed; dataset and synthetic frames are made first unless they are given."""
+    """Train and score every setting and seed; what is not given is made first."""
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     if synthetic is None:
         synthetic = call_flow(synthesize, experiment, dataset)
-    training_sets = {
-        "real": [dataset.frames],
-        "synthetic": [synthetic],
-        "real+synthetic": [dataset.frames, synthetic],
-    }
+    if compared is None:
+        compared = call_flow(baselines, experiment, dataset)
+    generated = {"synthetic": synthetic} | {name: frames.synthetic for name, frames in compared.items()}
+    training_sets = {"real": [dataset.frames]}
+    for name, frames in generated.items():
+        training_sets |= {name: [frames], f"real+{name}": [dataset.frames, frames]}
     scores: list[ManifestRef] = []
     models: list[ManifestRef] = []
     model_names: list[str] = []
-    for setting in experiment.settings:
+    for setting in experiment.trained_settings:
         for seed in experiment.downstream_seeds:
             label = f"{experiment.downstream.name} on {setting}, seed {seed}"
             model = train_downstream(training_sets[setting], downstream=experiment.downstream, seed=seed, label=label)
@@ -50,7 +55,7 @@ def evaluate(
             tested = [(dataset.frames, "test", setting)]
             if setting == "real":
                 # Do the synthetic frames show what their labels say? The real row's error is the floor.
-                tested.append((synthetic, "train", "labels of synthetic"))
+                tested += [(frames, "train", f"{LABELS_OF} {name}") for name, frames in generated.items()]
             for data, split, row in tested:
                 scores.append(
                     score_model(
@@ -66,22 +71,20 @@ def evaluate(
                     )
                 )
     if experiment.feature_extractor is not None:
-        extractor = train_downstream(
-            [dataset.frames], downstream=experiment.feature_extractor, seed=experiment.seed, label="feature extractor"
-        )
-        for data, split, row in ((dataset.frames, "test", "held-out real"), (synthetic, "train", "synthetic")):
-            scores.append(
-                score_distance(
-                    extractor,
-                    dataset.frames,
-                    data,
-                    downstream=experiment.feature_extractor,
-                    setting=row,
-                    split=split,
-                    label=row,
-                )
-            )
+        scores += _distances(experiment.feature_extractor, experiment.seed, dataset.frames, generated)
     return Evaluation(scores=scores, models=models, model_names=model_names)
+
+
+def _distances(
+    feature_extractor: DownstreamChoice, seed: int, frames: ManifestRef, generated: dict[str, ManifestRef]
+) -> list[ManifestRef]:
+    """How far held-out real frames, and those of each generator, are from the real training frames."""
+    extractor = train_downstream([frames], downstream=feature_extractor, seed=seed, label="feature extractor")
+    compared = [(frames, "test", "held-out real"), *((made, "train", name) for name, made in generated.items())]
+    return [
+        score_distance(extractor, frames, data, downstream=feature_extractor, setting=row, split=split, label=row)
+        for data, split, row in compared
+    ]
 
 
 if __name__ == "__main__":

@@ -9,12 +9,14 @@ import sys
 
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
+from flows.baselines import baselines
 from flows.command_line import main
 from flows.evaluate import evaluate
 from flows.prepare_dataset import prepare_dataset
 from flows.settings import HOME, flow
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
+from tasks.ingest import ingest
 from tasks.realism import realism
 from tasks.report import publish_report, report
 from tasks.stage import call_flow
@@ -26,21 +28,35 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
     dataset = call_flow(prepare_dataset, experiment)
     checkpoint = call_flow(train_generator, experiment, dataset)
     synthetic = call_flow(synthesize, experiment, dataset, checkpoint)
-    evaluation = call_flow(evaluate, experiment, dataset, synthetic)
-    looks = realism(dataset.recordings, dataset.frames, synthetic, label="training frames and synthetic")
+    compared = call_flow(baselines, experiment, dataset)
+    evaluation = call_flow(evaluate, experiment, dataset, synthetic, compared)
+    generated = [synthetic, *(frames.synthetic for frames in compared.values())]
+    reference = None
+    if experiment.realism_reference is not None:
+        reference = ingest(dataset=experiment.realism_reference, label="realism reference")
+    looks = realism(
+        dataset.recordings,
+        dataset.frames,
+        generated,
+        reference,
+        names=experiment.generator_names,
+        label=f"training frames and {', '.join(experiment.generator_names)}",
+    )
     return report(
         dataset.recordings,
         dataset.frames,
         dataset.frame_conditions,
         dataset.sample_conditions,
-        checkpoint,
-        synthetic,
+        [checkpoint, *(frames.checkpoint for frames in compared.values() if frames.checkpoint)],
+        generated,
         evaluation.scores,
         evaluation.models,
         looks,
         title=experiment.name,
         notice=experiment.data_notice,
-        settings=experiment.settings,
+        settings=experiment.trained_settings,
+        generator_names=experiment.generator_names,
+        checkpoint_names=["synthetic", *(name for name, frames in compared.items() if frames.checkpoint)],
         model_names=evaluation.model_names,
         label=experiment.name,
     )

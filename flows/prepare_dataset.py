@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from data_contracts.config import Frozen
+from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from flows.command_line import main
@@ -16,9 +16,10 @@ from tasks.ingest import ingest
 
 
 class PreparedDataset(Frozen):
-    """Manifests of a dataset ready for training and sampling."""
+    """Manifests of a dataset ready for training and sampling; `poses` are the recordings whose labels are sampled."""
 
     recordings: ManifestRef
+    poses: ManifestRef
     frames: ManifestRef
     frame_conditions: ManifestRef
     sample_conditions: ManifestRef
@@ -32,28 +33,11 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
     frames = encode(
         recordings, encoding=experiment.encoding, windows=experiment.windows, label=experiment.encoding.name
     )
-    frame_conditions = condition_frames(
-        recordings,
-        frames,
-        condition=experiment.condition,
-        seed=experiment.seed,
-        label=f"{experiment.condition.name}, training",
-    )
     poses = recordings
     if experiment.poses is not None:
         poses = ingest(dataset=experiment.poses, label=f"{experiment.poses.name}, poses")
-    sample_conditions = condition_samples(
-        poses,
-        recordings,
-        frames,
-        condition=experiment.condition,
-        encoding=experiment.encoding,
-        count=experiment.num_synthetic,
-        order=experiment.pose_order,
-        views=experiment.pose_views,
-        seed=experiment.seed,
-        label=f"{experiment.condition.name}, to sample",
-    )
+    frame_conditions = condition_training_frames(experiment, recordings, frames, experiment.condition)
+    sample_conditions = condition_asked_samples(experiment, poses, recordings, frames, experiment.condition)
     sheet = contact_sheet(
         frames,
         frame_conditions,
@@ -64,10 +48,47 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
     )
     return PreparedDataset(
         recordings=recordings,
+        poses=poses,
         frames=frames,
         frame_conditions=frame_conditions,
         sample_conditions=sample_conditions,
         contact_sheet=sheet,
+    )
+
+
+def condition_training_frames(
+    experiment: Experiment, recordings: ManifestRef, frames: ManifestRef, condition: ConditionChoice
+) -> ManifestRef:
+    """The conditions a generator learns from."""
+    return condition_frames(
+        recordings,
+        frames,
+        condition=condition,
+        encoding=experiment.encoding,
+        seed=experiment.seed,
+        label=f"{condition.name}, training",
+    )
+
+
+def condition_asked_samples(
+    experiment: Experiment,
+    poses: ManifestRef,
+    recordings: ManifestRef,
+    frames: ManifestRef,
+    condition: ConditionChoice,
+) -> ManifestRef:
+    """The conditions a generator is asked for; of the same labels for every condition."""
+    return condition_samples(
+        poses,
+        recordings,
+        frames,
+        condition=condition,
+        encoding=experiment.encoding,
+        count=experiment.num_synthetic,
+        order=experiment.pose_order,
+        views=experiment.pose_views,
+        seed=experiment.seed,
+        label=f"{condition.name}, to sample",
     )
 
 

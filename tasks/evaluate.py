@@ -16,6 +16,9 @@ from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
+LABELS_OF = "labels of"
+"""Settings that start so score frames of a generator against the labels they were made from."""
+
 
 @stage(version=4, schema=tables.SCORES)
 def score_model(

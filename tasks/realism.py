@@ -24,20 +24,39 @@ MAX_FRAMES = 1000
 """Of a larger set of frames so many, evenly spread."""
 
 
-@stage(version=1, schema=tables.SCORES)
-def realism(out: Output, recordings: Manifest, frames: Manifest, synthetic: Manifest) -> pa.Table:
-    """Events of the test split beside those of the training split, and synthetic beside real training frames.
+@stage(version=2, schema=tables.SCORES)
+def realism(
+    out: Output,
+    recordings: Manifest,
+    frames: Manifest,
+    generated: list[Manifest],
+    reference: Manifest | None,
+    *,
+    names: Sequence[str],
+) -> pa.Table:
+    """Events of the test split beside those of the training split, and generated beside real training frames.
 
-    Rows have the task `realism` and the group `events` or `frames`. Settings: the two sets, `A against B` for their
-    distances and `A against A` for the floor. Distributions lie beside the table.
+    `reference` are other recordings that those of the training split are compared with, `names` those of the
+    generators behind `generated`.
+
+    Rows have the task `realism` and the group `events`, `frames` (of the first generator), `frames of NAME` or, with
+    other recordings as a reference, `reference`. Settings: the two sets, `A against B` for their distances and
+    `A against A` for the floor. Distributions lie beside the table.
     """
-    sets = {split: _summarise_recordings(recordings, split) for split in ("train", "test")}
-    rows, distributions = _compare("events", "train", "test", sets, recordings.ref.digest)
-    sets = {"real": _summarise_frames(frames), "synthetic": _summarise_frames(synthetic)}
-    more_rows, more_distributions = _compare("frames", "real", "synthetic", sets, synthetic.ref.digest)
+    learnt = _summarise_recordings(recordings, "train")
+    found = [_compare("events", "train", "test", learnt, _summarise_recordings(recordings, "test"), recordings)]
+    if reference is not None:
+        splits = sorted({part["split"] for part in reference.attached(tables.PARTS).to_pylist()})
+        theirs = [summary for split in splits for summary in _summarise_recordings(reference, split)]
+        found.append(_compare("reference", "reference", "train", theirs, learnt, recordings))
+    real = _summarise_frames(frames)
+    groups = ["frames", *(f"frames of {name}" for name in names[1:])]
+    for group, name, made in zip(groups, names, generated, strict=True):
+        found.append(_compare(group, "real", name, real, _summarise_frames(made), made))
     schema = distances.DISTRIBUTIONS
-    out.write_table(pa.Table.from_pylist(distributions + more_distributions, schema.arrow()), schema)
-    return pa.Table.from_pylist(rows + more_rows, schema=tables.SCORES.arrow())
+    shares = [row for _, distributions in found for row in distributions]
+    out.write_table(pa.Table.from_pylist(shares, schema.arrow()), schema)
+    return pa.Table.from_pylist([row for rows, _ in found for row in rows], schema=tables.SCORES.arrow())
 
 
 def _summarise_recordings(recordings: Manifest, split: str) -> list[Summary]:
@@ -63,9 +82,15 @@ def _summarise_frames(frames: Manifest) -> list[Summary]:
 
 
 def _compare(
-    group: str, first: str, second: str, sets: dict[str, list[Summary]], data_digest: str
+    group: str,
+    first: str,
+    second: str,
+    of_first: list[Summary],
+    of_second: list[Summary],
+    data: Manifest,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows of the table and of the distributions: two sets, their distances, and the floor of the first."""
+    sets = {first: of_first, second: of_second}
     found = {name: distances.estimate_numbers(summaries) for name, summaries in sets.items()}
     found[f"{second} against {first}"] = distances.estimate_distances(sets[first], sets[second])
     found[f"{first} against {first}"] = distances.estimate_floor(sets[first])
@@ -83,7 +108,7 @@ def _compare(
             "num_samples": sizes[setting.split(" against ")[0]],
             "num_train": 0,
             "model_digest": "",
-            "data_digest": data_digest,
+            "data_digest": data.ref.digest,
         }
         for setting, estimates in found.items()
         for metric, estimate in estimates.items()

@@ -2,9 +2,8 @@
 
 World frame: metres, y up, as in `ctlev_core.body.layer`; a source with another one is turned first (`move_world`).
 
-SMPL turns the body about its pelvis J, not about the origin: x = R (x_rest - J) + J + transl. A rigid motion of the
-world, X' = A X + a, therefore makes R' = A R and transl' = A (J + transl) + a - J. J depends on the body that is
-drawn later; here it is the mean SMPL body's. With any other body the whole motion is shifted by the constant
+SMPL turns the body about its pelvis J (`ctlev_core.body.rigid_motion`), which depends on the body that is drawn later;
+here it is the mean SMPL body's. With any other body a motion that is turned by A is shifted by the constant
 (I - A) (J_body - J), some centimetres, as if the camera stood a little elsewhere. Labels and pictures agree all the
 same, because the pictures are made from the labels.
 """
@@ -95,11 +94,12 @@ def move_world(clip: MotionClip, rotation: np.ndarray, translation: np.ndarray) 
         rotation: [3, 3] float64.
         translation: [3] or [T, 3] float64, m.
     """
+    from ctlev_core.body.rigid_motion import move_roots
     from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 
     pose = clip.pose.copy()
-    pose[:, :3] = axis_angle_from_matrix(rotation @ matrix_from_axis_angle(pose[:, :3]))
-    transl = (REST_PELVIS + clip.transl) @ rotation.T + translation - REST_PELVIS
+    root, transl = move_roots(matrix_from_axis_angle(pose[:, :3]), clip.transl, REST_PELVIS, rotation, translation)
+    pose[:, :3] = axis_angle_from_matrix(root)
     return replace(clip, pose=pose, transl=transl)
 
 

@@ -15,7 +15,8 @@ _HOW_TO_READ = (
     "difference, or between distributions the Wasserstein-1 distance in the unit named and the Jensen-Shannon "
     "divergence (0 = equal, 1 = nothing in common). Floor: the same distance between random halves of the left set. "
     "Bold: the distance lies above the floor's interval. Resampling repeats recordings, which makes divergences a "
-    "little larger: with few recordings their interval may lie above the value."
+    "little larger: with few recordings their interval may lie above the value. Ratio: of the right number to the left "
+    "one, bold beyond a factor of ten."
 )
 _TITLES = {
     "frames": (
@@ -29,8 +30,13 @@ _TITLES = {
         "and recordings differ. Noise rate: events that nothing around joins within 10 ms, a pixel and second in which "
         "nothing happens around.",
     ),
+    "reference": (
+        "How alike are the recordings and the reference?",
+        "Events of the training split beside those of the recordings given as a reference.",
+    ),
 }
-_DISTANCE_COLUMN = 3
+_OF_BASELINE = "How real do the frames of {} look?"
+_RATIO_COLUMN, _DISTANCE_COLUMN = 3, 4
 
 
 def realism_sections(rows: Sequence[dict[str, Any]], distributions: Sequence[dict[str, Any]]) -> list[Section]:
@@ -40,14 +46,17 @@ def realism_sections(rows: Sequence[dict[str, Any]], distributions: Sequence[dic
         rows: of the table `scores` with the task `realism`.
         distributions: of the table `distributions`.
     Returns:
-        One table a group, frames first; the chart follows the frames' where they have values.
+        One table a group, frames first; the chart follows the frames of the first generator where they have values.
     """
     sections: list[Section] = []
     how_to_read = _HOW_TO_READ
-    for group, (title, caption) in _TITLES.items():
+    prefix = "frames of "
+    baselines = {row["group"]: (_OF_BASELINE, "") for row in rows if row["group"].startswith(prefix)}
+    for group, (title, caption) in ({"frames": _TITLES["frames"]} | baselines | _TITLES).items():
         of_group = [row for row in rows if row["group"] == group]
         if of_group:
-            sections.append(_table(of_group, title, f"{caption} {how_to_read}"))
+            titled = title.format(group.removeprefix(prefix))
+            sections.append(_table(of_group, titled, f"{caption} {how_to_read}".strip()))
             how_to_read = "To be read like the table of frames."
         if group == "frames":
             sections += _values([row for row in distributions if row["axis"] == "value"])
@@ -68,7 +77,7 @@ def _values(rows: Sequence[dict[str, Any]]) -> list[Section]:
 
 
 def _table(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
-    """Numbers down; the two sets, their distance and the floor across."""
+    """Numbers down; the two sets, their ratio and distance, and the floor across."""
     found = {(row["setting"], row["metric"]): row for row in rows}
     sets = [name for name in dict.fromkeys(row["setting"] for row in rows) if " against " not in name]
     first, second = (*sets, "", "")[:2]
@@ -79,10 +88,21 @@ def _table(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
         cells = [found.get((setting, metric)) for setting in settings]
         if _is_above(cells[2], cells[3]):
             bold.add((len(body), _DISTANCE_COLUMN))
-        body.append([metric, *(_cell(cell) for cell in cells)])
+        ratio = _ratio(cells[0], cells[1])
+        if ratio is not None and not 0.1 < ratio < 10:
+            bold.add((len(body), _RATIO_COLUMN))
+        numbers, rest = [_cell(cell) for cell in cells[:2]], [_cell(cell) for cell in cells[2:]]
+        body.append([metric, *numbers, "" if ratio is None else _digits(ratio, 2), *rest])
     counts = [next((row["num_samples"] for row in rows if row["setting"] == name), 0) for name in (first, second)]
-    columns = ["number", f"{first} ({counts[0]})", f"{second} ({counts[1]})", "distance", f"floor: {first}, halves"]
+    columns = [
+        "number", f"{first} ({counts[0]})", f"{second} ({counts[1]})", "ratio", "distance", f"floor: {first}, halves",
+    ]  # fmt: skip
     return Table(title, columns, body, caption=caption, bold=bold, footnotes=["In parentheses: recordings."])
+
+
+def _ratio(first: dict[str, Any] | None, second: dict[str, Any] | None) -> float | None:
+    """Of the second number to the first; None where there is none, or the first is 0."""
+    return second["value"] / first["value"] if first and second and first["value"] else None
 
 
 def _is_above(distance: dict[str, Any] | None, floor: dict[str, Any] | None) -> bool:
