@@ -34,7 +34,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
 
-VERSION = 1
+VERSION = 2
 JOINT_SET = "cdehp"
 Place = Literal["indoor", "outdoor"]
 
@@ -248,8 +248,8 @@ def _recording(place: str, folder: Path, options: Options) -> Recording:
         sensor_size=files.SENSOR_SIZE,
         has_events=has_data and not use_images,
         has_event_images=has_data and use_images,
-        has_intensity=has_data and bool(colour),
-        files=(*data, *labels, *colour, *colour_labels) if has_data else tuple(labels),
+        has_intensity=bool(colour),
+        files=(*(data if has_data else ()), *labels, *colour, *colour_labels),
     )
 
 

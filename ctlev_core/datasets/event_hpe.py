@@ -35,7 +35,7 @@ from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_lab
 if TYPE_CHECKING:
     from ctlev_core.camera import Camera
 
-VERSION = 2
+VERSION = 3
 JOINT_SET = "smpl"
 
 EXPECTED_TREE = """expected the preprocessed download of EventHPE (layout `preprocessed`):
@@ -240,8 +240,8 @@ def _recording(poses: Path, layout: str, subject: int, name: str, options: Optio
         sensor_size=size,
         has_events=has_data and layout == "raw",
         has_event_images=has_data and layout != "raw",
-        has_intensity=has_data and bool(grey),
-        files=(*data.values(), *labels.values(), *grey.values()) if has_data else tuple(labels.values()),
+        has_intensity=bool(grey),
+        files=(*(data.values() if has_data else ()), *labels.values(), *grey.values()),
     )
 
 

@@ -241,6 +241,9 @@ def test_colour_pictures_are_dated_by_the_labels(root):
     assert track.images.shape == (4, 480, 848) and track.images[:, 3, 7].tolist() == [100, 101, 102, 103]
     assert track.t_us.tolist() == [8333 * n + 4166 for n in (1, 3, 5, 8)]
     assert not first(root, intensity=False)[0].has_intensity
+    labels_only, options = first(root, condition_subjects=(1,))
+    assert labels_only.has_intensity and not labels_only.has_event_images
+    assert cdehp.read_intensity_frames(labels_only, options).t_us.tolist() == track.t_us.tolist()
 
 
 def test_colour_pictures_before_the_first_event_frame_are_left_out_and_none_run_backwards():

@@ -112,8 +112,11 @@ def test_actions_become_recordings_split_by_subject(root):
 def test_condition_subjects_give_labels_only(layout, tmp_path, request):
     root = request.getfixturevalue("root" if layout == "preprocessed" else "raw")
     recording, options = first(root, condition_subjects=(3,))
-    assert not (recording.has_events or recording.has_event_images or recording.has_intensity)
+    assert not (recording.has_events or recording.has_event_images)
     labels = event_hpe.read_labels(recording, options)
+    # Grey pictures come along, on the clock of the labels: what frame-to-event generators are asked with.
+    pictures = event_hpe.read_intensity_frames(recording, options)
+    assert recording.has_intensity and set(labels.t_us[:2]) <= set(pictures.t_us)
     number = int(labels.t_us[1]) // 15_000
     pixels = project(event_hpe.read_camera(recording, options), pose_values(number)[3])
     np.testing.assert_allclose(labels.joints2d[1], pixels, rtol=1e-4, atol=1e-2)
