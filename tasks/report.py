@@ -134,8 +134,8 @@ def _compared_with_baselines(scores: list[Manifest], generator_names: Sequence[s
     columns = ["baseline", f"{own} - baseline", f"real+{own} - real+baseline", "real+baseline - real"]
     caption = (
         "Differences in the first metric, sample by sample on the same held-out frames; in brackets 95 % over test "
-        "recordings. Bold: the interval excludes 0. All generators learnt from the same frames and were asked for the "
-        "same labels."
+        "recordings. Bold: the interval excludes 0. All generators were asked for the same labels; those that learn, "
+        "learnt from the same frames."
     )
     return [Table("Beside the baselines", columns, body, caption=caption, bold=bold)]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,13 @@ def sample(out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling:
     return _table(conditions, plugin, checkpoint.ref.digest, seeds)
 
 
-@stage(version=1, schema=tables.SYNTHETIC)
+def _input_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
+    plugin = plugins.load_options(arguments["sampling"])
+    files = plugin.module.input_files(plugin.options) if hasattr(plugin.module, "input_files") else []
+    return [(path.name, path) for path in files]
+
+
+@stage(version=1, schema=tables.SYNTHETIC, raw_files=_input_files)
 def simulate(
     out: Output,
     recordings: Manifest,
