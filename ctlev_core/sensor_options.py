@@ -81,6 +81,22 @@ PRESETS = {
         rate_spread=0.5,
         hot_pixel_fraction=0.0008,
     ),
+    # A DVXplorer indoors: what `ctlev_core.sensor_calibration` estimates, on the base `noisy`, from one recording of
+    # 0.59 s of a person before such a camera, 320 x 240 px. Measured are leak, shot noise, its spread over pixels, hot
+    # pixels, and the shortest interval, which is this sensor's period of readout rather than the silence of a pixel.
+    # Thresholds, bandwidth and `log_floor` cannot be told from events and are those of `noisy`.
+    "dvxplorer": SensorOptions(
+        threshold=0.25,
+        threshold_sigma=0.035,
+        cutoff_dark_hz=20.0,
+        refractory_us=197,
+        leak_rate_hz=0.01,
+        shot_rate_hz=0.081,
+        shot_rate_bright=1.0,
+        rate_spread=1.84,
+        hot_pixel_fraction=0.00078,
+        hot_rate_hz=(34.0, 498.0),
+    ),
 }
 
 
