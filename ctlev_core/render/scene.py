@@ -136,7 +136,7 @@ class BodyPainter:
         self.rest = shape_vertices(self.body, subject.betas)
         self._vertices, self._normals = np.empty_like(self.rest), np.empty_like(self.rest)
         self._colours = np.empty_like(subject.albedo)
-        self._image = self.background.repeat(SUPERSAMPLING, axis=0).repeat(SUPERSAMPLING, axis=1)
+        self._image = np.empty((SUPERSAMPLING * height, SUPERSAMPLING * width, shape[2]), np.float32)
         self._depth_inverse = np.zeros(self._image.shape[:2], np.float32)
 
     def in_camera(self, rotations: np.ndarray, transl: np.ndarray) -> np.ndarray:
@@ -173,8 +173,7 @@ class BodyPainter:
             rasterise(
                 self._vertices, body.faces, self._colours, self._K, NEAR_M, True, self._image, self._depth_inverse
             )
-            _average_blocks(self._image, left, top, patch)
-            _restore(self.background, left, top, right, bottom, self._image, self._depth_inverse)
+            _average_blocks(self._image, self._depth_inverse, self.background, left, top, patch)
         return left, top, patch
 
 
@@ -280,23 +279,21 @@ def _find_box(vertices, K, near, width, height):
 
 
 @numba.njit(cache=True, nogil=True)
-def _average_blocks(image, left, top, out):
-    """Means over blocks of SUPERSAMPLING x SUPERSAMPLING pixels, into `out`, whose first is at (left, top)."""
+def _average_blocks(image, depth_inverse, background, left, top, out):
+    """Means over blocks of SUPERSAMPLING x SUPERSAMPLING pixels, into `out`, whose first is at (left, top).
+
+    Where no surface is, the background counts. What is read of the depth is put back to 0, for the next picture.
+    """
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             for k in range(out.shape[2]):
-                total = np.float32(0.0)
+                behind, total = background[top + row, left + column, k], np.float32(0.0)
                 for dy in range(SUPERSAMPLING):
                     for dx in range(SUPERSAMPLING):
-                        total += image[SUPERSAMPLING * (top + row) + dy, SUPERSAMPLING * (left + column) + dx, k]
+                        y, x = SUPERSAMPLING * (top + row) + dy, SUPERSAMPLING * (left + column) + dx
+                        total += image[y, x, k] if depth_inverse[y, x] > 0.0 else behind
                 out[row, column, k] = total / np.float32(SUPERSAMPLING * SUPERSAMPLING)
-
-
-@numba.njit(cache=True, nogil=True)
-def _restore(background, left, top, right, bottom, image, depth_inverse):
-    """Put the background back into a box of the picture that is drawn on."""
-    for row in range(SUPERSAMPLING * top, SUPERSAMPLING * bottom):
-        for column in range(SUPERSAMPLING * left, SUPERSAMPLING * right):
-            depth_inverse[row, column] = 0.0
-            for k in range(image.shape[2]):
-                image[row, column, k] = background[row // SUPERSAMPLING, column // SUPERSAMPLING, k]
+    depth_inverse[
+        SUPERSAMPLING * top : SUPERSAMPLING * (top + out.shape[0]),
+        SUPERSAMPLING * left : SUPERSAMPLING * (left + out.shape[1]),
+    ] = 0.0
