@@ -1,118 +1,97 @@
-"""The dataset the project makes itself: a procedural body moves, a camera watches, a DVS pixel model sends events.
+"""The dataset the project makes itself: a procedural body moves, cameras watch, a DVS pixel model sends events.
 
 It stands in for recordings of real people, which users must download under their own licences. Training recordings
 show four subjects and the SEEN motions; tests show two other subjects and all motions; `condition` recordings carry
-labels only: poses of the UNSEEN motions by random people, from which synthetic data is sampled. The HELD_OUT motions
-appear in tests alone.
+labels, and grey pictures where asked for, but no events: random people in UNSEEN motions, from whose poses synthetic
+data is sampled. The HELD_OUT motions appear in tests alone.
+
+Recordings like those of a real dataset are options: DHP19 is 346 x 260 px, `dhp19`, 4 cameras; CDEHP is 1280 x 800 px,
+`cdehp`, Event-HPE a square sensor, `smpl`, both with intensity frames.
 
 Layout of the splits: the trial of ControlEvents' DHP19 protocol, with motions in the place of sessions.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
 
 from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
-from data_contracts.config import Frozen
+from ctlev_core.sensor_options import PRESETS, SensorOptions, read_preset
+from ctlev_core.studio_options import Options
 from data_contracts.errors import DataError
 from data_contracts.events import Events
-from data_contracts.labels import Labels, Part, Recording, check_labels
+from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
 
 if TYPE_CHECKING:
     from ctlev_core.body.motions import MotionStyle
     from ctlev_core.camera import Camera
+    from ctlev_core.render.moving_body import MovingBody
     from ctlev_core.render.scene import Subject
 
-VERSION = 2
+__all__ = [
+    "MOTIONS_OF_SPLIT", "SPLIT_NAMES", "VERSION", "Options", "list_recordings", "read_events", "read_intensity_frames",
+    "read_labels",
+]  # fmt: skip
+
+VERSION = 3
 SPLIT_NAMES = ("train", "test", "condition")
 MOTIONS_OF_SPLIT = {"train": SEEN, "test": SEEN + UNSEEN + HELD_OUT, "condition": UNSEEN}
 # Streams of random numbers, each with its own seed, so that any recording can be made alone.
-SUBJECT_STREAM, SENSOR_STREAM, SCENE_STREAM, NOISE_STREAM = 10, 11, 12, 13
-
-
-class Options(Frozen):
-    """Options of the studio. The defaults are a small set that is made in about a minute on one core."""
-
-    seed: int = Field(default=0, ge=0, description="Everything in the studio follows from it.")
-    sensor_size: tuple[int, int] = Field(default=(64, 64), description="(width, height) px.")
-    num_train_recordings: int = Field(default=600, ge=0, description="Recordings of subjects 0 to 3, SEEN motions.")
-    num_test_recordings: int = Field(
-        default=300, ge=0, description="Recordings of subjects 4 and 5, all motions in turn."
-    )
-    num_condition_recordings: int = Field(
-        default=1200, ge=0, description="Label-only poses of random people, UNSEEN motions."
-    )
-    recording_duration_us: int = Field(default=250_000, ge=10_000, description="Length of a recording.")
-    render_rate_hz: float = Field(
-        default=250.0, gt=0, le=10_000, description="Pictures a second the sensor model sees."
-    )
-    label_rate_hz: float = Field(
-        default=200.0, gt=0, le=10_000, description="Labels a second; DHP19's motion capture has 100."
-    )
-    num_train_subjects: int = Field(default=4, ge=1, description="Subjects 0 .. n - 1.")
-    num_test_subjects: int = Field(default=2, ge=1, description="The subjects after those.")
-    num_sensors: int = Field(
-        default=2, ge=1, description="Individual sensors, each with its own mismatch and hot pixels."
-    )
-    sensor_preset: Literal["noisy", "ideal"] = Field(
-        default="noisy", description="A key of `ctlev_core.sensor.PRESETS`."
-    )
-    joint_set: Literal["dhp19", "smpl"] = Field(
-        default="dhp19", description="13 markers as DHP19 labels them, or the 24 joints of SMPL as Event-HPE does"
-    )
-    occlusion: bool = Field(
-        default=False, description="joints that the body itself hides are not visible; markers' labels do not say"
-    )
-    yaw_range_deg: tuple[float, float] = Field(
-        default=(0.0, 360.0), description="from where the camera looks at people who face +z; 0 = from the front"
-    )
-    textured: bool = Field(default=True, description="False: grey people before a plain wall, as in naive simulations.")
+SUBJECT_STREAM, SENSOR_STREAM, SCENE_STREAM, NOISE_STREAM, CAMERA_STREAM = 10, 11, 12, 13, 14
+KEY_POSE_RATE_HZ = 200.0
+"""Between key poses joints turn at constant speed. A hand at 300 m/s^2 is then 1 mm off its smooth path."""
+RECORDING_ID = re.compile(r"(?P<split>\w+)/.+_(?P<index>\d{5,})(_cam(?P<camera>\d+))?")
 
 
 def list_recordings(options: Options) -> list[Recording]:
-    """Every recording, split by split; motions and subjects take turns."""
+    """Every recording, split by split; motions and subjects take turns, and within a performance the cameras.
+
+    Raises:
+        DataError: there is no such sensor preset.
+    """
+    _sensor_options(options)
     counts = (options.num_train_recordings, options.num_test_recordings, options.num_condition_recordings)
     return [
-        _recording(split, index, options)
+        _recording(split, index, camera, options)
         for split, count in zip(SPLIT_NAMES, counts, strict=True)
         for index in range(count)
+        for camera in range(options.num_cameras if split != "condition" else 1)
     ]
 
 
-def _recording(split: str, index: int, options: Options) -> Recording:
+def _recording(split: str, index: int, camera: int, options: Options) -> Recording:
     motions = MOTIONS_OF_SPLIT[split]
     motion, turn = motions[index % len(motions)], index // len(motions)
+    has_events = split != "condition"
     if split == "train":
         subject = f"subject{turn % options.num_train_subjects}"
     elif split == "test":
         subject = f"subject{options.num_train_subjects + turn % options.num_test_subjects}"
     else:
         subject = f"stranger{index}"
+    suffix = f"_cam{camera}" if has_events and options.num_cameras > 1 else ""
+    is_file = has_events and options.sensor_preset not in PRESETS
     return Recording(
-        recording_id=f"{split}/{subject}_{motion}_{index:05d}",
+        recording_id=f"{split}/{subject}_{motion}_{index:05d}{suffix}",
         subject=subject,
         parts=(Part(split),),
         class_name=motion,
         sensor_size=options.sensor_size,
-        has_events=split != "condition",
+        has_events=has_events,
+        has_intensity=options.intensity_rate_hz is not None,
+        files=(Path(options.sensor_preset),) if is_file else (),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Performance:
-    """Who does what before which camera: all that labels and pictures of a recording have in common."""
-
-    style: MotionStyle
-    betas: np.ndarray
-    camera: Camera
-
-
 def read_labels(recording: Recording, options: Options) -> Labels:
-    """Joints in 2D and 3D and the SMPL body at `label_rate_hz` from time 0 on; a label-only recording has one moment.
+    """Joints in 2D and 3D and the SMPL body from time 0 on, at `label_rate_hz`.
+
+    A label-only recording has them at about `condition_rate_hz`, evenly spread, at both of its ends too.
 
     Raises:
         DataError: the recording is not one of the studio with these options.
@@ -121,101 +100,175 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     from ctlev_core.body_views import labels_in_camera, with_joints
 
     performance = _perform(recording, options)
-    t_us = _times_us(options.label_rate_hz, options) if recording.has_events else np.zeros(1, dtype=np.int64)
+    if recording.has_events:
+        t_us = _times_us(options.label_rate_hz, options)
+    else:
+        spans = max(round(1e-6 * options.recording_duration_us * options.condition_rate_hz), 1)
+        t_us = np.rint(np.linspace(0, options.recording_duration_us, spans + 1)).astype(np.int64)
     rotations, transl = pose_at(recording.class_name, 1e-6 * t_us, performance.style)
     labels = labels_in_camera(
-        rotations, transl, performance.betas, performance.camera, class_name=recording.class_name, t_us=t_us
+        rotations, transl, performance.subject.betas, performance.camera, class_name=recording.class_name, t_us=t_us
     )
     seen = with_joints(labels, options.sensor_size, options.joint_set, options.occlusion)
     return check_labels(seen, recording.recording_id)
 
 
 def read_events(recording: Recording, options: Options) -> Events:
-    """Render the recording and send it through the sensor; time 0 is the first picture.
+    """Film the recording, as densely in time as its motion asks for, and send it through the sensor.
 
     Raises:
-        DataError: the recording is not one of the studio with these options, or carries labels only.
+        DataError: the recording is not one of the studio with these options, carries labels only, or has more than
+            `max_events`.
     """
-    from ctlev_core.sensor import PRESETS, simulate_events
-
-    intensity, t_us = read_frames(recording, options)
-    entropy = _entropy(recording, options)
-    sensor = int(np.random.default_rng([*entropy, SENSOR_STREAM]).integers(options.num_sensors))
-    return simulate_events(
-        intensity,
-        t_us,
-        PRESETS[options.sensor_preset],
-        sensor_seed=[options.seed, SENSOR_STREAM, sensor],
-        seed=[*entropy, NOISE_STREAM],
-    )
-
-
-def read_frames(recording: Recording, options: Options) -> tuple[np.ndarray, np.ndarray]:
-    """The pictures the sensor watches: linear intensity [T, H, W] float32 in (0, 1] and their times [T] int64, us.
-
-    Raises:
-        DataError: the recording is not one of the studio with these options, or carries labels only.
-    """
-    from ctlev_core.body.motions import pose_at
-    from ctlev_core.render.scene import render_body_frames, sample_background, sample_light
+    from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
+    from ctlev_core.sensor import EventBudgetError
 
     if not recording.has_events:
-        raise DataError(f"studio recording {recording.recording_id!r} carries labels only; there is nothing to see")
-    performance = _perform(recording, options)
-    rng = np.random.default_rng([*_entropy(recording, options), SCENE_STREAM])
-    subject = _subject(recording, options)
-    background = sample_background(rng, options.sensor_size, colour=False)
-    light = sample_light(rng)
-    if not options.textured:
-        subject = replace(subject, albedo=np.full_like(subject.albedo, 0.5))
-        background = np.full_like(background, background.mean())
-    t_us = _times_us(options.render_rate_hz, options)
-    rotations, transl = pose_at(recording.class_name, 1e-6 * t_us, performance.style)
-    frames = render_body_frames(subject, rotations, transl, performance.camera, background, light)
-    return frames[..., 0], t_us
+        raise DataError(f"studio recording {recording.recording_id!r} has no events")
+    *entropy, camera = _entropy(recording, options)
+    film = _film(recording, options)
+    sensor = int(np.random.default_rng([*entropy, camera, SENSOR_STREAM]).integers(options.num_sensors))
+    try:
+        events, _ = simulate_rendered(
+            film,
+            0,
+            options.recording_duration_us,
+            _sensor_options(options),
+            RenderingOptions(max_displacement_px=options.max_displacement_px),
+            sensor_seed=[options.seed, SENSOR_STREAM, camera, sensor],
+            seed=[*entropy, camera, NOISE_STREAM],
+            speed_bound=film.speed_bound,
+            background=film.background,
+            max_events=options.max_events,
+        )
+    except EventBudgetError as error:
+        raise EventBudgetError(f"studio recording {recording.recording_id!r}: {error}", error.events) from None
+    return events
+
+
+def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:
+    """Grey pictures at `intensity_rate_hz` from time 0 on: 255 times the linear intensity, without noise or blur.
+
+    Raises:
+        DataError: the recording is not one of the studio with these options, or has no pictures.
+    """
+    if options.intensity_rate_hz is None:
+        raise DataError(f"studio recording {recording.recording_id!r} has no pictures without intensity_rate_hz")
+    t_us = _times_us(options.intensity_rate_hz, options)
+    frames = _film(recording, options).render_frames(1e-6 * t_us)
+    return ImageTrack(np.rint(255.0 * frames).astype(np.uint8), t_us)
+
+
+@dataclass(frozen=True, eq=False)
+class _Performance:
+    """Who does what before which camera: all that labels and pictures of a recording have in common."""
+
+    style: MotionStyle
+    subject: Subject
+    camera: Camera
+    first_camera: Camera
+    """The one whose frame the lamp is drawn in, for one lamp lights the performance for all of them."""
 
 
 def _perform(recording: Recording, options: Options) -> _Performance:
     from ctlev_core.body.layer import joint_transforms, load_body
     from ctlev_core.body.motions import pose_at, sample_style
-    from ctlev_core.render.scene import sample_betas
+
+    *entropy, number = _entropy(recording, options)
+    style = sample_style(recording.class_name, np.random.default_rng(entropy))
+    subject = _subject(recording, entropy, options)
+    # Cameras look at the middle of all that happens.
+    framed_s = 1e-6 * options.recording_duration_us * np.array([0.0, 0.5, 1.0])
+    rotations, transl = pose_at(recording.class_name, framed_s, style)
+    _, joints = joint_transforms(load_body(), rotations, subject.betas, transl)
+    count = options.num_cameras if recording.has_events else 1
+    cameras = [_camera(entropy, camera, count, joints, options) for camera in dict.fromkeys((0, number))]
+    return _Performance(style, subject, cameras[-1], cameras[0])
+
+
+def _camera(entropy: list[int], number: int, count: int, joints: np.ndarray, options: Options) -> Camera:
+    """One of `count` cameras; each has its own part of the range of yaw, so that they stand around the person."""
     from ctlev_core.virtual_camera import CameraRange, sample_camera
 
-    rng = np.random.default_rng(_entropy(recording, options))
-    style = sample_style(recording.class_name, rng)
-    betas = _subject(recording, options).betas if recording.has_events else sample_betas(rng)
-    # The camera looks at the middle of all that happens; a label-only recording is its first moment.
-    framed_s = 1e-6 * options.recording_duration_us * np.array([0.0, 0.5, 1.0] if recording.has_events else [0.0])
-    rotations, transl = pose_at(recording.class_name, framed_s, style)
-    _, joints = joint_transforms(load_body(), rotations, betas, transl)
     low, high = np.deg2rad(options.yaw_range_deg)
-    camera = sample_camera(rng, joints, options.sensor_size, CameraRange(yaw_rad=(low, high)))
-    return _Performance(style, betas, camera)
+    part = (high - low) / count
+    ranges = CameraRange(
+        distance_m=options.distance_m,
+        yaw_rad=(low + number * part, low + (number + 1) * part),
+        focal_per_side=options.focal_per_side,
+    )
+    rng = np.random.default_rng([*entropy, number, CAMERA_STREAM])
+    return sample_camera(rng, joints, options.sensor_size, ranges)
 
 
-def _subject(recording: Recording, options: Options) -> Subject:
-    """The person, who looks the same in all recordings."""
+def _subject(recording: Recording, entropy: list[int], options: Options) -> Subject:
+    """The person; a subject looks the same in all recordings, and a stranger is seen once."""
     from ctlev_core.render.scene import sample_subject
 
-    number = int(recording.subject.removeprefix("subject"))
-    return sample_subject(np.random.default_rng([options.seed, SUBJECT_STREAM, number]), colour=False)
+    is_stranger = recording.subject.startswith("stranger")
+    number = entropy[1:] if is_stranger else [int(recording.subject.removeprefix("subject"))]
+    return sample_subject(np.random.default_rng([options.seed, SUBJECT_STREAM, *number]), colour=False)
+
+
+def _film(recording: Recording, options: Options) -> MovingBody:
+    """The person in motion, under a light and before a wall drawn at random."""
+    from ctlev_core.body.motions import pose_at
+    from ctlev_core.render.moving_body import MovingBody
+    from ctlev_core.render.scene import sample_background, sample_light
+
+    performance = _perform(recording, options)
+    *entropy, number = _entropy(recording, options)
+    rng = np.random.default_rng([*entropy, SCENE_STREAM])
+    light, brightness = sample_light(rng), rng.uniform(*options.brightness)
+    light = replace(light, direction=performance.camera.R @ performance.first_camera.R.T @ light.direction)
+    wall = np.random.default_rng([*entropy, number, SCENE_STREAM])
+    background, albedo = sample_background(wall, options.sensor_size, colour=False), performance.subject.albedo
+    if not options.textured:
+        background, albedo = np.full_like(background, background.mean()), np.full_like(albedo, 0.5)
+    subject = replace(performance.subject, albedo=np.float32(brightness) * albedo)
+    spans = int(np.ceil(1e-6 * options.recording_duration_us * KEY_POSE_RATE_HZ))
+    t_s = np.arange(spans + 1) / KEY_POSE_RATE_HZ
+    poses = pose_at(recording.class_name, t_s, performance.style)
+    return MovingBody(subject, t_s, *poses, performance.camera, np.float32(brightness) * background, light)
+
+
+def _sensor_options(options: Options) -> SensorOptions:
+    """The kind of sensor that the preset and the amount of noise make."""
+    preset = PRESETS.get(options.sensor_preset)
+    if preset is None:
+        path = Path(options.sensor_preset)
+        if not path.is_file():
+            raise DataError(
+                f"studio: unknown sensor_preset {options.sensor_preset!r}: known are {', '.join(PRESETS)} and YAML "
+                "files, and there is no file of that name"
+            )
+        preset = read_preset(path)
+    return preset.model_copy(
+        update={
+            "threshold_sigma": options.noise * preset.threshold_sigma,
+            "leak_rate_hz": options.noise * preset.leak_rate_hz,
+            "shot_rate_hz": options.noise * preset.shot_rate_hz,
+            "hot_pixel_fraction": min(options.noise * preset.hot_pixel_fraction, 1.0),
+        }
+    )
 
 
 def _times_us(rate_hz: float, options: Options) -> np.ndarray:
     """Times [T] int64 from 0 to the end of a recording."""
-    count = int(1e-6 * options.recording_duration_us * rate_hz) + 1
+    # A time that is the end but for rounding belongs to the recording.
+    count = int(1e-6 * options.recording_duration_us * rate_hz + 1e-6) + 1
     return np.rint(np.arange(count) * (1e6 / rate_hz)).astype(np.int64)
 
 
 def _entropy(recording: Recording, options: Options) -> list[int]:
-    """What seeds a recording: the studio's seed, the split and the index within it.
+    """What seeds a recording: the studio's seed, the split, the index within it, and the camera.
 
     Raises:
         DataError: the studio with these options has no such recording.
     """
-    split, _, name = recording.recording_id.partition("/")
-    index = name.rpartition("_")[2]
-    known = split in SPLIT_NAMES and index.isdecimal()
-    if not known or recording != _recording(split, int(index), options):
-        raise DataError(f"the studio with these options has no recording {recording.recording_id!r}")
-    return [options.seed, SPLIT_NAMES.index(split), int(index)]
+    name = RECORDING_ID.fullmatch(recording.recording_id)
+    if name and name["split"] in SPLIT_NAMES:
+        split, index, camera = name["split"], int(name["index"]), int(name["camera"] or 0)
+        if camera < options.num_cameras and recording == _recording(split, index, camera, options):
+            return [options.seed, SPLIT_NAMES.index(split), index, camera]
+    raise DataError(f"the studio with these options has no recording {recording.recording_id!r}")

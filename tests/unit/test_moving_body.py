@@ -106,7 +106,8 @@ def test_the_patch_is_the_whole_picture(place):
 def test_a_picture_leaves_no_traces():
     filmed = film(1)
     first = filmed(0.02).intensity.copy()
-    filmed(0.17), filmed(0.2)
+    for other_s in (0.17, 0.2):
+        filmed(other_s)
     again = filmed(0.02).intensity
     assert np.array_equal(first, again)
     frames = filmed.render_frames([0.02, 0.17])

@@ -10,12 +10,18 @@ import pytest
 
 from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.datasets import studio
+from ctlev_core.sensor import PRESETS, EventBudgetError, simulate_events
+from ctlev_core.skeletons import JOINT_SETS
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
-from data_contracts.labels import check_labels
+from data_contracts.labels import check_image_track, check_labels
 
 OPTIONS = studio.Options(num_train_recordings=24, num_test_recordings=40, num_condition_recordings=26)
 RECORDINGS = studio.list_recordings(OPTIONS)
+
+
+def changed(**changes):
+    return studio.Options(**OPTIONS.model_dump() | changes)
 
 
 def of_split(split):
@@ -116,22 +122,177 @@ def test_labels_do_not_depend_on_their_rate():
     np.testing.assert_allclose(coarse.joints2d, fine.joints2d[::4], atol=1e-4)
 
 
-def test_frames_are_intensities_in_time():
-    frames, t_us = studio.read_frames(RECORDINGS[0], OPTIONS)
-    assert frames.shape == (63, 64, 64) and frames.dtype == np.float32 and t_us[1] == 4000
-    assert frames.min() > 0 and frames.max() <= 1
-    assert np.abs(np.diff(frames, axis=0)).max() > 0.05
+@pytest.mark.parametrize("split", ["train", "condition"])
+def test_intensity_frames_are_pictures_in_time(split):
+    assert not any(recording.has_intensity for recording in RECORDINGS)
+    options = changed(intensity_rate_hz=40.0, brightness=(0.5, 0.5))
+    recording = next(r for r in studio.list_recordings(options) if r.parts[0].split == split)
+    assert recording.has_intensity
+    track = check_image_track(studio.read_intensity_frames(recording, options), "test")
+    assert track.images.shape == (11, 64, 64) and track.t_us.tolist() == list(range(0, 250_001, 25_000))
+    # Something moves, and half the light is half the intensity.
+    assert np.abs(np.diff(track.images.astype(int), axis=0)).max() > 20
+    bright = studio.read_intensity_frames(recording, changed(intensity_rate_hz=40.0)).images
+    assert np.abs(2.0 * track.images - bright).max() <= 1.5
+    with pytest.raises(DataError, match="intensity_rate_hz"):
+        studio.read_intensity_frames(RECORDINGS[0], OPTIONS)
 
 
-def test_condition_recordings_are_one_visible_moment():
-    joints = []
+def test_condition_recordings_are_tracks_of_labels():
+    joints, shapes = [], []
     for recording in of_split("condition"):
         labels = check_labels(studio.read_labels(recording, OPTIONS), recording.recording_id)
-        assert labels.t_us.tolist() == [0] and labels.visible.mean() > 0.8
-        joints.append(labels.joints2d[0])
-    assert np.std(joints, axis=0).mean() > 2
-    with pytest.raises(DataError, match="labels only"):
+        assert labels.t_us.tolist() == [0, 50_000, 100_000, 150_000, 200_000, 250_000]
+        assert labels.visible.mean() > 0.8
+        joints.append(labels.joints2d)
+        shapes.append(labels.smpl_betas[0])
+    assert np.std([track[0] for track in joints], axis=0).mean() > 2
+    assert np.median([np.abs(np.diff(track, axis=0)).max() for track in joints]) > 1
+    assert len(np.unique(shapes, axis=0)) == len(shapes)
+    with pytest.raises(DataError, match="has no events"):
         studio.read_events(of_split("condition")[0], OPTIONS)
+    coarse = changed(condition_rate_hz=1.0)
+    assert studio.read_labels(studio.list_recordings(coarse)[-1], coarse).t_us.tolist() == [0, 250_000]
+
+
+def test_cameras_stand_around_the_same_performance():
+    options = changed(num_cameras=4, num_sensors=1)
+    views = studio.list_recordings(options)[4:8]
+    assert [view.recording_id for view in views] == [f"train/subject0_run_00001_cam{i}" for i in range(4)]
+    assert len(studio.list_recordings(options)) == 4 * (24 + 40) + 26
+    labels = [studio.read_labels(view, options) for view in views]
+    films = [studio._film(view, options) for view in views]
+    for track, film in zip(labels[1:], films[1:], strict=True):
+        assert np.array_equal(track.t_us, labels[0].t_us)
+        np.testing.assert_allclose(track.smpl_pose[:, 3:], labels[0].smpl_pose[:, 3:], atol=1e-5)
+        # One rigid motion carries what one camera sees to what the other sees: all distances, over time too, agree.
+        points, first = (each.joints3d.reshape(-1, 3).astype(np.float64) for each in (track, labels[0]))
+        np.testing.assert_allclose(
+            np.linalg.norm(points[::7, None] - points[::7], axis=-1),
+            np.linalg.norm(first[::7, None] - first[::7], axis=-1),
+            atol=0.01,
+        )
+        assert np.abs(track.joints2d[0] - labels[0].joints2d[0]).max() > 3
+        # The lamp stands where it is.
+        lamps = [each._painter.camera.R.T @ each._painter.light.direction for each in (film, films[0])]
+        np.testing.assert_allclose(*lamps, atol=1e-12)
+        assert np.array_equal(film._painter.subject.albedo, films[0]._painter.subject.albedo)
+    # From the front, the right, the back and the left: a quarter of the range each.
+    yaw_deg = [np.rad2deg(np.arctan2(-film._painter.camera.R[2, 0], -film._painter.camera.R[2, 2])) for film in films]
+    assert sorted(np.floor(np.mod(yaw_deg, 360) / 90)) == [0, 1, 2, 3]
+
+
+def test_each_camera_has_a_sensor_of_its_own():
+    """Pixels that are busy at the left edge, where nobody is: the same ones in each recording of a camera."""
+    options = changed(num_cameras=2, num_sensors=1, noise=8.0)
+    busy = []
+    for recording in studio.list_recordings(options)[:4]:
+        events = studio.read_events(recording, options)
+        counts = np.bincount(events.y.astype(int) * 64 + events.x, minlength=4096)
+        busy.append(frozenset(np.flatnonzero(counts.reshape(64, 64)[:, :5] >= 10)))
+
+    def overlap(first, second):
+        return len(busy[first] & busy[second]) / len(busy[first] | busy[second])
+
+    assert overlap(0, 2) > 0.5 < overlap(1, 3) and overlap(0, 1) < 0.2 > overlap(2, 3)
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_every_sensor_preset_records(preset):
+    options = changed(sensor_preset=preset)
+    events = studio.read_events(studio.list_recordings(options)[1], options)
+    assert len(check_events(events, preset)) > 500
+
+
+def test_a_sensor_from_a_file_is_an_input(tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text("threshold: 0.31\nleak_rate_hz: 2.0\n")
+    options = changed(sensor_preset=str(path))
+    recordings = studio.list_recordings(options)
+    assert recordings[0].files == (path,) and recordings[-1].files == () and not RECORDINGS[0].files
+    first = studio.read_events(recordings[1], options)
+    path.write_text("threshold: 0.11\n")
+    assert len(studio.read_events(recordings[1], options)) > 1.5 * len(first)
+    path.write_text("threshold: -1\n")
+    with pytest.raises(DataError, match=r"camera\.yaml"):
+        studio.list_recordings(options)
+    with pytest.raises(DataError, match=r"'loud'.*clean, noisy, dvs346"):
+        studio.list_recordings(changed(sensor_preset="loud"))
+
+
+def test_noise_is_a_matter_of_degree():
+    """Corners, where nobody is: silent without noise, and twice the noise sends twice the events."""
+    counts = []
+    for noise in (0.0, 1.0, 2.0):
+        options = changed(noise=noise)
+        total = 0
+        for recording in of_split("train")[:6]:
+            events = studio.read_events(recording, options)
+            total += np.count_nonzero((events.x < 6) | (events.x >= 58))
+        counts.append(total)
+    assert counts[0] < 0.1 * counts[1] and 1.5 < counts[2] / counts[1] < 2.6
+
+
+def test_people_are_as_large_as_asked_for():
+    spread = []
+    for focal in (0.75, 1.5):
+        options = changed(focal_per_side=(focal, focal))
+        labels = studio.read_labels(RECORDINGS[0], options)
+        spread.append(np.ptp(labels.joints2d[0, :, 1]))
+    assert spread[1] / spread[0] == pytest.approx(2, rel=1e-4)
+
+
+def test_events_are_nearly_those_of_many_more_pictures():
+    options = changed(sensor_preset="ideal", sensor_size=(96, 96))
+    recording = studio.list_recordings(options)[1]
+    events = studio.read_events(recording, options)
+    film, t_us = studio._film(recording, options), np.arange(0, 250_001, 250)
+    dense = simulate_events(film.render_frames(1e-6 * t_us), t_us, PRESETS["ideal"], sensor_seed=0, seed=0)
+    assert len(events) == pytest.approx(len(dense), rel=0.1)
+    counts = [np.bincount(e.y.astype(int) * 96 + e.x, minlength=96 * 96) for e in (events, dense)]
+    assert np.abs(counts[0] - counts[1]).sum() < 0.15 * len(dense)
+
+
+def test_too_many_events_are_an_error_that_says_where():
+    with pytest.raises(EventBudgetError, match=r"'train/subject0_walk_00000'.*max_events = 100 ") as caught:
+        studio.read_events(RECORDINGS[0], changed(max_events=100))
+    assert 0 < len(caught.value.events) <= 100
+
+
+LIKE = {
+    "dhp19": {"sensor_size": (346, 260), "num_cameras": 4, "recording_duration_us": 30_000},
+    "cdehp": {"sensor_size": (1280, 800), "intensity_rate_hz": 60.0, "recording_duration_us": 10_000},
+    "smpl": {"sensor_size": (256, 256), "intensity_rate_hz": 25.0, "recording_duration_us": 40_000},
+}
+
+
+@pytest.mark.parametrize("joint_set", LIKE)
+def test_recordings_like_those_of_real_datasets(joint_set):
+    options = studio.Options(
+        joint_set=joint_set, num_train_recordings=1, num_test_recordings=1, num_condition_recordings=1,
+        max_displacement_px=2.0, **LIKE[joint_set],
+    )  # fmt: skip
+    recordings = studio.list_recordings(options)
+    assert len(recordings) == 2 * options.num_cameras + 1
+    for recording in (recordings[options.num_cameras - 1], recordings[-1]):
+        labels = check_labels(studio.read_labels(recording, options), recording.recording_id)
+        assert labels.joint_set == joint_set and labels.joints2d.shape[1] == len(JOINT_SETS[joint_set].joints)
+        if recording.has_intensity:
+            track = check_image_track(studio.read_intensity_frames(recording, options), recording.recording_id)
+            assert track.images.shape[1:] == options.sensor_size[::-1]
+        if recording.has_events:
+            events = check_events(studio.read_events(recording, options), recording.recording_id)
+            assert events.sensor_size == options.sensor_size and len(events) > 1000
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"focal_per_side": (2.0, 1.0)}, {"distance_m": (0.0, 1.0)}, {"brightness": (0.5, 1.5)}, {"sensor_size": (0, 4)}],
+    ids=str,
+)
+def test_ranges_are_checked(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        studio.Options(**wrong)
 
 
 def test_other_sensor_sizes_and_durations():
@@ -147,6 +308,7 @@ def test_unknown_recordings_are_refused():
         replace(RECORDINGS[0], recording_id="train/subject1_walk_00000"),
         replace(RECORDINGS[0], subject="subject5"),
         replace(RECORDINGS[0], recording_id="nothing"),
+        replace(RECORDINGS[0], recording_id=f"{RECORDINGS[0].recording_id}_cam0"),
     ]
     for recording in wrong:
         with pytest.raises(DataError, match="has no recording"):
