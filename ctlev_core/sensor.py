@@ -50,6 +50,9 @@ class EventBudgetError(DataError):
         super().__init__(message)
         self.events = events
 
+    def __reduce__(self) -> tuple:
+        return type(self), (str(self), self.events)  # exceptions are pickled with their message alone
+
 
 class Sensor:
     """A sensor that is shown frames one after the other, in any portions, and sends the same events.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 
 from ctlev_core import plugins
 from data_contracts.config import Frozen
@@ -18,7 +19,7 @@ from flows.prepare_dataset import (
 from flows.settings import flow
 from tasks.finetune import finetune
 from tasks.sample import sample, simulate
-from tasks.stage import call_flow
+from tasks.stage import call_flow, call_together
 
 
 class BaselineFrames(Frozen):
@@ -34,30 +35,29 @@ def baselines(experiment: Experiment, dataset: PreparedDataset | None = None) ->
     """Train each baseline that learns, and sample all; the dataset is prepared first unless it is given."""
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
-    made: dict[str, BaselineFrames] = {}
-    for name, baseline in experiment.baselines.items():
-        asked = condition_asked_samples(
-            experiment, dataset.poses, dataset.recordings, dataset.frames, baseline.condition
+    prepared = dataset
+    calls = [partial(_make, experiment, prepared, name) for name in experiment.baselines]
+    return dict(zip(experiment.baselines, call_together(*calls), strict=True))
+
+
+def _make(experiment: Experiment, dataset: PreparedDataset, name: str) -> BaselineFrames:
+    baseline = experiment.baselines[name]
+    asked = condition_asked_samples(experiment, dataset.poses, dataset.recordings, dataset.frames, baseline.condition)
+    if hasattr(plugins.load("generators", baseline.generator.name), "sample_events"):
+        synthetic = simulate(
+            dataset.recordings,
+            asked,
+            sampling=baseline.sampling_choice,
+            encoding=experiment.encoding,
+            windows=experiment.windows,
+            seed=experiment.seed,
+            label=name,
         )
-        if hasattr(plugins.load("generators", baseline.generator.name), "sample_events"):
-            checkpoint = None
-            synthetic = simulate(
-                dataset.recordings,
-                asked,
-                sampling=baseline.sampling_choice,
-                encoding=experiment.encoding,
-                windows=experiment.windows,
-                seed=experiment.seed,
-                label=name,
-            )
-        else:
-            learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition)
-            checkpoint = finetune(
-                dataset.frames, learnt, generator=baseline.generator, seed=experiment.seed, label=name
-            )
-            synthetic = sample(checkpoint, asked, sampling=baseline.sampling_choice, seed=experiment.seed, label=name)
-        made[name] = BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)
-    return made
+        return BaselineFrames(sample_conditions=asked, checkpoint=None, synthetic=synthetic)
+    learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition)
+    checkpoint = finetune(dataset.frames, learnt, generator=baseline.generator, seed=experiment.seed, label=name)
+    synthetic = sample(checkpoint, asked, sampling=baseline.sampling_choice, seed=experiment.seed, label=name)
+    return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)
 
 
 if __name__ == "__main__":

@@ -12,23 +12,23 @@ from data_contracts.manifest import ManifestRef
 from flows.baselines import baselines
 from flows.command_line import main
 from flows.evaluate import evaluate
-from flows.prepare_dataset import prepare_dataset
+from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
 from tasks.ingest import ingest
 from tasks.realism import realism
 from tasks.report import publish_report, report
-from tasks.stage import call_flow
+from tasks.stage import call_flow, call_together
 
 
 @flow(name="full-experiment")
 def full_experiment(experiment: Experiment) -> ManifestRef:
     """Every stage from recordings to the report; what is in the store already is not computed again."""
     dataset = call_flow(prepare_dataset, experiment)
-    checkpoint = call_flow(train_generator, experiment, dataset)
-    synthetic = call_flow(synthesize, experiment, dataset, checkpoint)
-    compared = call_flow(baselines, experiment, dataset)
+    (checkpoint, synthetic), compared = call_together(
+        lambda: _own_frames(experiment, dataset), lambda: call_flow(baselines, experiment, dataset)
+    )
     evaluation = call_flow(evaluate, experiment, dataset, synthetic, compared)
     generated = [synthetic, *(frames.synthetic for frames in compared.values())]
     reference = None
@@ -60,6 +60,11 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
         model_names=evaluation.model_names,
         label=experiment.name,
     )
+
+
+def _own_frames(experiment: Experiment, dataset: PreparedDataset) -> tuple[ManifestRef, ManifestRef]:
+    checkpoint = call_flow(train_generator, experiment, dataset)
+    return checkpoint, call_flow(synthesize, experiment, dataset, checkpoint)
 
 
 if __name__ == "__main__":

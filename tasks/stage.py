@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import importlib
 import importlib.metadata
 import inspect
 import json
@@ -44,6 +45,7 @@ from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
 from tasks.store import RawFileDigests, Store
+from tasks.workers import current_workers, together
 
 if TYPE_CHECKING:
     from prefect import Flow
@@ -86,6 +88,11 @@ def planning() -> Iterator[list[PlannedStage]]:
 def call_flow(flow: Flow[P, R], *arguments: P.args, **settings: P.kwargs) -> R:
     """Call a Prefect flow, or only its wiring while planning."""
     return (flow.fn if _plan.get() is not None else flow)(*arguments, **settings)
+
+
+def call_together(*calls: Callable[[], Any]) -> list[Any]:
+    """The results of all calls, side by side where there are cores; one after the other while planning."""
+    return [call() for call in calls] if _plan.get() is not None else together(calls)
 
 
 class Output:
@@ -155,16 +162,22 @@ class Stage:
 
     def run(self, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
         """Return the artefact and whether it was already there."""
-        store = Store()
-        upstream = {ref.key: ref.digest for value in arguments.values() for ref in _references(value)}
-        found = self._find(store, key, upstream)
+        found = self.find(key, arguments)
         if found is not None:
             return found, True
+        workers = current_workers()
+        if workers is not None:
+            return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
+        store, upstream = Store(), _upstream(arguments)
         with store.lock(key):
             found = self._find(store, key, upstream)  # another process may have just finished it
             if found is not None:
                 return found, True
             return self._compute(store, key, arguments, upstream), False
+
+    def find(self, key: str, arguments: dict[str, Any]) -> ManifestRef | None:
+        """The artefact, if it is there and was made from inputs of the same content."""
+        return self._find(Store(), key, _upstream(arguments))
 
     def _find(self, store: Store, key: str, upstream: dict[str, str]) -> ManifestRef | None:
         found = store.find(self.name, key)
@@ -239,6 +252,16 @@ def _run_as_task(stage: Stage, label: str, key: str, arguments: dict[str, Any]) 
         return Completed(data=ref, name="Cached" if cached else "Completed", message=f"{ref.rows} rows, key {key[:12]}")
 
     return run(return_state=True).result()
+
+
+def _run_stage(module: str, name: str, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
+    """`Stage.run` in another process."""
+    return getattr(importlib.import_module(module), name).run(key, arguments)
+
+
+def _upstream(arguments: dict[str, Any]) -> dict[str, str]:
+    """Digests of the inputs, by their keys."""
+    return {ref.key: ref.digest for value in arguments.values() for ref in _references(value)}
 
 
 def _references(value: Any) -> list[ManifestRef]:
