@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from ctlev_core.sensor_choice import check_sensor_preset
 from data_contracts.config import Frozen
 
 
@@ -41,7 +42,9 @@ class Options(Frozen):
         description="Grey pictures a second, of label-only recordings too; None = none, as in DHP19.",
     )
     max_displacement_px: float = Field(
-        default=0.5, gt=0, description="Movement in the picture between two looks of the sensor; see the README."
+        default=0.5,
+        gt=0,
+        description="Movement between frames that the sensor sees; half of it costs double.",
     )
     max_events: int = Field(default=20_000_000, ge=1, description="A recording with more is an error.")
     num_train_subjects: int = Field(default=4, ge=1, description="Subjects 0 .. n - 1.")
@@ -49,7 +52,7 @@ class Options(Frozen):
     num_sensors: int = Field(
         default=2, ge=1, description="Individual sensors of each camera, with their own mismatch and hot pixels."
     )
-    sensor_preset: str = Field(
+    sensor_preset: Annotated[str, AfterValidator(check_sensor_preset)] = Field(
         default="noisy", description="A key of `ctlev_core.sensor.PRESETS`, or a YAML file such as calibration writes."
     )
     noise: float = Field(

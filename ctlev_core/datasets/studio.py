@@ -15,13 +15,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
-from ctlev_core.sensor_options import PRESETS, SensorOptions, read_preset
+from ctlev_core.sensor_choice import read_sensor, sensor_preset_files
 from ctlev_core.studio_options import Options
 from data_contracts.errors import DataError
 from data_contracts.events import Events
@@ -52,9 +51,9 @@ def list_recordings(options: Options) -> list[Recording]:
     """Every recording, split by split; motions and subjects take turns, and within a performance the cameras.
 
     Raises:
-        DataError: there is no such sensor preset.
+        DataError: the sensor preset is a file that cannot be read, or is no preset.
     """
-    _sensor_options(options)
+    read_sensor(options.sensor_preset, options.noise)
     counts = (options.num_train_recordings, options.num_test_recordings, options.num_condition_recordings)
     return [
         _recording(split, index, camera, options)
@@ -75,7 +74,6 @@ def _recording(split: str, index: int, camera: int, options: Options) -> Recordi
     else:
         subject = f"stranger{index}"
     suffix = f"_cam{camera}" if has_events and options.num_cameras > 1 else ""
-    is_file = has_events and options.sensor_preset not in PRESETS
     return Recording(
         recording_id=f"{split}/{subject}_{motion}_{index:05d}{suffix}",
         subject=subject,
@@ -84,7 +82,7 @@ def _recording(split: str, index: int, camera: int, options: Options) -> Recordi
         sensor_size=options.sensor_size,
         has_events=has_events,
         has_intensity=options.intensity_rate_hz is not None,
-        files=(Path(options.sensor_preset),) if is_file else (),
+        files=sensor_preset_files(options.sensor_preset) if has_events else (),
     )
 
 
@@ -133,7 +131,7 @@ def read_events(recording: Recording, options: Options) -> Events:
             film,
             0,
             options.recording_duration_us,
-            _sensor_options(options),
+            read_sensor(options.sensor_preset, options.noise),
             RenderingOptions(max_displacement_px=options.max_displacement_px),
             sensor_seed=[options.seed, SENSOR_STREAM, camera, sensor],
             seed=[*entropy, camera, NOISE_STREAM],
@@ -230,27 +228,6 @@ def _film(recording: Recording, options: Options) -> MovingBody:
     t_s = np.arange(spans + 1) / KEY_POSE_RATE_HZ
     poses = pose_at(recording.class_name, t_s, performance.style)
     return MovingBody(subject, t_s, *poses, performance.camera, np.float32(brightness) * background, light)
-
-
-def _sensor_options(options: Options) -> SensorOptions:
-    """The kind of sensor that the preset and the amount of noise make."""
-    preset = PRESETS.get(options.sensor_preset)
-    if preset is None:
-        path = Path(options.sensor_preset)
-        if not path.is_file():
-            raise DataError(
-                f"studio: unknown sensor_preset {options.sensor_preset!r}: known are {', '.join(PRESETS)} and YAML "
-                "files, and there is no file of that name"
-            )
-        preset = read_preset(path)
-    return preset.model_copy(
-        update={
-            "threshold_sigma": options.noise * preset.threshold_sigma,
-            "leak_rate_hz": options.noise * preset.leak_rate_hz,
-            "shot_rate_hz": options.noise * preset.shot_rate_hz,
-            "hot_pixel_fraction": min(options.noise * preset.hot_pixel_fraction, 1.0),
-        }
-    )
 
 
 def _times_us(rate_hz: float, options: Options) -> np.ndarray:

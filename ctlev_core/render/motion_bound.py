@@ -71,11 +71,11 @@ def bound_acceleration(body: BodyModel, betas: np.ndarray, rest: np.ndarray, tur
             length = np.linalg.norm(joints[joint] - joints[parent])
             of_joint[:, joint] = of_joint[:, parent] + lever[:, parent] * length
     arm = np.linalg.norm(rest[:, None] - joints[body.weight_indices], axis=-1)
-    # [48, V]: by what each of the 24 joints' two numbers counts for a vertex.
+    # By what each of the 24 joints' two numbers counts for a vertex; no vertex has a joint twice.
     share = np.zeros((len(rest), 2, lever.shape[1]), np.float32)
     rows = np.arange(len(rest))[:, None]
-    np.add.at(share[:, 0], (rows, body.weight_indices), body.weight_values)
-    np.add.at(share[:, 1], (rows, body.weight_indices), body.weight_values * arm)
+    share[rows, 0, body.weight_indices] = body.weight_values
+    share[rows, 1, body.weight_indices] = body.weight_values * arm
     numbers = np.concatenate([of_joint, lever], axis=1).astype(np.float32)
     return (numbers @ share.reshape(len(rest), -1).T).max(axis=1, initial=0.0).astype(np.float64)
 

@@ -216,8 +216,10 @@ def test_a_sensor_from_a_file_is_an_input(tmp_path):
     path.write_text("threshold: -1\n")
     with pytest.raises(DataError, match=r"camera\.yaml"):
         studio.list_recordings(options)
-    with pytest.raises(DataError, match=r"'loud'.*clean, noisy, dvs346"):
-        studio.list_recordings(changed(sensor_preset="loud"))
+    with pytest.raises(DataError, match=r"other\.yaml"):
+        studio.list_recordings(changed(sensor_preset=str(tmp_path / "other.yaml")))
+    with pytest.raises(ValueError, match=r"clean, noisy, dvs346"):
+        changed(sensor_preset="loud")
 
 
 def test_noise_is_a_matter_of_degree():
