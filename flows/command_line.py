@@ -32,12 +32,33 @@ def load_experiment(preset: str, overrides: list[str]) -> Experiment:
     """The experiment a preset describes, with every plug-in's options validated.
 
     Raises:
-        PluginError: unknown preset, option or plug-in, or a wrong value.
+        PluginError: unknown preset, option or plug-in, a wrong value, or parts that do not go together.
     """
     experiment = load_preset(Experiment, PRESETS, preset, overrides)
     for choice in experiment.choices:
         plugins.load_options(choice)
+    _check_intensity(experiment)
     return experiment
+
+
+def _check_intensity(experiment: Experiment) -> None:
+    """Raise `PluginError` where a condition needs intensity frames and a dataset has none, before anything is read."""
+    conditions = {"condition": experiment.condition}
+    conditions |= {f"baselines.{name}.condition": baseline.condition for name, baseline in experiment.baselines.items()}
+    needing = [
+        name
+        for name, choice in conditions.items()
+        if getattr(plugins.load("conditions", choice.name), "NEEDS", "") == "intensity"
+    ]
+    for dataset in (experiment.dataset, experiment.poses) if needing else ():
+        if dataset is None:
+            continue
+        plugin = plugins.load_options(dataset)
+        if not any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options)):
+            raise PluginError(
+                f"{', '.join(needing)}: needs intensity frames, "
+                f"and dataset {dataset.name!r} with these options has none"
+            )
 
 
 def load_preset(model: type[BaseModel], folder: Path, preset: str, overrides: list[str]) -> Any:

@@ -10,6 +10,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from data_contracts.manifest import Manifest, ManifestRef, read_manifest
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 REAL_RECORDINGS = REPOSITORY.parent / "shared" / "real" / "events"
 
@@ -44,6 +46,17 @@ def run_script(name: str, *arguments: str, home: Path, timeout: float = 300) -> 
     process = script(name, *arguments, home=home)
     output, errors = process.communicate(timeout=timeout)
     return Finished(process.returncode, output, errors)
+
+
+def artefacts(home: Path, stage: str, plugin: str = "") -> list[Manifest]:
+    """Every artefact of a stage, its files checked; with `plugin` (kind/name) those that were made with it."""
+    found = []
+    for record in sorted((home / "artefacts" / stage).glob("*/run.json")):
+        arguments = json.loads(record.read_text())["arguments"].values()
+        used = [argument["plugin"] for argument in arguments if isinstance(argument, dict) and "plugin" in argument]
+        if not plugin or plugin in used:
+            found.append(read_manifest(ManifestRef(key=record.parent.name, path=record.parent), full=True))
+    return found
 
 
 def digests(home: Path, stages: tuple[str, ...] = ()) -> dict[str, str]:

@@ -27,6 +27,14 @@ def refused(home, *arguments, preset="folder"):
             ("--preset", "nonesuch"),
             "unknown preset 'nonesuch'; known: aist, amass, body, cdehp, demo, dhp19, event_hpe, folder, ",
         ),
+        (
+            ("--set", "dataset.options.intensity_rate_hz=null"),
+            "baselines.event_gan.condition: needs intensity frames, and dataset 'studio' with these options has none",
+        ),
+        (
+            ("--set", "baselines={synthetic: {condition: {name: skeleton}, generator: {name: controlnet}}}"),
+            "a baseline's name is made of a-z, 0-9 and _, and is not real or synthetic, got 'synthetic'",
+        ),
         (("--set", "nonesuch=1"), "unknown option 'nonesuch'; known: name,"),
         (("--set", "windows.num_events=0"), "option 'windows.num_events': input should be greater than 0, got 0"),
         (("--set", "dataset.options.colour=red"), "datasets 'studio': unknown option 'colour'; known: "),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow.parquet as pq
+from flow_scripts import artefacts
 
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.summary import summarise_frames
@@ -26,7 +27,7 @@ def test_the_report_sets_synthetic_beside_real(smoke_home):
 def test_numbers_are_those_of_the_frames_that_were_sampled(smoke_home):
     rows = only_artefact(smoke_home, "realism").table.to_pylist()
     found = {(row["group"], row["setting"], row["metric"]): row for row in rows}
-    synthetic = only_artefact(smoke_home, "sample")
+    (synthetic,) = artefacts(smoke_home, "sample", "generators/controlnet")
     shares = [summarise_frames(frame[None]).numbers["active_pixel_share"] for frame in synthetic.array("frames")]
     row = found["frames", "synthetic", "active_pixel_share"]
     np.testing.assert_allclose(row["value"], np.mean(shares))

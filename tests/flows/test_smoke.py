@@ -13,28 +13,23 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from flow_scripts import REPOSITORY, digests, run_script, script
+from flow_scripts import REPOSITORY, artefacts, digests, run_script, script
 
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef, read_manifest
 
 # Everything but the report is a pure function of options and data: on one machine, digests must repeat exactly.
 # The report's digest covers the time each stage took.
 DETERMINISTIC = (
-    "ingest", "encode", "condition_frames", "condition_samples", "finetune", "sample", "train_downstream",
+    "ingest", "encode", "condition_frames", "condition_samples", "finetune", "sample", "simulate", "train_downstream",
     "score_model", "score_distance", "realism",
 )  # fmt: skip
-
-
-def artefacts(home, stage):
-    folders = sorted((home / "artefacts" / stage).iterdir())
-    return [read_manifest(ManifestRef(key=folder.name, path=folder), full=True) for folder in folders]
 
 
 def test_smoke_ends_in_a_report(smoke_home):
     (report,) = (smoke_home / "reports").glob("*.html")
     text = report.read_text()
     assert "far too small to learn from" in text[:20_000]
-    for expected in ("mpjpe2d", "fd_event_classifier_", "real+synthetic", "data:image/png;base64,"):
+    for expected in ("mpjpe2d", "fd_event_classifier_", "real+synthetic", "real+smpl_esim", "data:image/png;base64,"):
         assert expected in text
     assert "http://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", text) and "<script src" not in text
     output = (smoke_home / "first_run.txt").read_text()
@@ -54,13 +49,43 @@ def test_every_artefact_is_whole_and_says_where_it_came_from(smoke_home):
     assert not list((smoke_home / "tmp").iterdir()) and not list((smoke_home / "work").iterdir())
 
 
-def test_labels_travel_from_condition_to_synthetic_frame(smoke_home):
-    (synthetic,) = artefacts(smoke_home, "sample")
-    (conditions,) = artefacts(smoke_home, "condition_samples")
+GENERATORS = {
+    "synthetic": ("sample", "generators/controlnet", "conditions/skeleton"),
+    "event_gan": ("sample", "generators/event_gan", "conditions/intensity_pair"),
+    "smpl_esim": ("simulate", "generators/smpl_esim", "conditions/body_motion"),
+}
+
+
+@pytest.mark.parametrize("name", GENERATORS)
+def test_labels_travel_from_condition_to_synthetic_frame(smoke_home, name):
+    stage, generator, condition = GENERATORS[name]
+    (synthetic,) = artefacts(smoke_home, stage, generator)
+    (conditions,) = artefacts(smoke_home, "condition_samples", condition)
     assert synthetic.column("condition_id") == conditions.column("sample_id")
     np.testing.assert_array_equal(synthetic.labels.joints2d, conditions.labels.joints2d)
     assert synthetic.array("frames").shape == (len(synthetic), 64, 64, 3)
     assert len(set(synthetic.column("seed"))) == len(synthetic)
+
+
+def test_every_generator_is_asked_for_the_same_labels(smoke_home):
+    asked = [artefacts(smoke_home, "condition_samples", condition)[0] for _, _, condition in GENERATORS.values()]
+    for others in asked[1:]:
+        assert others.column("source_id") == asked[0].column("source_id")
+        np.testing.assert_array_equal(others.labels.smpl_pose, asked[0].labels.smpl_pose)
+        np.testing.assert_array_equal(others.labels.joints2d, asked[0].labels.joints2d)
+
+
+def test_simulated_events_lie_on_the_body_they_were_asked_for(smoke_home):
+    """The brightest of a frame lies within the box of its joints, widened by the flesh and a window's movement."""
+    (simulated,) = artefacts(smoke_home, "simulate")
+    frames, joints = simulated.array("frames"), simulated.labels.joints2d
+    for frame, points in zip(frames, joints, strict=True):
+        value = frame.max(axis=-1)
+        assert value.any()
+        low, high = points.min(axis=0) - 6, points.max(axis=0) + 6
+        y, x = np.nonzero(value)
+        inside = (x + 0.5 >= low[0]) & (x + 0.5 <= high[0]) & (y + 0.5 >= low[1]) & (y + 0.5 <= high[1])
+        assert inside.mean() > 0.95
 
 
 def test_training_and_test_subjects_are_disjoint(smoke_home):
@@ -118,11 +143,38 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
         ("downstream.options.num_steps=21", {"train_downstream: pose2d", "score_model", "report"}),
         (
             "num_synthetic=9",
-            {"condition_samples", "sample", "synthetic", "labels of synthetic", "report", "contact_sheet"},
+            {
+                "condition_samples",
+                "sample:",
+                "simulate",
+                "synthetic",
+                "on event_gan",
+                "on smpl_esim",
+                "+event_gan",
+                "+smpl_esim",
+                "labels of",
+                "score_distance: event_gan",
+                "score_distance: smpl_esim",
+                "report",
+                "contact_sheet",
+            },
+        ),
+        (
+            "baselines.event_gan.generator.options.num_steps=7",
+            {
+                "finetune: event_gan",
+                "sample: event_gan",
+                "on event_gan",
+                "+event_gan",
+                "labels of event_gan",
+                "score_distance: event_gan",
+                "realism",
+                "report",
+            },
         ),
         (
             "encoding.options.normalisation=max",
-            {"encode", "condition", "finetune", "sample", "train", "score", "report"},
+            {"encode", "condition", "finetune", "sample", "simulate", "train", "score", "report"},
         ),
         ("name=renamed", {"report", "contact_sheet"}),
     ],
@@ -141,7 +193,7 @@ def test_changing_an_option_reruns_exactly_what_depends_on_it(smoke_home, overri
 
 def test_each_flow_is_a_script_of_its_own_and_shares_the_store(smoke_home):
     before = digests(smoke_home)
-    for name in ("prepare_dataset", "train_generator", "synthesize", "evaluate"):
+    for name in ("prepare_dataset", "train_generator", "synthesize", "baselines", "evaluate"):
         finished = run_script(name, "--preset", "smoke", home=smoke_home)
         assert finished.status == 0, finished.errors
         assert re.search(r"(\d+) stages, \1 of them cached", finished.output)
@@ -191,5 +243,9 @@ def test_scores_are_tables(smoke_home):
     tables = list((smoke_home / "reports").glob("*/scores.parquet"))
     assert len(tables) == 1
     scores = pq.read_table(tables[0]).to_pylist()
-    assert {row["setting"] for row in scores} >= {"real", "synthetic", "real+synthetic"}
+    trained = {"real"} | {f"{real}{name}" for real in ("", "real+") for name in GENERATORS}
+    assert {row["setting"] for row in scores if row["task"] == "pose2d"} == trained | {
+        f"labels of {name}" for name in GENERATORS
+    }
+    assert {row["setting"] for row in scores if row["task"] == "distance"} == {"held-out real", *GENERATORS}
     assert all(np.isfinite(row["value"]) for row in scores)
