@@ -84,8 +84,9 @@ SPLIT_NAMES = ("train", "test", "condition")
 DRAWING_STREAM, PATH_STREAM, SENSOR_STREAM, NOISE_STREAM = 40, 41, 42, 43
 MIN_CONTRAST = 0.8
 """Between an object's colour and the background, in log intensity: what cannot be seen has no class."""
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 GAMMA = 2.2
+_LINEAR = (np.arange(256, dtype=np.float32) / 255) ** GAMMA
 AMBIENT = 0.06
 """The room's light on the screen, as a share of white: what black sends, so that contrasts stay below 17."""
 
@@ -121,6 +122,12 @@ class Options(Frozen):
     )
     intensity_rate_hz: float | None = Field(
         default=None, gt=0, le=10_000, description="grey pictures a second beside the events; None = none"
+    )
+    max_displacement_px: float = Field(
+        default=0.5,
+        gt=0,
+        description="movement between frames that the sensor sees; 0.7 % of the events of an event image are others "
+        "than with 0.05 px, half of that with 0.25 px",
     )
 
     @model_validator(mode="after")
@@ -174,7 +181,7 @@ def read_events(recording: Recording, options: Options) -> Events:
         0,
         options.recording_duration_us,
         read_sensor(options.sensor_preset, options.noise),
-        RenderingOptions(),
+        RenderingOptions(max_displacement_px=options.max_displacement_px),
         sensor_seed=[options.seed, SENSOR_STREAM, sensor],
         seed=[*entropy, NOISE_STREAM],
         speed_bound=screen.speed_bound,
@@ -240,20 +247,20 @@ def _draw_screen(
         first, second = (str(colour) for colour in rng.choice(colours, 2))
         composition = parse_composition(class_name)
         picture = draw_composition(composition, (first, second), canvas, rng, size_range, supersampling=1)
-    return _luminance(picture / 255)
+    return _luminance(picture)
 
 
 def _luminance(colour: np.ndarray) -> np.ndarray:
-    """Linear intensity [...] in (0, 1] of what is shown in a colour [..., 3] in [0, 1]."""
-    return AMBIENT + (1 - AMBIENT) * (colour**GAMMA @ LUMINANCE)
+    """Linear intensity [...] in (0, 1] of colours [..., 3] uint8 on the screen."""
+    return AMBIENT + (1 - AMBIENT) * (_LINEAR[colour] @ LUMINANCE)
 
 
 def _visible_colours(canvas: np.ndarray) -> list[str]:
     """Colours that stand out from the mean of a background [h, w, 3] uint8; on any there is black or white."""
     from ctlev_core.render.objects import COLOURS
 
-    level = float(_luminance(canvas / 255).mean())
-    contrasts = {name: np.log(_luminance(np.array(colour) / 255) / level) for name, colour in COLOURS.items()}
+    level = _luminance(canvas).mean()
+    contrasts = {name: np.log(_luminance(np.array(colour)) / level) for name, colour in COLOURS.items()}
     return [name for name, contrast in contrasts.items() if abs(contrast) >= MIN_CONTRAST]
 
 
