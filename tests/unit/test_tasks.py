@@ -101,6 +101,16 @@ def test_verdict_claims_only_what_the_interval_of_the_difference_shows(metric, d
     assert expected in verdict(rows, SETTINGS, difference)
 
 
+def test_verdict_sets_each_baseline_beside_in_a_sentence_of_its_own():
+    rows = [*ROWS, row("gan", 9.0), row("real+gan", 6.9), row("esim", 9.5), row("real+esim", 6.2)]
+    settings = (*SETTINGS, "gan", "esim", "real+gan", "real+esim")
+    beside = {"gan": Difference(-0.6, -0.8, -0.4), "esim": Difference(0.1, -0.1, 0.3)}
+    text = verdict(rows, settings, Difference(-0.8, -1.0, -0.6), beside)
+    assert "synthetic 8.000, real+synthetic 6.300. Adding" in text and "gan 9.000" not in text
+    assert "real+gan is 6.900; its own are better: -0.600 [-0.800, -0.400]." in text
+    assert "real+esim is 6.200; which is better is undecided: +0.100 [-0.100, +0.300]." in text
+
+
 def test_directions():
     assert lower_is_better("fd_event_classifier_0123abcd") and lower_is_better("mpjpe2d_px")
     assert not lower_is_better("accuracy") and not lower_is_better("pck_px4")
