@@ -26,6 +26,8 @@ from ctlev_core.skeletons import SMPL_PARENTS
 
 SEGMENT_TURN_RAD = 0.1
 """By how much the fastest bone may turn in a segment: then the bound is within a tenth of the speed."""
+MARGIN_M = 0.15
+"""Twice the longest edge of a posed body: of a face that reaches into the picture no corner is further outside."""
 _CHORD_PX, _CHORD_M, _NEAREST_M, _FARTHEST_M, _ASIDE_M = range(5)
 
 
@@ -99,8 +101,9 @@ def bound_correctives(body: BodyModel, turning: Turning) -> np.ndarray:
 def bound_speeds(points: np.ndarray, spans_s: np.ndarray, acceleration: np.ndarray, camera: Camera) -> np.ndarray:
     """What no projected vertex exceeds in each segment, [S] px/s.
 
-    While a part of the body may be at `NEAR_M` or nearer, where it is cut off, it is what nothing within the picture
-    exceeds; and 0 while all of it is.
+    A vertex counts unless it is at both ends of the segment beyond the same edge of the picture by `MARGIN_M`. While a
+    part of the body may be at `NEAR_M` or nearer, where it is cut off, it is what nothing within the picture exceeds;
+    and 0 while all of it is.
 
     Args:
         points: [S + 1, V, 3] float32, m, camera frame: vertices at the ends of the segments.
@@ -110,7 +113,7 @@ def bound_speeds(points: np.ndarray, spans_s: np.ndarray, acceleration: np.ndarr
     """
     fx, fy, cx, cy = camera.intrinsics
     chords = np.empty((len(spans_s), 5))
-    _measure_chords(points, fx, fy, NEAR_M, chords)
+    _measure_chords(points, fx, fy, cx, cy, *camera.image_size, NEAR_M, MARGIN_M, chords)
     # No further than this from the straight line between its ends.
     bulge = acceleration * spans_s**2 / 8
     speed = chords[:, _CHORD_M] / spans_s + acceleration * spans_s / 2
@@ -127,8 +130,9 @@ def bound_speeds(points: np.ndarray, spans_s: np.ndarray, acceleration: np.ndarr
 
 
 @numba.njit(cache=True, nogil=True)
-def _measure_chords(points, fx, fy, near, chords):
+def _measure_chords(points, fx, fy, cx, cy, width, height, near, margin, chords):
     """The largest chord in px and in m, the least and largest depth, and the largest distance from the optical axis."""
+    right, low = width - cx, height - cy
     for s in range(points.shape[0] - 1):
         longest_px = longest_m = aside = 0.0
         nearest, farthest = np.inf, -np.inf
@@ -138,7 +142,11 @@ def _measure_chords(points, fx, fy, near, chords):
             nearest, farthest = min(nearest, z, w), max(farthest, z, w)
             longest_m = max(longest_m, (u - x) ** 2 + (v - y) ** 2 + (w - z) ** 2)
             aside = max(aside, x * x + y * y, u * u + v * v)
-            if min(z, w) > near:
+            is_left = max(fx * (x + margin) + cx * z, fx * (u + margin) + cx * w) < 0.0
+            is_right = min(fx * (x - margin) - right * z, fx * (u - margin) - right * w) > 0.0
+            is_above = max(fy * (y + margin) + cy * z, fy * (v + margin) + cy * w) < 0.0
+            is_below = min(fy * (y - margin) - low * z, fy * (v - margin) - low * w) > 0.0
+            if min(z, w) > near and not (is_left or is_right or is_above or is_below):
                 dx, dy = fx * (u / w - x / z), fy * (v / w - y / z)
                 longest_px = max(longest_px, dx * dx + dy * dy)
         chords[s, 0], chords[s, 1] = np.sqrt(longest_px), np.sqrt(longest_m)

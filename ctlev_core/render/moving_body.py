@@ -123,11 +123,11 @@ class MovingBody:
         return rotations, self._transl[key] + fraction * (self._transl[key + 1] - self._transl[key])
 
     def speed_bound(self, start_s: float, stop_s: float) -> float:
-        """A speed in px/s that no vertex exceeds between two times, start before stop.
+        """A speed in px/s that no vertex in the picture exceeds between two times, start before stop.
 
         The interval touches short segments of time. In each, it is the largest mean speed of a projected vertex, plus
-        what the speed of a vertex may differ from its mean, for which `ctlev_core.render.motion_bound` has a bound. Of
-        a body so near that it is cut off, only what is within the picture is bounded.
+        what the speed of a vertex may differ from its mean, for which `ctlev_core.render.motion_bound` has a bound.
+        What moves outside of the picture, where no part of it can be seen, does not count.
         """
         ends_s, speeds_px_s = self._segments
         first = int(np.searchsorted(ends_s, start_s, "right")) - 1

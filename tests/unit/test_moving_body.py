@@ -127,13 +127,18 @@ def test_joints_turn_at_constant_speed_between_key_poses():
 
 
 def measured_speeds(filmed, times_s, camera=FRONT):
-    """Mean speed [T - 1, V], px/s, of each vertex between successive times; NaN where it is not in front."""
+    """Mean speed [T - 1, V], px/s, of each vertex that is in the picture before or after, else 0; and pixels [T, V, 2].
+
+    NaN where a vertex is not in front.
+    """
     rotations, transl = filmed.poses_at(times_s)
     painter = filmed._painter
     points, _ = pose_vertices(painter.body, rotations, painter.subject.betas, transl)
     points = points.astype(np.float64) @ camera.R.T + camera.translation
     pixels = np.where(points[..., 2:] > NEAR_M, (points / points[..., 2:]) @ camera.K.T, np.nan)[..., :2]
-    return np.linalg.norm(np.diff(pixels, axis=0), axis=-1) / np.diff(times_s)[:, None], pixels
+    inside = is_inside(pixels, SIZE)
+    speeds = np.linalg.norm(np.diff(pixels, axis=0), axis=-1) / np.diff(times_s)[:, None]
+    return np.where(np.logical_or(inside[1:], inside[:-1]), speeds, 0.0 * speeds), pixels
 
 
 # Vertices are float32, 2e-7 m at 3 m: that is 3e-6 px, and over a millisecond 3e-3 px/s.
@@ -188,6 +193,10 @@ def test_a_body_cut_off_by_the_camera_is_bounded_in_the_picture():
     assert np.isfinite(filmed.speed_bound(0.0, 0.2))
     assert speeds[stays].max() <= filmed.speed_bound(0.0, 0.2)
     assert film(5, transl_m=FRONT.R.T @ [0.0, 0.0, -8.0]).speed_bound(0.0, 0.2) == 0.0
+
+
+def test_who_is_out_of_sight_is_slow():
+    assert film(6, transl_m=(8.0, 0.0, 0.0)).speed_bound(0.0, 0.2) < 0.3 * film(6).speed_bound(0.0, 0.2)
 
 
 def test_what_rests_has_no_speed():
