@@ -43,7 +43,7 @@ MOTIONS_OF_SPLIT = {"train": SEEN, "test": SEEN + UNSEEN + HELD_OUT, "condition"
 # Streams of random numbers, each with its own seed, so that any recording can be made alone.
 SUBJECT_STREAM, SENSOR_STREAM, SCENE_STREAM, NOISE_STREAM, CAMERA_STREAM = 10, 11, 12, 13, 14
 KEY_POSE_RATE_HZ = 200.0
-"""Between key poses joints turn at constant speed. A hand at 300 m/s^2 is then 1 mm off its smooth path."""
+"""Between key poses joints turn at constant speed: no joint is ever 1 mm off the path that the labels follow."""
 RECORDING_ID = re.compile(r"(?P<split>\w+)/.+_(?P<index>\d{5,})(_cam(?P<camera>\d+))?")
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
+from ctlev_core.body.layer import joint_transforms
 from ctlev_core.datasets import studio
 from ctlev_core.sensor import PRESETS, EventBudgetError, simulate_events
-from ctlev_core.skeletons import JOINT_SETS
+from ctlev_core.skeletons import JOINT_SETS, SMPL_TO_DHP19
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 from data_contracts.labels import check_image_track, check_labels
@@ -233,6 +234,19 @@ def test_noise_is_a_matter_of_degree():
             total += np.count_nonzero((events.x < 6) | (events.x >= 58))
         counts.append(total)
     assert counts[0] < 0.1 * counts[1] and 1.5 < counts[2] / counts[1] < 2.6
+
+
+@pytest.mark.parametrize("motion", ["run", "punch", "spin_kick"])
+def test_pictures_show_what_the_labels_say(motion):
+    """Between key poses too, where pictures go straight and labels follow the curve: within a millimetre."""
+    options = changed(label_rate_hz=800.0)
+    recording = next(r for r in of_split("test") if r.class_name == motion)
+    labels, film = studio.read_labels(recording, options), studio._film(recording, options)
+    painter = film._painter
+    rotations, transl = film.poses_at(1e-6 * labels.t_us)
+    _, joints = joint_transforms(painter.body, rotations, painter.subject.betas, transl)
+    seen = 1000 * (joints @ painter.camera.R.T + painter.camera.translation)[:, list(SMPL_TO_DHP19)]
+    assert np.linalg.norm(seen - labels.joints3d, axis=-1).max() < 1.0
 
 
 def test_people_are_as_large_as_asked_for():
