@@ -8,7 +8,7 @@ import logging
 import math
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -31,7 +31,7 @@ from ctlev_core.diffusion.prior import (
     save_prior,
 )
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
-from ctlev_core.diffusion.small_prior import IMAGE_SIZE, SCHEDULER_CONFIG, WIDTHS, build_prior
+from ctlev_core.diffusion.small_prior import IMAGE_SIZE, WIDTHS, PredictionType, build_prior
 from ctlev_core.diffusion.training import Trainer, run_training, sample_rows
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
@@ -79,6 +79,9 @@ class PretrainingOptions(Frozen):
     condition_dropout: float = Field(default=0.2, ge=0, le=1, description="share of people without their condition")
     image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
     widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
+    prediction_type: PredictionType = Field(
+        default="v_prediction", description="what a U-Net that starts at random predicts; sample = the latents"
+    )
     start: Path | None = Field(
         default=None,
         json_schema_extra=RUN_SETTING,
@@ -182,13 +185,20 @@ def new_prior(options: PretrainingOptions) -> Prior:
     """The prior before training: fitted patch code, trained tokenizer and random networks, or those of `start`."""
     start = start_folder(options)
     if start is not None:
-        return replace(load_prior(start), scheduler_config=dict(SCHEDULER_CONFIG))
+        return load_prior(start)
     scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
     rng = np.random.default_rng([options.seed, STYLE_STREAM])
     images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
     vae: PatchAutoencoder = fit_patch_autoencoder(images_to_tensor(images))
     corpus = procedural_images.caption_corpus()
-    return build_prior(corpus, vae, seed=options.seed, widths=options.widths, image_size=options.image_size)
+    return build_prior(
+        corpus,
+        vae,
+        seed=options.seed,
+        widths=options.widths,
+        image_size=options.image_size,
+        prediction_type=options.prediction_type,
+    )
 
 
 def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:

@@ -2,9 +2,10 @@
 
 Half of the pictures are people: colour renderings of the procedural body in random poses and in poses of the procedural
 motions that are not held out for tests, with what a ControlNet is steered by: the skeleton in the manner of OpenPose,
-or the map of the body's normals. The others are everyday objects (`procedural_objects`), without such a condition. A
-scene is drawn once and shown in several styles: photograph, grey photograph, line drawing on black, coloured line
-drawing. A network that knows outlines needs far fewer event images to learn what an event camera sees.
+or the map of the body's normals. The others are everyday objects (`procedural_objects`), alone or two together as a
+`Composition` says, without such a condition. A scene is drawn once and shown in several styles: photograph, grey
+photograph, line drawing on black, coloured line drawing. A network that knows outlines needs far fewer event images to
+learn what an event camera sees.
 
 Scene i is a function of (seed, i) alone, style s of scene i of (seed, i, s).
 """
@@ -24,7 +25,8 @@ from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.body_views import labels_in_camera
 from ctlev_core.camera import is_inside, project
 from ctlev_core.conditions import normals
-from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object
+from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_composition, draw_object
+from ctlev_core.render.compositions import RELATIONS, all_compositions
 from ctlev_core.render.scene import render_person, sample_background, sample_subject
 from ctlev_core.render.skeleton import draw_skeleton
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_TO_DHP19
@@ -35,26 +37,32 @@ PEOPLE_SHARE = 0.5
 MOTION_SHARE = 0.55
 """Of the people, how many take their pose from a procedural motion, never a held-out one; the others' is random."""
 POSE_NOISE_RAD = 0.15
-PLAIN_SHARE = 0.4
+PLAIN_SHARE = {"people": 0.4, "things": 0.6}
 """How many scenes have a plain background, so that their line drawings are clean."""
+COMPOSITION_SHARE = 0.3
+"""How many of the things are two objects in one picture."""
+THING_SIZE = (0.6, 0.95)
 CAMERA = CameraRange(distance_m=(3.0, 4.2), pitch_rad=(-0.3, 0.5), focal_per_side=(1.3, 1.9))
 STYLES = ("photo", "grey", "lines", "coloured lines")
-STYLE_WEIGHTS = (0.22, 0.16, 0.37, 0.25)
-SAY_STYLE_SHARE = 0.4
+STYLE_WEIGHTS = (0.3, 0.13, 0.32, 0.25)
+SAY_STYLE_SHARE = 0.6
+GRAIN_SHARE = 0.1
 PERSON_CAPTIONS = (
     "a moving human", "a moving human", "a moving human", "a photo of a person", "a photo of a moving person",
     "a human", "a photo of a man", "a photo of a woman", "a dancing person", "a person in the street",
 )  # fmt: skip
 OBJECT_CAPTIONS = (
-    "a photo of {noun}", "a photo of a {noun}", "a photo of a {colour} {noun}", "a {colour} {noun}", "a {noun}",
-    "a picture of a {colour} {noun}",
+    "a photo of {plain}", "a photo of a {plain}", "a {plain}", "a photo of a {coloured}", "a {coloured}",
+    "a picture of a {coloured}",
 )  # fmt: skip
+"""The first three name no colour."""
 STYLE_CAPTIONS = {
-    "photo": "a colour {}",
-    "grey": "a grey {}",
+    "photo": "a colour photo of {}",
+    "grey": "a grey photo of {}",
     "lines": "a line drawing of {}",
     "coloured lines": "a coloured line drawing of {}",
 }
+COMPOSITIONS = all_compositions()
 # Words the captions above never use, so that users' prompts find them in the vocabulary as whole words.
 EXTRA_WORDS = """
     event events camera image images recording motion moving walking running jumping kicking punching dancing waving
@@ -78,14 +86,14 @@ class Scene:
     Attributes:
         image: [S, S, 3] uint8 RGB colours.
         condition: [S, S, 3] uint8 RGB, the person's skeleton or normal map; None for objects.
-        noun: a key of `OBJECTS`, or `person`.
-        colour: of the object; empty for people.
+        plain: what is seen in words without colours: `person`, a key of `OBJECTS`, or such as `cat on box`.
+        coloured: the same with colours, such as `red cat on blue box`; empty for people.
     """
 
     image: np.ndarray
     condition: np.ndarray | None
-    noun: str
-    colour: str
+    plain: str
+    coloured: str = ""
 
 
 def sample_pose(rng: np.random.Generator) -> np.ndarray:
@@ -132,7 +140,7 @@ def draw_person(rng: np.random.Generator, size: int, condition: ConditionKind = 
     _, joints = joint_transforms(load_body(), rotations[None], subject.betas, transl[None])
     camera = sample_camera(rng, joints[0], (size, size), CAMERA)
     background = sample_background(rng, (size, size), colour=True)
-    if rng.random() < PLAIN_SHARE:
+    if rng.random() < PLAIN_SHARE["people"]:
         background[:] = background.mean(axis=(0, 1))
     linear = render_person(rng, subject, rotations, transl, camera, background, (size, size))
     image = (np.clip(linear, 0, 1) ** (1 / 2.2) * 255).round().astype(np.uint8)
@@ -142,22 +150,28 @@ def draw_person(rng: np.random.Generator, size: int, condition: ConditionKind = 
         )
         drawn = normals.render(body, (size, size), normals.Options(workers=1), [0]).images
         assert drawn is not None
-        return Scene(image, drawn[0], "person", "")
+        return Scene(image, drawn[0], "person")
     joints2d = project(camera, joints[0])[list(SMPL_TO_DHP19)]
     visible = is_inside(joints2d, (size, size))
     if rng.random() < 0.1:  # real labels miss joints
         visible &= rng.random(len(visible)) < 0.85
-    return Scene(image, draw_skeleton(joints2d, visible, "dhp19", (size, size)), "person", "")
+    return Scene(image, draw_skeleton(joints2d, visible, "dhp19", (size, size)), "person")
 
 
 def draw_thing(rng: np.random.Generator, size: int) -> Scene:
-    """A drawn object on a plain or stained background, without a condition."""
-    noun, colour = rng.choice(list(OBJECTS)), rng.choice(list(COLOURS))
+    """An object, or two together, on a plain or stained background, without a condition."""
     background = sample_background(rng, (size, size), colour=True) ** (1 / 2.2) * 255
-    if rng.random() < PLAIN_SHARE:
+    if rng.random() < PLAIN_SHARE["things"]:
         background[:] = rng.choice((8, 60, 200, 250)) if rng.random() < 0.5 else background.mean(axis=(0, 1))
-    image = draw_object(noun, colour, background.astype(np.uint8), rng)
-    return Scene(image, None, noun, colour)
+    canvas = background.astype(np.uint8)
+    first, second = (str(colour) for colour in rng.choice(list(COLOURS), 2))
+    if rng.random() < COMPOSITION_SHARE:
+        composition = COMPOSITIONS[rng.integers(len(COMPOSITIONS))]
+        image = draw_composition(composition, (first, second), canvas, rng)
+        coloured = f"{first} {composition.first} {composition.relation} {second} {composition.second}"
+        return Scene(image, None, composition.name, coloured)
+    noun = str(rng.choice(list(OBJECTS)))
+    return Scene(draw_object(noun, first, canvas, rng, THING_SIZE), None, noun, f"{first} {noun}")
 
 
 def draw_scene(
@@ -180,7 +194,7 @@ def apply_style(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, str
         image = np.repeat(image @ np.array([[0.299], [0.587], [0.114]], np.float32), 3, axis=2)
     if style.endswith("lines"):
         image = _outlines(image, rng)
-    if rng.random() < 0.2:  # film grain
+    if rng.random() < GRAIN_SHARE:  # of film
         image = image + rng.normal(0, rng.uniform(3, 14), image.shape[:2])[..., None]
     picture = np.clip(image, 0, 255).round().astype(np.uint8)
     return picture, _caption(scene, style, rng)
@@ -201,11 +215,11 @@ def _caption(scene: Scene, style: str, rng: np.random.Generator) -> str:
         caption = str(rng.choice(PERSON_CAPTIONS))
     else:
         # A grey picture has no colour to name.
-        templates = OBJECT_CAPTIONS if style.startswith(("photo", "coloured")) else OBJECT_CAPTIONS[:2]
-        caption = str(rng.choice(templates)).format(noun=scene.noun, colour=scene.colour)
+        templates = OBJECT_CAPTIONS if style.startswith(("photo", "coloured")) else OBJECT_CAPTIONS[:3]
+        caption = str(rng.choice(templates)).format(plain=scene.plain, coloured=scene.coloured)
     if rng.random() < SAY_STYLE_SHARE:
         subject = caption.removeprefix("a photo of ").removeprefix("a picture of ")
-        caption = STYLE_CAPTIONS[style].format(subject if "lines" in style else subject.removeprefix("a "))
+        caption = STYLE_CAPTIONS[style].format(subject)
     return caption
 
 
@@ -213,10 +227,12 @@ def caption_corpus() -> list[str]:
     """Every kind of caption the stream can give, and further everyday words: what the tokenizer is trained on."""
     plain = [*PERSON_CAPTIONS]
     for noun in OBJECTS:
-        plain += [template.format(noun=noun, colour=colour) for template in OBJECT_CAPTIONS for colour in COLOURS]
+        plain += [
+            form.format(plain=noun, coloured=f"{colour} {noun}") for form in OBJECT_CAPTIONS for colour in COLOURS
+        ]
     styled = [form.format(caption) for form in STYLE_CAPTIONS.values() for caption in PERSON_CAPTIONS]
     # Repeated: byte-pair encoding makes a word of its own of what it sees often enough.
-    return 4 * (plain + styled) + 40 * EXTRA_WORDS.split()
+    return 4 * (plain + styled) + 40 * [*RELATIONS, *EXTRA_WORDS.split()]
 
 
 def draw_block(

@@ -12,7 +12,7 @@ import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -41,6 +41,9 @@ SCHEDULER_CONFIG = {
     "clip_sample": False,
     "steps_offset": 1,
 }
+PredictionType = Literal["v_prediction", "sample"]
+WORD_GAIN = 12.0
+"""How loud the mean of a prompt's words is beside a single word; 24 tokens share the mean, a handful are words."""
 START, END = "<|startoftext|>", "<|endoftext|>"
 
 
@@ -101,6 +104,7 @@ def build_prior(
     seed: int,
     widths: tuple[int, ...] = WIDTHS,
     image_size: int = IMAGE_SIZE,
+    prediction_type: PredictionType = "v_prediction",
 ) -> Prior:
     """A prior with random weights.
 
@@ -110,6 +114,7 @@ def build_prior(
         seed: of the initial weights.
         widths: channels of the U-Net from the top to the bottom resolution; multiples of 32.
         image_size: px, a multiple of 16.
+        prediction_type: what the U-Net learns to predict: v, or `sample`, the latents themselves.
     """
     from diffusers.models.controlnets.controlnet import ControlNetModel
     from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
@@ -125,7 +130,7 @@ def build_prior(
                 hidden_size=TEXT_CHANNELS,
                 intermediate_size=2 * TEXT_CHANNELS,
                 projection_dim=TEXT_CHANNELS,
-                num_hidden_layers=2,
+                num_hidden_layers=1,
                 num_attention_heads=TEXT_CHANNELS // HEAD_CHANNELS,
                 max_position_embeddings=MAX_TOKENS,
                 bos_token_id=tokenizer.bos_token_id,
@@ -133,7 +138,7 @@ def build_prior(
                 pad_token_id=tokenizer.pad_token_id,
             )
         )
-        spread_words(text_encoder)
+        fix_text_encoder(text_encoder, tokenizer)
         upper = len(widths) - 1  # a condition image says where; attention is needed at the lowest resolution only
         unet = UNet2DConditionModel(
             sample_size=image_size // PATCH_PX,
@@ -154,20 +159,40 @@ def build_prior(
         )
         controlnet = ControlNetModel.from_unet(unet, conditioning_embedding_out_channels=CONDITION_WIDTHS)
         break_zeros(controlnet)
-    side = image_size
-    return Prior(tokenizer, text_encoder, vae, unet, controlnet, dict(SCHEDULER_CONFIG), (side, side))
+    scheduler_config = {**SCHEDULER_CONFIG, "prediction_type": prediction_type}
+    return Prior(tokenizer, text_encoder, vae, unet, controlnet, scheduler_config, (image_size, image_size))
 
 
-def spread_words(text_encoder: Any) -> None:
-    """Give every word of the text encoder a random direction of its own, of unit variance; it is then never trained.
+@torch.no_grad()
+def fix_text_encoder(text_encoder: Any, tokenizer: Any) -> None:
+    """Weights under which every token holds its word and the mean of the words up to it; they are never trained.
 
     Trained together with the U-Net, the text encoder collapsed: a small network finds the condition image first, has
     little to gain from prompts for a long time, and lets them grow alike. Fixed embeddings cannot; the U-Net learns
-    what each of them means. Positions matter a tenth as much as words, context what two random layers mix in.
+    what each of them means. Here every word has a random direction of unit variance. All scores of the first layer's
+    attention are equal, so that it averages what came before, turned at random to be told from the word itself; start
+    and end are left out of the average. Padding, most of a prompt, thus repeats what the whole prompt says, and the
+    pooled prompt is a bag of its words (Arora et al., ICLR 2017) before the U-Net has learnt to look for them. Order
+    stays in the words: a word's token holds the words before it, and not those after it. The other layers add nothing.
+
+    Args:
+        text_encoder: a `CLIPTextModel`; changed in place, with torch's global random stream.
+        tokenizer: whose start and end tokens are not words.
     """
     words, positions = text_encoder.embeddings.token_embedding, text_encoder.embeddings.position_embedding
-    torch.nn.init.normal_(words.weight, std=1.0)
+    width = words.embedding_dim
+    marks = torch.linalg.qr(torch.randn(width, 2)).Q.T  # directions of start and end
+    without_marks = torch.eye(width) - marks.T @ marks
+    directions = torch.randn(words.weight.shape) @ without_marks
+    words.weight.copy_(directions / directions.square().mean(dim=1, keepdim=True).sqrt())
+    words.weight[[tokenizer.bos_token_id, tokenizer.eos_token_id]] = marks * width**0.5
     torch.nn.init.normal_(positions.weight, std=0.1)
+    for parameter in text_encoder.encoder.layers.parameters():
+        parameter.zero_()
+    first = text_encoder.encoder.layers[0]
+    first.layer_norm1.weight.fill_(1.0)
+    first.self_attn.v_proj.weight.copy_(without_marks)
+    first.self_attn.out_proj.weight.copy_(WORD_GAIN * torch.linalg.qr(torch.randn(width, width)).Q)
 
 
 def break_zeros(controlnet: Any) -> None:

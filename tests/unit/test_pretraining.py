@@ -10,6 +10,8 @@ from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
 from ctlev_core.diffusion.prior import encode_prompts, load_prior
 from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object
+from ctlev_core.diffusion.small_prior import WORD_GAIN
+from ctlev_core.render.compositions import RELATIONS, parse_composition
 from data_contracts.errors import TrainingError
 
 TINY = PretrainingOptions(
@@ -48,12 +50,19 @@ def test_scenes_do_not_depend_on_order_or_block():
 
 def test_mixture_of_people_and_objects():
     scenes = procedural_images.draw_block(0, 0, 60, 32)
-    people = [scene for scene in scenes if scene.condition is not None]
+    people = [scene.condition for scene in scenes if scene.condition is not None]
     # 60 draws at 0.5: four standard deviations either way.
     assert 15 <= len(people) <= 45
-    assert all(scene.condition.any() for scene in people), (
-        "a person whose skeleton is out of the picture teaches nothing"
-    )
+    assert all(condition.any() for condition in people), "a person whose skeleton is out of the picture teaches nothing"
+
+
+def test_things_are_single_objects_and_compositions():
+    scenes = [procedural_images.draw_thing(np.random.default_rng([5, index]), 16) for index in range(120)]
+    pairs = [parse_composition(scene.plain) for scene in scenes if " " in scene.plain]
+    # 120 draws at 0.3: four standard deviations either way.
+    assert 16 <= len(pairs) <= 56
+    assert {pair.relation for pair in pairs} == set(RELATIONS)
+    assert all(scene.condition is None for scene in scenes)
 
 
 def test_held_out_motions_are_never_drawn(monkeypatch):
@@ -94,10 +103,12 @@ def test_captions_name_what_is_seen_and_the_tokenizer_knows_their_words():
         image, caption = procedural_images.apply_style(scene, rng)
         assert image.dtype == np.uint8 and image.shape == (16, 16, 3)
         if scene.condition is None:
-            assert scene.noun in caption
+            assert scene.plain in caption or scene.coloured in caption
+            assert set(scene.plain.split()) <= {*OBJECTS, *RELATIONS}
+            assert set(scene.coloured.split()) - set(scene.plain.split()) <= {*COLOURS}
         words = caption.split()
         assert tokenizer.tokenize(caption) == [f"{word}</w>" for word in words]
-    for word in (*OBJECTS, *COLOURS, "street", "running", "human", "motorcycle"):
+    for word in (*OBJECTS, *COLOURS, *RELATIONS, "street", "running", "human", "motorcycle"):
         assert tokenizer.tokenize(word) == [f"{word}</w>"]
     assert tokenizer.eos_token_id == len(tokenizer) - 1, "CLIP finds the end token as the largest id"
 
@@ -148,6 +159,51 @@ def test_the_text_encoder_tells_prompts_apart_and_is_not_trained(tmp_path):
     kept = load_prior(tmp_path / "out").text_encoder.state_dict()
     for name, weight in before.text_encoder.state_dict().items():
         assert torch.equal(kept[name].half(), weight.half()), name
+
+
+def test_tokens_hold_their_word_and_the_mean_of_the_words_so_far():
+    """Against the definition in NumPy: layer norm, mean of the projections, one turn, layer norm."""
+    prior = new_prior(TINY)
+    tokens = prior.tokenizer("a red cat on a blue box", padding="max_length", return_tensors="pt").input_ids
+    embeddings = prior.text_encoder.embeddings
+    layer = prior.text_encoder.encoder.layers[0]
+    project, turn = (weight.detach().double().numpy() for weight in (layer.self_attn.v_proj.weight,
+        layer.self_attn.out_proj.weight))  # fmt: skip
+
+    def normalised(rows):
+        return (rows - rows.mean(1, keepdims=True)) / rows.std(1, keepdims=True)
+
+    positions = embeddings.position_embedding.weight.detach().double().numpy()
+    rows = embeddings.token_embedding.weight.detach().double().numpy()[tokens[0]] + positions
+    means = np.cumsum(normalised(rows) @ project.T, axis=0) / np.arange(1, len(rows) + 1)[:, None]
+    expected = normalised(rows + means @ turn.T)
+    with torch.no_grad():
+        actual = prior.text_encoder(tokens)[0][0].numpy()
+    # float32 against float64, and layer norm's epsilon of 1e-5.
+    np.testing.assert_allclose(actual, expected, atol=1e-4)
+    np.testing.assert_allclose(turn @ turn.T, WORD_GAIN**2 * np.eye(len(turn)), atol=1e-3)
+
+
+def test_padding_says_which_words_a_prompt_has_and_words_in_which_order():
+    prior = new_prior(TINY)
+    prompts = ["a photo of a cat on box", "a photo of a box on cat", "a photo of a cat with box", ""]
+    cat_on_box, box_on_cat, with_box, empty = encode_prompts(prior, prompts)
+
+    def distance(one, other):
+        return float((one - other).square().mean().sqrt())
+
+    assert distance(cat_on_box[-1], box_on_cat[-1]) < 0.05 < 0.2 < distance(cat_on_box[-1], with_box[-1])
+    assert distance(cat_on_box[-1], empty[-1]) > 0.5
+    first, second = 5, 7  # after start: a, photo, of, a, cat, on, box
+    assert distance(cat_on_box[first], box_on_cat[second]) > 0.1, "the same word, but the box came before it"
+
+
+def test_prediction_type_is_written_and_kept(tmp_path):
+    options = TINY.model_copy(update={"prediction_type": "sample"})
+    pretrain(options, tmp_path / "first", tmp_path / "work")
+    assert load_prior(tmp_path / "first").scheduler_config["prediction_type"] == "sample"
+    again = TINY.model_copy(update={"start": tmp_path / "first"})
+    assert new_prior(again).scheduler_config["prediction_type"] == "sample", "that of the weights it goes on from"
 
 
 def test_wall_clock_budget_ends_training(tmp_path):
