@@ -20,7 +20,7 @@ import zlib
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from ctlev_core.render.camera_paths import Motion, sample_camera_path
 from ctlev_core.sensor_choice import check_sensor_preset, read_sensor, sensor_preset_files
@@ -130,20 +130,37 @@ class Options(Frozen):
         "than with 0.05 px, half of that with 0.25 px",
     )
 
-    @model_validator(mode="after")
-    def _choices_make_sense(self) -> Options:
-        unknown = [name for name in self.classes if name not in (*CLASSES, *HELD_OUT)]
+    @field_validator("classes")
+    @classmethod
+    def _classes_are_known(cls, classes: tuple[str, ...]) -> tuple[str, ...]:
+        unknown = [name for name in classes if name not in (*CLASSES, *HELD_OUT)]
         if unknown:
             raise ValueError(f"no class {unknown[0]!r}; there are: {', '.join((*CLASSES, *HELD_OUT))}")
+        if len(set(classes)) < len(classes):
+            raise ValueError("a class is named twice")
+        return classes
+
+    @field_validator("object_size")
+    @classmethod
+    def _sizes_ascend(cls, sizes: tuple[float, float]) -> tuple[float, float]:
+        if not 0.1 <= sizes[0] <= sizes[1] <= 1:
+            raise ValueError("expected two shares from 0.1 to 1, the lower first")
+        return sizes
+
+    @model_validator(mode="after")
+    def _something_is_left_to_learn_from_and_to_test(self) -> Options:
         if self.zero_shot and not (_classes_of("train", self) and _classes_of("test", self)):
             raise ValueError(f"zero_shot needs classes to learn from and some of {', '.join(HELD_OUT)}")
-        if not 0.1 <= self.object_size[0] <= self.object_size[1] <= 1:
-            raise ValueError(f"object_size must be two shares from 0.1 to 1, the lower first, got {self.object_size}")
         return self
 
 
 def list_recordings(options: Options) -> list[Recording]:
-    """Every recording, split by split and class by class; a recording is its own subject."""
+    """Every recording, split by split and class by class; a recording is its own subject.
+
+    Raises:
+        DataError: the sensor file cannot be read.
+    """
+    read_sensor(options.sensor_preset, options.noise)
     counts = (options.num_train_per_class, options.num_test_per_class, 1)
     return [
         _recording(split, class_name, index, options)
@@ -168,8 +185,7 @@ def read_events(recording: Recording, options: Options) -> Events:
     """The events of one time along the camera's path; time 0 is its start.
 
     Raises:
-        DataError: the recording is not one of this set with these options, carries labels only, or names a sensor file
-            that cannot be read.
+        DataError: the recording is not one of this set with these options, or carries labels only.
     """
     from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
 
@@ -244,7 +260,8 @@ def _draw_screen(
     if class_name in CLASSES:
         picture = draw_object(class_name, str(rng.choice(colours)), canvas, rng, size_range, supersampling=1)
     else:
-        first, second = (str(colour) for colour in rng.choice(colours, 2))
+        # Two of one colour would lose the outline they share.
+        first, second = (str(colour) for colour in rng.choice(colours, 2, replace=False))
         composition = parse_composition(class_name)
         picture = draw_composition(composition, (first, second), canvas, rng, size_range, supersampling=1)
     return _luminance(picture)
@@ -256,7 +273,7 @@ def _luminance(colour: np.ndarray) -> np.ndarray:
 
 
 def _visible_colours(canvas: np.ndarray) -> list[str]:
-    """Colours that stand out from the mean of a background [h, w, 3] uint8; on any there is black or white."""
+    """Colours that stand out from the mean of a background [h, w, 3] uint8; there are two or more for any."""
     from ctlev_core.render.objects import COLOURS
 
     level = _luminance(canvas).mean()

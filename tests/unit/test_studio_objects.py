@@ -18,7 +18,7 @@ from ctlev_core.datasets.studio_objects import CLASSES, HELD_OUT, Options
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
 from ctlev_core.render.compositions import NOUNS, Composition, all_compositions, parse_composition
 from ctlev_core.render.object_drawing import draw_composition, draw_object
-from ctlev_core.render.objects import OBJECTS
+from ctlev_core.render.objects import COLOURS, OBJECTS
 from ctlev_core.sensor_choice import read_sensor
 from ctlev_core.sensor_options import PRESETS
 from data_contracts.errors import DataError
@@ -189,6 +189,16 @@ def test_events_lie_on_the_edges_of_the_drawing():
         assert counts.sum() > 500
 
 
+def test_any_background_leaves_two_colours_that_stand_out():
+    for level in range(256):
+        canvas = np.full((2, 2, 3), level, np.uint8)
+        colours = studio_objects._visible_colours(canvas)
+        assert len(colours) >= 2
+        for colour in colours:
+            shown = [studio_objects._luminance(np.array(c, np.uint8)) for c in (COLOURS[colour], canvas[0, 0])]
+            assert abs(np.log(shown[0] / shown[1])) >= 0.799
+
+
 def test_noise_and_size_are_difficulty():
     quiet, usual, loud = (SMALL.model_copy(update={"noise": noise}) for noise in (0.0, 1.0, 5.0))
     recording = first_of("moon with tower", options := SMALL.model_copy(update={"classes": HELD_OUT}))
@@ -244,7 +254,10 @@ def test_a_sensor_may_come_from_a_file(tmp_path):
     )
     file.write_text("threshold: -1\n")
     with pytest.raises(DataError, match="not a sensor preset"):
-        studio_objects.read_events(recording, options)
+        studio_objects.list_recordings(options)
+    file.unlink()
+    with pytest.raises(DataError, match="No such file"):
+        studio_objects.list_recordings(options)
 
 
 @pytest.mark.parametrize(
@@ -252,6 +265,7 @@ def test_a_sensor_may_come_from_a_file(tmp_path):
     [
         ({"sensor_preset": "loud"}, f"expected one of {', '.join(PRESETS)}, or a file"),
         ({"classes": ("cat", "unicorn")}, "no class 'unicorn'; there are: airplane"),
+        ({"classes": ("cat", "cat")}, "a class is named twice"),
         ({"zero_shot": True, "classes": ("cat",)}, "zero_shot needs classes to learn from and some of bird on car"),
         ({"object_size": (0.9, 0.5)}, "the lower first"),
         ({"motion": "jump"}, "saccades"),
