@@ -1,7 +1,8 @@
 """Frechet distance between the features of two sets of images; see `ctlev_core.frechet` for the formula.
 
 The features come from the caller, who has to name the extractor beside the score: distances under different
-extractors do not compare, and only Inception's may be called FID.
+extractors do not compare, and only Inception's may be called FID. Values of sets of different sizes do not compare
+either; `fd_infinity` and `kid` do. How sure a value is says `ctlev_core.feature_distances`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 from ctlev_core.frechet import frechet_distance
 from data_contracts.config import Frozen
 
-VERSION = 1
+VERSION = 2
 INPUT = "features"
 
 

@@ -1,0 +1,44 @@
+"""Kernel inception distance between the features of two sets of images; see `ctlev_core.kernel_distance`.
+
+Unbiased, so that sets of different and small sizes compare; it may be negative, and is given as it is. The features
+come from the caller, who has to name the extractor beside the score.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from ctlev_core.kernel_distance import kernel_distance
+from data_contracts.config import Frozen
+
+VERSION = 1
+INPUT = "features"
+
+
+class Options(Frozen):
+    """Subsets, as torch-fidelity and clean-fid draw them."""
+
+    subset_size: int = Field(default=1000, ge=0, description="rows of a subset; 0 = all rows at once")
+    num_subsets: int = Field(default=100, ge=1, description="subsets the mean is taken over")
+    seed: int = Field(default=0, ge=0, description="of the drawing of subsets")
+
+
+def compute(predicted: np.ndarray, target: np.ndarray, options: Options) -> dict[str, float]:
+    """`kid`; papers often print 1,000 times as much.
+
+    Args:
+        predicted: [N, D] features of the set to judge.
+        target: [M, D] features of the reference set, from the same extractor.
+        options: subsets.
+    Raises:
+        ValueError: shapes do not fit, fewer than two rows, or a value that is not finite.
+    """
+    value = kernel_distance(
+        predicted,
+        target,
+        subset_size=options.subset_size,
+        num_subsets=options.num_subsets,
+        seed=options.seed,
+    )
+    return {"kid": value}

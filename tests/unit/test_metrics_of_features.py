@@ -1,0 +1,220 @@
+"""KID, FD-infinity, precision and coverage against slow loops and closed forms; intervals by counting."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctlev_core.feature_distances import estimate_distances
+from ctlev_core.frechet import frechet_distance
+from ctlev_core.kernel_distance import kernel_distance
+from ctlev_core.metrics import fd_infinity, frechet, kid, prdc
+from ctlev_core.neighbour_scores import neighbour_scores
+
+
+def normal(seed, count, width=6, scale=1.0, offset=0.0):
+    return scale * np.random.default_rng(seed).normal(size=(count, width)) + offset
+
+
+def slow_kid(a, b):
+    """Binkowski et al., eq. 4, pair by pair."""
+
+    def kernel(x, y):
+        return (float(x @ y) / len(x) + 1) ** 3
+
+    within = [
+        sum(kernel(x, y) for i, x in enumerate(rows) for j, y in enumerate(rows) if i != j)
+        / (len(rows) * (len(rows) - 1))
+        for rows in (a, b)
+    ]
+    return sum(within) - 2 * sum(kernel(x, y) for x in a for y in b) / (len(a) * len(b))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 12), st.integers(2, 12), st.integers(1, 5), st.floats(-3, 3))
+def test_kid_agrees_with_a_loop_over_pairs(seed, n, m, width, offset):
+    a, b = normal(seed, n, width, 1.5, offset), normal(seed + 1, m, width, 1.0, offset)
+    # The loop cancels numbers of the size of the kernel.
+    size = max(1.0, (max(np.abs(a).max(), np.abs(b).max()) ** 2 + 1) ** 3)
+    assert kernel_distance(a, b) == pytest.approx(slow_kid(a, b), rel=1e-9, abs=1e-13 * size)
+
+
+def test_kid_of_large_offsets_keeps_its_digits():
+    """Integers, so that a loop over Python's exact fractions of them is the truth."""
+    from fractions import Fraction
+
+    random = np.random.default_rng(0)
+    a, b = (random.integers(-9, 9, size=(count, 4)) + 2**20 for count in (7, 9))
+    rows = [[[Fraction(int(v)) for v in row] for row in features] for features in (a, b)]
+
+    def mean(first, second, without_self):
+        kernel = [
+            (sum(x * y for x, y in zip(p, q, strict=True)) / 4 + 1) ** 3
+            for i, p in enumerate(first)
+            for j, q in enumerate(second)
+            if not (without_self and i == j)
+        ]
+        return sum(kernel) / len(kernel)
+
+    exact = mean(rows[0], rows[0], True) + mean(rows[1], rows[1], True) - 2 * mean(rows[0], rows[1], False)
+    assert kernel_distance(a, b) == pytest.approx(float(exact), rel=1e-10)
+
+
+def test_subsets_of_kid_have_the_same_mean_and_a_seed():
+    a, b = normal(1, 400), normal(2, 300, offset=0.5)
+    whole = kernel_distance(a, b, subset_size=0)
+    drawn = [kernel_distance(a, b, subset_size=100, num_subsets=50, seed=seed) for seed in (0, 0, 1)]
+    assert drawn[0] == drawn[1] != drawn[2]
+    assert drawn[0] == pytest.approx(whole, rel=0.15)
+    assert kid.compute(a, b, kid.Options()) == {"kid": whole}  # no set has more than 1,000 rows
+    assert kernel_distance(np.full((5, 3), 2.0), np.full((7, 3), 2.0)) == 0
+    with pytest.raises(ValueError, match="at least 2 rows"):
+        kernel_distance(a, b, subset_size=1)
+
+
+def test_kid_of_equal_distributions_lies_around_zero():
+    values = [kernel_distance(normal(seed, 60), normal(seed + 1000, 40)) for seed in range(60)]
+    assert abs(np.mean(values)) < 3 * np.std(values) / np.sqrt(60)
+    assert min(values) < 0 < max(values)
+
+
+def slow_neighbour_scores(judged, reference, k):
+    def radius(rows, i):
+        return sorted(np.linalg.norm(rows - rows[i], axis=1))[k]
+
+    real = [radius(reference, i) for i in range(len(reference))]
+    made = [radius(judged, i) for i in range(len(judged))]
+    inside = np.array([[np.linalg.norm(x - y) for y in judged] for x in reference])
+    in_real = inside <= np.array(real)[:, None]
+    return {
+        "precision": in_real.any(axis=0).mean(),
+        "recall": (inside <= np.array(made)).any(axis=1).mean(),
+        "density": in_real.sum(axis=0).mean() / k,
+        "coverage": in_real.any(axis=1).mean(),
+    }
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(6, 25), st.integers(6, 25), st.integers(1, 5), st.floats(0, 3))
+def test_neighbour_scores_agree_with_a_loop(seed, n, m, k, offset):
+    judged, reference = normal(seed, n, 4, 1.0, offset), normal(seed + 1, m, 4)
+    assert neighbour_scores(judged, reference, k) == pytest.approx(slow_neighbour_scores(judged, reference, k))
+
+
+def test_neighbour_scores_where_rows_repeat_and_far_from_the_origin():
+    a = normal(3, 50)
+    identical = neighbour_scores(a, a.copy(), 3)
+    assert identical["precision"] == identical["recall"] == identical["coverage"] == 1
+    constant = np.full((9, 2), 5.0)
+    everything = {"precision": 1.0, "recall": 1.0, "coverage": 1.0}
+    assert neighbour_scores(constant, constant, 3) == everything | {"density": 3.0}
+    assert set(neighbour_scores(constant + 1, constant, 3).values()) == {0.0}
+    judged, reference = np.round(64 * normal(4, 60)), np.round(64 * normal(5, 50))
+    far = neighbour_scores(judged + 2.0**40, reference + 2.0**40, 5)
+    assert far == neighbour_scores(judged, reference, 5)
+    with pytest.raises(ValueError, match=r"5 neighbours need .* got 60 and 5"):
+        neighbour_scores(judged, reference[:5], 5)
+
+
+def test_prdc_names_its_neighbours():
+    a, b = normal(6, 40), normal(7, 40)
+    found = prdc.compute(a, b, prdc.Options(num_neighbours=3))
+    assert found == {f"{name}_k3": value for name, value in neighbour_scores(a, b, 3).items()}
+
+
+def test_fd_infinity_takes_away_the_bias_of_small_sets():
+    """Both Gaussians have a standard deviation of 1 in each of 16 directions, half a unit apart in one: 0.25."""
+    plain, extrapolated = [], []
+    for seed in range(40):
+        a, b = normal(seed, 120, 16), normal(seed + 500, 120, 16)
+        a[:, 0] += 0.5
+        plain.append(frechet_distance(a, b))
+        extrapolated.append(fd_infinity.compute(a, b, fd_infinity.Options())["fd_infinity"])
+    assert np.mean(plain) > 0.25 + 0.5
+    # The second order of the bias is left: a few per cent of the first at 60 rows a half and 16 features.
+    assert np.mean(extrapolated) == pytest.approx(0.25, abs=0.06)
+
+
+def test_fd_infinity_is_a_line_through_the_distances_of_parts():
+    a, b = normal(8, 90), normal(9, 60, offset=1)
+    options = fd_infinity.Options(max_parts=3, num_divisions=2)
+    found = fd_infinity.compute(a, b, options)["fd_infinity"]
+    assert found == fd_infinity.compute(a, b, options)["fd_infinity"]
+    assert found != fd_infinity.compute(a, b, options.model_copy(update={"seed": 1}))["fd_infinity"]
+    assert 0 < found < frechet_distance(a, b)
+    with pytest.raises(ValueError, match="3 parts need 6 rows or more, got 90 and 5"):
+        fd_infinity.compute(a, b[:5], options)
+
+
+@pytest.mark.parametrize("metric", [frechet, kid, fd_infinity, prdc])
+def test_distances_name_bad_rows(metric):
+    a = normal(10, 30)
+    broken = a.copy()
+    broken[7, 2] = np.nan
+    with pytest.raises(ValueError, match=r"second set: .* 1 of 30 rows are not, the first is row 7"):
+        metric.compute(a, broken, metric.Options())
+    with pytest.raises(ValueError, match=r"first set: .* at least 2 rows, got 1"):
+        metric.compute(a[:1], a, metric.Options())
+    with pytest.raises(ValueError, match="same number of features, got 6 and 4"):
+        metric.compute(a, a[:, :4], metric.Options())
+
+
+def score(a, b):
+    return {"fd": frechet_distance(a, b), "kid": kernel_distance(a, b)}
+
+
+@pytest.mark.parametrize(("shift", "frames"), [(0.5, 1), (0.5, 4), (0.0, 1)])
+def test_intervals_cover_the_mean_score_as_often_as_they_say(shift, frames):
+    """The mean over 200 draws is what sets of these sizes score on average; frames of a recording resemble another."""
+
+    def draw(seed):
+        random = np.random.default_rng(seed)
+        scenes = random.normal(size=(60, 1, 4)) + 0.3 * random.normal(size=(60, frames, 4))
+        return scenes.reshape(-1, 4) + shift, random.normal(size=(70, 4)) * 1.05
+
+    truth = {name: np.mean([score(*draw(10_000 + seed))[name] for seed in range(200)]) for name in ("fd", "kid")}
+    hits = {"fd": 0, "kid": 0}
+    for seed in range(40):
+        a, b = draw(seed)
+        found = estimate_distances(score, a, b, predicted_groups=np.repeat(np.arange(60), frames), num_splits=10)
+        for name, estimate in found.items():
+            hits[name] += int(estimate.low <= truth[name] <= estimate.high)
+    # 95 % of 40 is 38; three deviations are 4, and equal distributions have intervals that are too wide.
+    assert min(hits.values()) >= 34
+
+
+def test_a_percentile_bootstrap_would_miss_the_value_itself():
+    """Why halves are used: a resampled set holds fewer different rows, and lies further away."""
+    a, b = normal(11, 60, 20), normal(12, 60, 20)
+    random = np.random.default_rng(0)
+    resampled = [frechet_distance(a[random.integers(60, size=60)], b[random.integers(60, size=60)]) for _ in range(60)]
+    value = frechet_distance(a, b)
+    assert np.quantile(resampled, 0.025) > value
+    estimate = estimate_distances(lambda x, y: {"fd": frechet_distance(x, y)}, a, b)["fd"]
+    assert estimate.low < value == estimate.value < estimate.high
+
+
+def test_floor_and_halves_say_what_small_sets_do():
+    same = estimate_distances(score, normal(13, 100), normal(14, 100))["fd"]
+    far = estimate_distances(score, normal(13, 100, offset=2), normal(14, 100))["fd"]
+    assert same.halved > same.value and same.floor_low < same.floor < same.floor_high
+    # A perfect set lies at the floor, another above it; both floors are of the same reference set and splits.
+    assert same.halved == pytest.approx(same.floor, rel=0.2)
+    assert far.floor == same.floor and far.halved > 5 * far.floor
+    assert (same.num_predicted, same.num_target, same.num_features) == (100, 100, 6)
+    assert estimate_distances(score, normal(13, 100), normal(14, 100))["fd"] == same
+
+
+def test_too_few_recordings_leave_the_value_alone():
+    a, b = normal(15, 40), normal(16, 30)
+    few = estimate_distances(score, a, b, predicted_groups=np.repeat(list("abcd"), 10))["fd"]
+    assert few.value == frechet_distance(a, b) and np.isnan([few.low, few.high, few.halved, few.floor]).all()
+    # Halves of eight rows have no ten neighbours.
+    short = estimate_distances(lambda x, y: neighbour_scores(x, y, 6), a[:12], b)["precision"]
+    assert 0 <= short.value <= 1 and np.isnan(short.low)
+    with pytest.raises(ValueError, match=r"groups must be \[30\]"):
+        estimate_distances(score, a, b, target_groups=["a"])
+    with pytest.raises(ValueError, match="level"):
+        estimate_distances(score, a, b, level=1.0)
+    with pytest.raises(ValueError, match="at least 2 rows"):
+        estimate_distances(score, a[:1], b)
