@@ -12,34 +12,43 @@ from ctlev_core.skeletons import JOINT_SETS
 from data_contracts.labels import Labels
 
 Alignment = Literal["none", "pelvis", "procrustes"]
+Counted = Literal["visible", "known"]
+Sums = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Of each score, by name, numerators [N] and denominators [N] of the rows."""
 
 
-def compute_joint_errors_px(predicted: Mapping[str, Any], target: Labels) -> np.ndarray:
-    """Euclidean distance of each joint, NaN where the label is not visible.
+def compute_joint_errors_px(
+    predicted: Mapping[str, Any], target: Labels, counted: Counted = "visible", *, whole_pixels: bool = False
+) -> np.ndarray:
+    """Euclidean distance of each joint, NaN where the label does not count.
 
     Args:
         predicted: `joints2d` [N, J, 2], px.
         target: labels with `joints2d` [N, J, 2], px, and `visible` [N, J].
+        counted: joints that count: those visible, or all whose position is known, also outside the image and occluded.
+        whole_pixels: measure from the centre of the pixel that a label lies in rather than from the label.
     Returns:
         [N, J] float64, px.
     Raises:
-        ValueError: shapes differ, no joint is visible, or a prediction for a visible joint is not finite.
+        ValueError: shapes differ, no joint counts, or a prediction for one that does is not finite.
     """
     if target.joints2d is None or target.visible is None:
         raise ValueError("the target labels have no joints2d")
     points = np.asarray(predicted["joints2d"], dtype=np.float64)
     if points.shape != target.joints2d.shape:
         raise ValueError(f"predicted joints2d must be {target.joints2d.shape}, got {points.shape}")
-    if not target.visible.any():
-        raise ValueError(f"no joint is visible in any of the {len(target)} target rows")
-    distance = np.linalg.norm(points - target.joints2d, axis=-1)
-    wrong = target.visible & ~np.isfinite(distance)
+    joints = target.joints2d.astype(np.float64)
+    counts = target.visible if counted == "visible" else np.isfinite(joints).all(axis=-1)
+    if not counts.any():
+        raise ValueError(f"no joint is {counted} in any of the {len(target)} target rows")
+    distance = np.linalg.norm(points - (np.floor(joints) + 0.5 if whole_pixels else joints), axis=-1)
+    wrong = counts & ~np.isfinite(distance)
     if wrong.any():
         row, joint = np.argwhere(wrong)[0]
         raise ValueError(
             f"predicted joint {joint} of row {row} is {points[row, joint].tolist()}, not a finite position"
         )
-    return np.where(target.visible, distance, np.nan)
+    return np.where(counts, distance, np.nan)
 
 
 def compute_joint_errors_mm(predicted: Mapping[str, Any], target: Labels, alignment: Alignment) -> np.ndarray:
@@ -88,6 +97,11 @@ def row_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sum and number [N] of the entries of [N, J] that are not NaN: what means over any rows are made of."""
     known = ~np.isnan(values)
     return np.where(known, values, 0.0).sum(axis=-1), known.sum(axis=-1)
+
+
+def quotients(sums: Sums) -> dict[str, float]:
+    """Scores over all rows: sum of the numerators by sum of the denominators."""
+    return {name: float(total.sum() / count.sum()) for name, (total, count) in sums.items()}
 
 
 def row_means(values: np.ndarray) -> np.ndarray:

@@ -21,24 +21,19 @@ def align_similarity(points: np.ndarray, target: np.ndarray, known: np.ndarray) 
         known: [N, J] bool; points that count. A row without any is only returned as it is.
     Returns:
         [N, J, 3] float64, all points, known or not.
-    Source: Umeyama, IEEE TPAMI 1991, eq. 34-43.
+    Raises:
+        ValueError: shapes differ.
+    Source: Umeyama, IEEE TPAMI 1991, eq. 34-43. Event-HPE's own function returns NaN for coinciding points and takes
+    batches of two or three poses for transposed ones.
     """
-    points, target = points.astype(np.float64), target.astype(np.float64)
-    weight = known[..., None].astype(np.float64)
-    count = np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
-    target = np.where(known[..., None], target, 0.0)
-    centre_points = np.sum(weight * points, axis=1, keepdims=True) / count
-    centre_target = np.sum(weight * target, axis=1, keepdims=True) / count
-    from_centre, to_centre = points - centre_points, weight * (target - centre_target)
-    # Scaled to unit size first: the product of coordinates in mm and in km alike stays far from overflow.
-    size = np.sqrt(np.sum(weight * from_centre**2, axis=(1, 2), keepdims=True))
-    shapeless = size <= RELATIVE_SIZE * np.abs(centre_points).max(axis=2, keepdims=True, initial=0.0)
-    unit = from_centre / np.where(shapeless, 1.0, size)
-    left, stretch, right = np.linalg.svd(np.swapaxes(weight * unit, 1, 2) @ to_centre)
-    handed = np.ones_like(stretch)
-    mirrored = np.asarray(np.linalg.det(left) * np.linalg.det(right)) < 0.0
-    handed[:, 2] = np.where(mirrored, -1.0, 1.0)
-    rotation = left * handed[:, None] @ right
-    scale = np.maximum(np.sum(stretch * handed, axis=1), 0.0)[:, None, None]
-    aligned = np.where(shapeless, 0.0, scale * unit @ rotation) + centre_target
-    return np.where(np.any(known, axis=1, keepdims=True)[..., None], aligned, points)
+    from ctlev_core.procrustes_kernels import align_rows
+
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    target = np.ascontiguousarray(target, dtype=np.float64)
+    if points.shape != target.shape or points.ndim != 3 or points.shape[2] != 3 or known.shape != points.shape[:2]:
+        raise ValueError(
+            f"points and target must be [N, J, 3] and known [N, J], got {points.shape}, {target.shape}, {known.shape}"
+        )
+    aligned = np.empty_like(points)
+    align_rows(points, target, np.ascontiguousarray(known, dtype=np.bool_), RELATIVE_SIZE, aligned)
+    return aligned

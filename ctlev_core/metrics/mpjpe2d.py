@@ -1,17 +1,20 @@
 """Mean per-joint position error in the image, px.
 
-Source: 2D-MPJPE of DHP19 (Calabrese et al., CVPR Workshops 2019) and of the paper's Table 2: the mean of the Euclidean
-distance over all visible joints of all frames. DHP19's own code truncates labels to whole pixels first; this does not.
+Source: 2D-MPJPE of DHP19 (Calabrese et al., CVPR Workshops 2019, SensorsINI/DHP19) and of the paper's Table 2: the mean
+of the Euclidean distance over all joints inside the image, of all frames. DHP19's own code truncates labels to whole
+pixels first and compares them with the index of the highest pixel of the heatmap: `protocol="dhp19"`. That moves each
+label by up to half a pixel; by default labels stay where they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
-from ctlev_core.joint_errors import compute_joint_errors_px, row_means, row_sums
+from ctlev_core.joint_errors import Counted, Sums, compute_joint_errors_px, quotients, row_means, row_sums
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
@@ -20,29 +23,42 @@ INPUT = "joints2d"
 
 
 class Options(Frozen):
-    """None: the error has no parameters."""
+    """Which joints count, and how labels are read."""
+
+    joints: Counted = Field(
+        default="visible", description="joints that count: those visible, or all whose position is known"
+    )
+    protocol: Literal["exact", "dhp19"] = Field(
+        default="exact", description="labels as they are, or moved to the centre of their pixel as DHP19's code does"
+    )
 
 
 def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> dict[str, float]:
-    """`mpjpe2d_px`, every visible joint with the same weight.
+    """`mpjpe2d_px`, every joint that counts with the same weight.
+
+    By other options the name is `mpjpe2d_dhp19_px`, `mpjpe2d_known_px` or `mpjpe2d_dhp19_known_px`.
 
     Args:
         predicted: `joints2d` [N, J, 2], px.
         target: labels with joints in the same image and order.
-        options: none.
+        options: which joints count, and how labels are read.
     Raises:
-        ValueError: shapes differ, or no joint is visible.
+        ValueError: shapes differ, or no joint counts.
     """
-    return {"mpjpe2d_px": float(np.nanmean(compute_joint_errors_px(predicted, target)))}
+    return quotients(compute_sums(predicted, target, options))
 
 
-def compute_sums(
-    predicted: Mapping[str, Any], target: Labels, options: Options
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options) -> Sums:
     """Of each row the sum [N] px and number [N] of its errors; `compute` is their quotient over all rows."""
-    return {"mpjpe2d_px": row_sums(compute_joint_errors_px(predicted, target))}
+    protocol = "_dhp19" if options.protocol == "dhp19" else ""
+    counted = "_known" if options.joints == "known" else ""
+    return {f"mpjpe2d{protocol}{counted}_px": row_sums(_errors_px(predicted, target, options))}
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
-    """Mean error [N] px of each row, NaN for a row without a visible joint: what intervals are made of."""
-    return row_means(compute_joint_errors_px(predicted, target))
+    """Mean error [N] px of each row, NaN for a row without a joint that counts: what intervals are made of."""
+    return row_means(_errors_px(predicted, target, options))
+
+
+def _errors_px(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
+    return compute_joint_errors_px(predicted, target, options.joints, whole_pixels=options.protocol == "dhp19")

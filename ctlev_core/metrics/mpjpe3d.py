@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.joint_errors import Alignment, compute_joint_errors_mm, row_means, row_sums
+from ctlev_core.joint_errors import Alignment, Sums, compute_joint_errors_mm, quotients, row_means, row_sums
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
-VERSION = 1
+VERSION = 2
 INPUT = "joints3d"
 NAMES: dict[Alignment, str] = {"pelvis": "mpjpe3d_pelvis_mm", "procrustes": "mpjpe3d_pa_mm", "none": "mpjpe3d_mm"}
 
@@ -33,23 +33,25 @@ class Options(Frozen):
 def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> dict[str, float]:
     """`mpjpe3d_pelvis_mm`, `mpjpe3d_pa_mm` and `mpjpe3d_mm`, the chosen one first; every known joint counts alike.
 
+    An alignment that no row has (the pelvis, where no row knows both hips) is left out unless it is the chosen one.
+
     Args:
         predicted: `joints3d` [N, J, 3], mm, camera frame.
         target: labels with joints in the same frame and order.
         options: which comes first.
     Raises:
-        ValueError: see `compute_joint_errors_mm`.
+        ValueError: see `compute_joint_errors_mm`; or no row has the chosen alignment.
     """
-    sums = compute_sums(predicted, target, options)
-    return {name: float(total.sum() / count.sum()) if count.any() else np.nan for name, (total, count) in sums.items()}
+    return quotients(compute_sums(predicted, target, options))
 
 
-def compute_sums(
-    predicted: Mapping[str, Any], target: Labels, options: Options
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options) -> Sums:
     """Of each row the sum [N] mm and number [N] of its errors; `compute` is their quotient over all rows."""
     order = sorted(NAMES, key=lambda alignment: alignment != options.alignment)
-    return {NAMES[a]: row_sums(compute_joint_errors_mm(predicted, target, a)) for a in order}
+    sums = {NAMES[a]: row_sums(compute_joint_errors_mm(predicted, target, a)) for a in order}
+    if not sums[NAMES[options.alignment]][1].any():
+        raise ValueError(f"none of the {len(target)} target rows has what alignment {options.alignment!r} needs")
+    return {name: (total, count) for name, (total, count) in sums.items() if count.any()}
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 The threshold is in px, or a fraction of a length of the labelled person. A joint exactly at the threshold is correct.
 Source: Yang & Ramanan, Articulated Human Detection with Flexible Mixtures of Parts, TPAMI 2013 (bounding box); Sapp &
-Taskar, MODEC, CVPR 2013 (torso: left shoulder to right hip).
+Taskar, MODEC, CVPR 2013 (torso: left shoulder to right hip); Andriluka et al., CVPR 2014 (PCKh: a threshold of 0.5 with
+the normaliser `head`, see `ctlev_core.body_lengths` for what is a head here).
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.joint_errors import compute_joint_errors_px, row_means, row_sums
-from ctlev_core.skeletons import JOINT_SETS
+from ctlev_core.body_lengths import head_length, torso_length
+from ctlev_core.joint_errors import Sums, compute_joint_errors_px, row_means, row_sums
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
@@ -26,9 +27,10 @@ class Options(Frozen):
     """What counts as correct."""
 
     threshold: float = Field(default=0.2, gt=0, description="px, or a fraction of the normaliser's length")
-    normaliser: Literal["px", "torso", "bbox"] = Field(
+    normaliser: Literal["px", "torso", "bbox", "head"] = Field(
         default="torso",
-        description="px; torso = left shoulder to right hip; bbox = longer side of the box around the visible joints",
+        description="px; torso = left shoulder to right hip; bbox = longer side of the box around the visible joints; "
+        "head = length of the head",
     )
 
 
@@ -48,9 +50,7 @@ def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> d
     return {f"pck_{options.normaliser}{options.threshold:g}": float(np.nanmean(correct))}
 
 
-def compute_sums(
-    predicted: Mapping[str, Any], target: Labels, options: Options
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options) -> Sums:
     """Of each row the number [N] of correct joints and of scored ones; `compute` is their quotient over all rows."""
     return {f"pck_{options.normaliser}{options.threshold:g}": row_sums(_correct(predicted, target, options))}
 
@@ -79,7 +79,4 @@ def _normaliser_px(target: Labels, options: Options) -> np.ndarray:
         seen = target.visible.any(axis=1)
         size[seen] = (np.nanmax(points[seen], axis=1) - np.nanmin(points[seen], axis=1)).max(axis=-1)
         return size
-    if target.joint_set not in JOINT_SETS:
-        raise ValueError(f"the torso needs a joint set of {', '.join(JOINT_SETS)}, got {target.joint_set!r}")
-    joints = JOINT_SETS[target.joint_set].joints
-    return np.linalg.norm(points[:, joints.index("left_shoulder")] - points[:, joints.index("right_hip")], axis=-1)
+    return (torso_length if options.normaliser == "torso" else head_length)(points, target.joint_set)

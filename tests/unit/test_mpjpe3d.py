@@ -58,6 +58,16 @@ def test_unknown_joints_do_not_count_and_unknown_hips_leave_no_pelvis():
     np.testing.assert_allclose(rows, [10, 10], atol=1e-3)
 
 
+def test_an_alignment_that_no_row_has_is_left_out_and_missed_if_chosen():
+    target = poses(2)
+    target[:, 5] = np.nan  # a hip
+    predicted, known = {"joints3d": np.nan_to_num(target)}, labels(target)
+    scores = mpjpe3d.compute(predicted, known, mpjpe3d.Options(alignment="none"))
+    assert list(scores) == ["mpjpe3d_mm", "mpjpe3d_pa_mm"]
+    with pytest.raises(ValueError, match="none of the 2 target rows has what alignment 'pelvis' needs"):
+        mpjpe3d.compute(predicted, known, mpjpe3d.Options())
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -1,0 +1,46 @@
+"""Lengths of a labelled person that thresholds of correct joints are measured with: torso and head."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctlev_core.skeletons import JOINT_SETS
+
+
+def torso_length(joints: np.ndarray, joint_set: str) -> np.ndarray:
+    """Left shoulder to right hip, [N], of joints [N, J, 2 or 3]; NaN where one of them is.
+
+    Source: Sapp & Taskar, MODEC, CVPR 2013. Event-HPE measures from neck to pelvis.
+
+    Raises:
+        ValueError: the joint set is unknown or lacks one of them.
+    """
+    shoulder, hip = _indices(joint_set, "torso", "left_shoulder", "right_hip")
+    return np.linalg.norm(joints[:, shoulder] - joints[:, hip], axis=-1)
+
+
+def head_length(joints: np.ndarray, joint_set: str) -> np.ndarray:
+    """Length of the head, [N], of joints [N, J, 2 or 3]; NaN where a joint of it is.
+
+    SMPL's joints of neck and head lie inside; twice their distance, as in Event-HPE. Of the other sets, the distance of
+    the head (OpenPose: the nose) from the middle of the shoulders: it takes the neck in, and is longer than the head
+    segment of MPII, which is 0.6 of the diagonal of a box around the head.
+
+    Source: PCKh, Andriluka et al., CVPR 2014; Event-HPE (Zou et al., ICCV 2021), `loss_funcs.py`.
+
+    Raises:
+        ValueError: the joint set is unknown or lacks one of them.
+    """
+    if joint_set == "smpl":
+        neck, head = _indices(joint_set, "head", "neck", "head")
+        return 2 * np.linalg.norm(joints[:, neck] - joints[:, head], axis=-1)
+    top = "nose" if joint_set == "openpose" else "head"
+    head, left, right = _indices(joint_set, "head", top, "left_shoulder", "right_shoulder")
+    return np.linalg.norm(joints[:, head] - (joints[:, left] + joints[:, right]) / 2, axis=-1)
+
+
+def _indices(joint_set: str, length: str, *names: str) -> list[int]:
+    known = JOINT_SETS[joint_set].joints if joint_set in JOINT_SETS else ()
+    if not set(names) <= set(known):
+        raise ValueError(f"the {length} needs a joint set of {', '.join(JOINT_SETS)}, got {joint_set!r}")
+    return [known.index(name) for name in names]

@@ -1,0 +1,165 @@
+"""The best similarity of two sets of points, row by row, compiled: a batch of 3 x 3 problems is too small for LAPACK.
+
+The singular value decomposition is one-sided Jacobi, which finds small singular values to their own size. Only the two
+largest pairs of vectors are taken from it and the third are their cross products: the rotation is then never a
+reflection, and a third singular value of zero needs no care.
+
+Source: Umeyama, IEEE TPAMI 1991, eq. 34-43; Demmel & Veselic, SIAM J. Matrix Anal. Appl. 13, 1992.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+_MAX_SWEEPS = 40
+_EPSILON = 2.0**-52
+
+
+@numba.njit(cache=True, nogil=True)
+def align_rows(
+    points: np.ndarray, target: np.ndarray, known: np.ndarray, relative_size: float, aligned: np.ndarray
+) -> None:
+    """Write `points` [N, J, 3], brought onto `target` [N, J, 3] where `known` [N, J], to `aligned` [N, J, 3].
+
+    Points whose spread is at most `relative_size` of their distance from the origin coincide.
+    """
+    product, turned, rotation = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    centre, centre_target = np.zeros(3), np.zeros(3)
+    for row in range(len(points)):
+        count = _centres(points[row], target[row], known[row], centre, centre_target)
+        if count == 0:
+            aligned[row] = points[row]
+            continue
+        size = _product(points[row], target[row], known[row], centre, centre_target, product)
+        farthest = max(abs(centre[0]), abs(centre[1]), abs(centre[2]))
+        scale = 0.0
+        if size > relative_size * farthest:
+            scale = _best_rotation(product, turned, rotation) / size
+        for joint in range(points.shape[1]):
+            x = points[row, joint, 0] - centre[0]
+            y = points[row, joint, 1] - centre[1]
+            z = points[row, joint, 2] - centre[2]
+            for axis in range(3):
+                moved = x * rotation[0, axis] + y * rotation[1, axis] + z * rotation[2, axis]
+                aligned[row, joint, axis] = scale * moved + centre_target[axis]
+
+
+@numba.njit(cache=True, nogil=True)
+def _centres(
+    points: np.ndarray, target: np.ndarray, known: np.ndarray, centre: np.ndarray, centre_target: np.ndarray
+) -> int:
+    """Means of the known points into `centre` and `centre_target`; returns their number."""
+    count = 0
+    centre[:] = 0.0
+    centre_target[:] = 0.0
+    for joint in range(len(points)):
+        if known[joint]:
+            count += 1
+            for axis in range(3):
+                centre[axis] += points[joint, axis]
+                centre_target[axis] += target[joint, axis]
+    for axis in range(3):
+        centre[axis] /= max(count, 1)
+        centre_target[axis] /= max(count, 1)
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _product(
+    points: np.ndarray,
+    target: np.ndarray,
+    known: np.ndarray,
+    centre: np.ndarray,
+    centre_target: np.ndarray,
+    product: np.ndarray,
+) -> float:
+    """Sum of the outer products of centred points, those of unit size, with the target's; returns the size."""
+    square = 0.0
+    for joint in range(len(points)):
+        if known[joint]:
+            for axis in range(3):
+                square += (points[joint, axis] - centre[axis]) ** 2
+    size = np.sqrt(square)
+    unit = 1.0 / size if size > 0.0 else 0.0
+    product[:] = 0.0
+    for joint in range(len(points)):
+        if known[joint]:
+            for axis in range(3):
+                coordinate = unit * (points[joint, axis] - centre[axis])
+                for other in range(3):
+                    product[axis, other] += coordinate * (target[joint, other] - centre_target[other])
+    return size
+
+
+@numba.njit(cache=True, nogil=True)
+def _best_rotation(product: np.ndarray, turned: np.ndarray, rotation: np.ndarray) -> float:
+    """The rotation R with the largest trace of R^T product, into `rotation`; returns that trace."""
+    v = _diagonalise(product, turned)
+    lengths = np.array([_length(turned[:, 0]), _length(turned[:, 1]), _length(turned[:, 2])])
+    order = np.argsort(-lengths)
+    first, second = order[0], order[1]
+    v1, v2 = v[:, first].copy(), v[:, second].copy()
+    if lengths[first] == 0.0:
+        u1 = v1.copy()
+    else:
+        u1 = turned[:, first] / lengths[first]
+    if lengths[second] > 0.0:
+        u2 = turned[:, second] / lengths[second]
+    else:
+        u2 = _perpendicular(u1)
+    u3, v3 = _cross(u1, u2), _cross(v1, v2)
+    trace = 0.0
+    for row in range(3):
+        for column in range(3):
+            rotation[row, column] = u1[row] * v1[column] + u2[row] * v2[column] + u3[row] * v3[column]
+            trace += rotation[row, column] * product[row, column]
+    return max(trace, 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _diagonalise(matrix: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """V, orthogonal, for which the columns of matrix V are orthogonal to one another; those into `turned`."""
+    v = np.eye(3)
+    turned[:] = matrix
+    for _ in range(_MAX_SWEEPS):
+        is_done = True
+        for p in range(2):
+            for q in range(p + 1, 3):
+                a = turned[0, p] ** 2 + turned[1, p] ** 2 + turned[2, p] ** 2
+                b = turned[0, q] ** 2 + turned[1, q] ** 2 + turned[2, q] ** 2
+                c = turned[0, p] * turned[0, q] + turned[1, p] * turned[1, q] + turned[2, p] * turned[2, q]
+                if abs(c) <= _EPSILON * np.sqrt(a * b):
+                    continue
+                is_done = False
+                zeta = (b - a) / (2.0 * c)
+                tangent = np.copysign(1.0, zeta) / (abs(zeta) + np.sqrt(1.0 + zeta * zeta))
+                cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
+                sine = cosine * tangent
+                for row in range(3):
+                    x, y = turned[row, p], turned[row, q]
+                    turned[row, p], turned[row, q] = cosine * x - sine * y, sine * x + cosine * y
+                    x, y = v[row, p], v[row, q]
+                    v[row, p], v[row, q] = cosine * x - sine * y, sine * x + cosine * y
+        if is_done:
+            break
+    return v
+
+
+@numba.njit(cache=True, nogil=True)
+def _length(vector: np.ndarray) -> float:
+    return np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+
+
+@numba.njit(cache=True, nogil=True)
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@numba.njit(cache=True, nogil=True)
+def _perpendicular(unit: np.ndarray) -> np.ndarray:
+    """Some unit vector perpendicular to a unit vector."""
+    axis = np.zeros(3)
+    axis[np.argmin(np.abs(unit))] = 1.0
+    found = _cross(unit, axis)
+    return found / _length(found)
