@@ -9,8 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-MAX_SAMPLE_WEIGHT = 20.0
-"""Highest weight of the error of a network that predicts the latents; at little noise snr + 1 grows without bound."""
+MAX_SAMPLE_WEIGHT = 5.0
+"""Highest weight of the error of a network that predicts the latents; at little noise snr + 1 grows without bound.
+
+With 20 the steps with little noise took most of the gradient, and those that decide layout and prompt learnt slower.
+"""
 
 
 @dataclass(frozen=True, eq=False)
