@@ -1,66 +1,74 @@
-"""Accuracy, macro precision and macro recall of a classifier, as scikit-learn defines them.
+"""Accuracy, macro precision, recall and F1 of a classifier, as scikit-learn defines them, and its calibration.
 
 Macro = plain mean over the classes that occur among the targets or the predictions. A class that is never predicted has
-precision 0, and one that is predicted but never a target has recall 0.
+precision 0, and one that is predicted but never a target has recall 0. The paper's Table 1 gives accuracy and
+precision, without saying how the classes are averaged.
+
+Calibration is the expected calibration error of Guo et al. (ICML 2017), over bins of equal width of the highest
+probability. `ctlev_core.classification_scores` has the scores of each class, the confusion matrix and the bins.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
+from ctlev_core.classification_scores import calibrate, class_scores, read_guesses
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
-VERSION = 1
+VERSION = 2
 INPUT = "classes"
 
 
 class Options(Frozen):
-    """None: the scores have no parameters."""
+    """Calibration."""
+
+    calibration_bins: int = Field(default=15, ge=1, description="bins of equal width; Guo et al.: 15")
 
 
 def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> dict[str, float]:
-    """`accuracy`, `macro_precision`, `macro_recall`, and `chance_accuracy`, that of always naming the commonest class.
+    """`accuracy`, `macro_precision`, `macro_recall`, `macro_f1`, `chance_accuracy` and `calibration_error_ece15`.
+
+    `chance_accuracy` is that of always naming the commonest class; the number of bins ends the last name.
 
     Args:
         predicted: `probability` [N, K] and `classes` [K], the names of the columns; of equal maxima the first wins.
         target: N rows with class names. A class the model does not know counts as an error.
-        options: none.
+        options: calibration.
     Returns:
         Fractions in [0, 1].
     Raises:
-        ValueError: shapes differ, there are no rows, a target has no class, or a probability is not finite.
+        ValueError: see `read_guesses`.
     """
-    names = _predicted_names(predicted, target)
-    classes, index = np.unique(np.concatenate([names, np.array(target.class_names)]), return_inverse=True)
-    guess, truth = np.split(index, 2)
-    hits = np.bincount(truth[guess == truth], minlength=len(classes))
-    guessed, true = (np.bincount(column, minlength=len(classes)) for column in (guess, truth))
-    return {
-        "accuracy": float(np.mean(guess == truth)),
-        "macro_precision": float(np.mean(hits / np.maximum(guessed, 1))),
-        "macro_recall": float(np.mean(hits / np.maximum(true, 1))),
-        "chance_accuracy": float(true.max() / len(truth)),
-    }
+    return prepare(predicted, target, options)(np.arange(len(target)))
+
+
+def prepare(predicted: Mapping[str, Any], target: Labels, options: Options) -> Callable[[np.ndarray], dict[str, float]]:
+    """The scores of any rows: what resampling asks for many times, with names compared once."""
+    guesses = read_guesses(predicted, target)
+
+    def compute_of(rows: np.ndarray) -> dict[str, float]:
+        truth, guess = guesses.truth[rows], guesses.guess[rows]
+        scores = class_scores(truth, guess, len(guesses.classes))
+        occurs = (scores.num_true + scores.num_guessed) > 0
+        calibration = calibrate(guesses.confidence[rows], truth == guess, options.calibration_bins)
+        return {
+            "accuracy": float(np.mean(truth == guess)),
+            "macro_precision": float(scores.precision[occurs].mean()),
+            "macro_recall": float(scores.recall[occurs].mean()),
+            "macro_f1": float(scores.f1[occurs].mean()),
+            "chance_accuracy": float(scores.num_true.max() / len(truth)),
+            f"calibration_error_ece{options.calibration_bins}": calibration.expected_error,
+        }
+
+    return compute_of
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
     """1 for each correct row and 0 for each wrong one [N]: what intervals are made of."""
-    return (_predicted_names(predicted, target) == np.array(target.class_names)).astype(np.float64)
-
-
-def _predicted_names(predicted: Mapping[str, Any], target: Labels) -> np.ndarray:
-    probability = np.asarray(predicted["probability"])
-    classes = np.asarray(predicted["classes"])
-    if not len(target):
-        raise ValueError("there is no row to score")
-    if probability.shape != (len(target), len(classes)):
-        raise ValueError(f"probability must be [{len(target)}, {len(classes)}], got {probability.shape}")
-    if not np.isfinite(probability).all():
-        raise ValueError(f"probability of row {int(np.argwhere(~np.isfinite(probability))[0][0])} is not finite")
-    if "" in target.class_names:
-        raise ValueError(f"target row {target.class_names.index('')} has no class name")
-    return classes[probability.argmax(axis=1)]
+    guesses = read_guesses(predicted, target)
+    return (guesses.guess == guesses.truth).astype(np.float64)

@@ -107,7 +107,9 @@ def test_classification_by_hand():
         "accuracy": 0.5,
         "macro_precision": pytest.approx(1 / 3),
         "macro_recall": pytest.approx(0.5),
+        "macro_f1": pytest.approx((2 / 3 + 1 / 2 + 0) / 3),
         "chance_accuracy": 0.5,
+        "calibration_error_ece15": 0.5,  # always certain, right half of the time
     }
 
 

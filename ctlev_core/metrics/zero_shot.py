@@ -1,0 +1,72 @@
+"""Binary accuracy of telling each held-out class from the others, with balanced negatives: the paper's Table 5.
+
+For each class, the images of that class are the positives and those of the other classes the negatives; an image is
+called positive where the class has the highest probability of all. With a two-class model, "bonsai" against anything
+else, that is a binary classifier as in the paper; with a model of all held-out classes it is one against the rest.
+
+Accuracy is given as expected for as many negatives as positives, drawn at random: the mean of the shares of positives
+and negatives told right (`ctlev_core.zero_shot`). Chance is 0.5, whatever the numbers of images are. The paper does not
+say how it draws negatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from ctlev_core.classification_scores import read_guesses
+from ctlev_core.zero_shot import balanced_accuracy
+from data_contracts.config import Frozen
+from data_contracts.labels import Labels
+
+VERSION = 1
+INPUT = "classes"
+
+
+class Options(Frozen):
+    """Which classes are told from the others."""
+
+    classes: tuple[str, ...] = Field(default=(), description="held-out classes; empty = every class of the targets")
+
+
+def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> dict[str, float]:
+    """`binary_accuracy_mean` over the classes, and `binary_accuracy_CLASS` of each.
+
+    Args:
+        predicted: `probability` [N, K] and `classes` [K], the names of the columns.
+        target: N rows with class names. A class the model does not know is never called: 0.5.
+        options: classes.
+    Returns:
+        Fractions in [0, 1]; 0.5 is chance.
+    Raises:
+        ValueError: see `read_guesses`; or a class has no row, or all of them.
+    """
+    return prepare(predicted, target, options)(np.arange(len(target)))
+
+
+def prepare(predicted: Mapping[str, Any], target: Labels, options: Options) -> Callable[[np.ndarray], dict[str, float]]:
+    """The scores of any rows: what resampling asks for many times, with names compared once.
+
+    A sample that lacks a class raises ValueError.
+    """
+    guesses = read_guesses(predicted, target)
+    names = options.classes or tuple(sorted(set(target.class_names)))
+    numbers = {name: number for number, name in enumerate(guesses.classes.tolist())}
+    if missing := [name for name in names if name not in target.class_names]:
+        raise ValueError(f"no target row is of class {', '.join(missing)}")
+
+    def compute_of(rows: np.ndarray) -> dict[str, float]:
+        found = {}
+        for name in names:
+            is_positive, is_called = (column[rows] == numbers[name] for column in (guesses.truth, guesses.guess))
+            if is_positive.all() or not is_positive.any():
+                raise ValueError(
+                    f"class {name!r} has {is_positive.sum()} of {len(rows)} rows; it needs some and not all"
+                )
+            found[f"binary_accuracy_{name}"] = balanced_accuracy(is_positive, is_called)
+        return {"binary_accuracy_mean": float(np.mean(list(found.values()))), **found}
+
+    return compute_of

@@ -1,0 +1,105 @@
+"""Classes that a generator has not seen: test sets of one class against the others, and what seen class is nearest.
+
+Source: the paper's section 4.1 and Table 5 (binary classification on ten unseen classes of N-Caltech101; the nearest
+seen class by the cosine similarity of text embeddings). It does not say how negatives are chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def balanced_rows(class_names: Sequence[str], positive: str, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of a class, and as many of the other classes, drawn without replacement and evenly over those classes.
+
+    Where the others are fewer, so many rows of the class are drawn instead.
+
+    Args:
+        class_names: [N] class of each row.
+        positive: the class to tell from the others.
+        seed: of the drawing.
+    Returns:
+        rows: [2 n] int64, ascending.
+        is_positive: [2 n] bool.
+    Raises:
+        ValueError: there is no row of the class, or of any other.
+    """
+    names = np.asarray(class_names)
+    own, others = np.flatnonzero(names == positive), np.flatnonzero(names != positive)
+    if not len(own) or not len(others):
+        raise ValueError(f"needs rows of class {positive!r} and of others, got {len(own)} and {len(others)}")
+    generator = np.random.default_rng(seed)
+    count = min(len(own), len(others))
+    chosen = np.concatenate([generator.permutation(own)[:count], _evenly(others, names, generator)[:count]])
+    order = np.argsort(chosen)
+    return chosen[order], (np.arange(2 * count) < count)[order]
+
+
+def _evenly(rows: np.ndarray, names: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """The rows in a random order in which the first rows of all classes come before the second ones, and so on."""
+    rows = generator.permutation(rows)
+    rank = np.empty(len(rows), np.int64)
+    for name in np.unique(names[rows]):
+        members = names[rows] == name
+        rank[members] = np.arange(np.count_nonzero(members))
+    return rows[np.argsort(rank, kind="stable")]
+
+
+def balanced_accuracy(is_positive: np.ndarray, is_called_positive: np.ndarray) -> float:
+    """Mean of the shares of positives and of negatives that are told right; 0.5 is chance.
+
+    That is the expected accuracy with as many negatives as positives, drawn at random: no draw is needed, and none adds
+    noise.
+
+    Args:
+        is_positive: [N] bool.
+        is_called_positive: [N] bool.
+    Raises:
+        ValueError: shapes differ, or there is no positive or no negative.
+    """
+    is_positive, called = np.asarray(is_positive, bool), np.asarray(is_called_positive, bool)
+    if is_positive.shape != called.shape or is_positive.ndim != 1:
+        raise ValueError(f"both must be [N], got {is_positive.shape} and {called.shape}")
+    if is_positive.all() or not is_positive.any():
+        raise ValueError(f"needs positives and negatives, got {is_positive.sum()} and {(~is_positive).sum()}")
+    return float((called[is_positive].mean() + (~called[~is_positive]).mean()) / 2)
+
+
+def nearest_seen_classes(
+    unseen: np.ndarray, seen: np.ndarray, seen_names: Sequence[str], *, count: int = 1
+) -> list[list[tuple[str, float]]]:
+    """For each unseen class the seen ones with the most similar text embeddings, the nearest first.
+
+    Args:
+        unseen: [U, D] text embeddings, of any length but zero.
+        seen: [S, D] text embeddings from the same encoder.
+        seen_names: [S] their names; of equally similar ones the first comes first.
+        count: how many to name, at most S.
+    Returns:
+        U lists of (name, cosine similarity).
+    Raises:
+        ValueError: shapes differ, or an embedding is zero or not finite.
+    """
+    unit = []
+    for name, embeddings in (("unseen", unseen), ("seen", seen)):
+        embeddings = np.asarray(embeddings, dtype=np.float64)
+        if embeddings.ndim != 2 or not len(embeddings):
+            raise ValueError(f"{name} embeddings must be [N, D] with N > 0, got {embeddings.shape}")
+        lengths = np.linalg.norm(embeddings, axis=1, keepdims=True)
+        usable = np.isfinite(lengths[:, 0]) & (lengths[:, 0] > 0)
+        if not usable.all():
+            raise ValueError(f"{name} embedding of row {int(np.argmin(usable))} is zero or not finite")
+        unit.append(embeddings / lengths)
+    if unit[0].shape[1] != unit[1].shape[1] or len(unit[1]) != len(seen_names):
+        raise ValueError(
+            f"embeddings must have one length and seen ones a name each, got {unit[0].shape}, {unit[1].shape} and "
+            f"{len(seen_names)} names"
+        )
+    similarity = unit[0] @ unit[1].T
+    order = np.argsort(-similarity, axis=1, kind="stable")[:, :count]
+    return [
+        [(seen_names[column], float(np.clip(row[column], -1, 1))) for column in columns]
+        for row, columns in zip(similarity, order.tolist(), strict=True)
+    ]

@@ -1,0 +1,178 @@
+"""Scores of classes, calibration and zero-shot accuracy against scikit-learn, loops and counting."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn import metrics as sklearn_metrics
+
+from ctlev_core.classification_scores import calibrate, class_scores, confusion_matrix, read_guesses
+from ctlev_core.metrics import classification, zero_shot
+from ctlev_core.zero_shot import balanced_accuracy, balanced_rows, nearest_seen_classes
+from data_contracts.labels import Labels
+
+ZERO: Any = {"zero_division": 0}
+
+
+def class_labels(names):
+    return Labels(tuple(names), np.zeros(len(names), np.int64))
+
+
+def random_prediction(seed, truth, classes):
+    """Probabilities that lean towards the truth."""
+    random = np.random.default_rng(seed)
+    logits = random.normal(size=(len(truth), len(classes))) + 1.5 * (np.array(truth)[:, None] == np.array(classes))
+    exponential = np.exp(logits)
+    return {"probability": exponential / exponential.sum(axis=1, keepdims=True), "classes": np.array(classes)}
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.sampled_from("abcde"), min_size=1, max_size=40), st.integers(0, 1000))
+def test_every_score_agrees_with_scikit_learn(truth, seed):
+    predicted, target = random_prediction(seed, truth, list("dbca")), class_labels(truth)  # the model knows no e
+    guesses = read_guesses(predicted, target)
+    assert guesses.classes.tolist() == list("dbca") + (["e"] if "e" in truth else [])
+    named = guesses.classes[guesses.guess]
+    labels = guesses.classes.tolist()
+    expected: Any = sklearn_metrics.precision_recall_fscore_support(truth, named, labels=labels, **ZERO)
+    found = class_scores(guesses.truth, guesses.guess, len(labels))
+    for ours, theirs in zip((found.precision, found.recall, found.f1, found.num_true), expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-15)
+    matrix = sklearn_metrics.confusion_matrix(truth, named, labels=labels)
+    np.testing.assert_array_equal(confusion_matrix(guesses), matrix)
+    macro_f1 = sklearn_metrics.f1_score(truth, named, average="macro", **ZERO)
+    scores = classification.compute(predicted, target, classification.Options())
+    assert scores["macro_f1"] == pytest.approx(macro_f1)
+
+
+def test_calibration_by_hand():
+    """Bins of a half: 0.5 belongs to the lower one. |1/2 - 0.45| of two rows, |1/2 - 0.8| of two rows."""
+    found = calibrate(np.array([0.4, 0.5, 0.6, 1.0]), np.array([1, 0, 0, 1]), 2)
+    assert found.count.tolist() == [2, 2]
+    np.testing.assert_allclose(found.confidence, [0.45, 0.8])
+    np.testing.assert_allclose(found.accuracy, [0.5, 0.5])
+    assert found.expected_error == pytest.approx((2 * 0.05 + 2 * 0.3) / 4)
+    assert calibrate(np.array([1.0, 1.0]), np.array([1, 1]), 15).expected_error == 0
+    assert calibrate(np.array([1.0, 1.0]), np.array([0, 0]), 15).expected_error == 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=60), st.integers(1, 20))
+def test_calibration_agrees_with_a_loop_over_bins(rows, num_bins):
+    confidence, is_right = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    error = 0.0
+    for index in range(num_bins):
+        low, high = index / num_bins, (index + 1) / num_bins
+        inside = (confidence > low) & (confidence <= high)
+        if index == 0:
+            inside |= confidence == 0
+        if inside.any():
+            error += inside.mean() * abs(is_right[inside].mean() - confidence[inside].mean())
+    found = calibrate(confidence, is_right, num_bins)
+    assert found.expected_error == pytest.approx(error, abs=1e-12) and found.count.sum() == len(rows)
+
+
+def test_a_calibrated_model_has_a_small_error_and_a_boastful_one_a_large():
+    random = np.random.default_rng(0)
+    confidence = random.uniform(0.5, 1, size=20_000)
+    is_right = random.random(20_000) < confidence
+    names = np.where(is_right, "a", "b")
+    honest = {"probability": np.stack([confidence, 1 - confidence], 1), "classes": np.array(["a", "b"])}
+    options = classification.Options(calibration_bins=10)
+    # Five bins of 4,000: the mean of five |N(0, 0.43 / 63)| is 0.005.
+    assert classification.compute(honest, class_labels(names), options)["calibration_error_ece10"] < 0.012
+    boastful = {**honest, "probability": np.tile([1.0, 0.0], (20_000, 1))}
+    assert classification.compute(boastful, class_labels(names), options)["calibration_error_ece10"] > 0.2
+
+
+@pytest.mark.parametrize("metric", [classification, zero_shot])
+def test_prepared_scores_of_rows_are_those_of_the_rows(metric):
+    truth = list("abcabcabca")
+    predicted, target = random_prediction(1, truth, list("abc")), class_labels(truth)
+    compute_of = metric.prepare(predicted, target, metric.Options())
+    rows = np.array([0, 0, 1, 2, 4, 5, 9, 9])
+    chosen = {"probability": predicted["probability"][rows], "classes": predicted["classes"]}
+    assert compute_of(rows) == pytest.approx(metric.compute(chosen, target.take(rows), metric.Options()))
+
+
+def test_logits_and_repeated_classes_are_refused():
+    with pytest.raises(ValueError, match=r"probability of row 1 must lie in \[0, 1\], got \[2.5, -1.0\]"):
+        predicted = {"probability": np.array([[0.5, 0.5], [2.5, -1.0]]), "classes": np.array(["a", "b"])}
+        classification.compute(predicted, class_labels("ab"), classification.Options())
+    with pytest.raises(ValueError, match="classes must differ"):
+        predicted = {"probability": np.array([[0.5, 0.5]]), "classes": np.array(["a", "a"])}
+        classification.compute(predicted, class_labels("a"), classification.Options())
+
+
+def test_zero_shot_by_hand():
+    """Three bonsais, two found; five others, one taken for a bonsai."""
+    truth = ["bonsai"] * 3 + ["ferry"] * 5
+    guess = ["bonsai", "bonsai", "other", "bonsai", "other", "other", "other", "other"]
+    probability = (np.array(guess)[:, None] == np.array(["bonsai", "other"])).astype(float)
+    predicted = {"probability": probability, "classes": np.array(["bonsai", "other"])}
+    found = zero_shot.compute(predicted, class_labels(truth), zero_shot.Options(classes=("bonsai",)))
+    expected = pytest.approx((2 / 3 + 4 / 5) / 2)
+    assert found == {"binary_accuracy_mean": expected, "binary_accuracy_bonsai": expected}
+    # The model has never heard of ferries.
+    both = zero_shot.compute(predicted, class_labels(truth), zero_shot.Options())
+    assert both["binary_accuracy_ferry"] == 0.5
+
+
+def test_zero_shot_is_the_mean_over_balanced_draws():
+    random = np.random.default_rng(2)
+    truth = np.array(["a"] * 30 + ["b"] * 70 + ["c"] * 70)
+    called = random.random(170) < np.where(truth == "a", 0.8, 0.3)
+    draws = []
+    for seed in range(300):
+        rows, is_positive = balanced_rows(truth.tolist(), "a", seed=seed)
+        draws.append(np.mean(called[rows] == is_positive))
+    # Classes b and c are equally large, so that drawing evenly over classes is drawing evenly over rows.
+    assert balanced_accuracy(truth == "a", called) == pytest.approx(np.mean(draws), abs=3 * np.std(draws) / 300**0.5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.sampled_from("abcd"), min_size=2, max_size=60), st.integers(0, 100))
+def test_negatives_are_as_many_and_evenly_spread(names, seed):
+    if "a" not in names or set(names) == {"a"}:
+        with pytest.raises(ValueError, match="needs rows of class 'a' and of others"):
+            balanced_rows(names, "a", seed=seed)
+        return
+    rows, is_positive = balanced_rows(names, "a", seed=seed)
+    assert len(set(rows.tolist())) == len(rows) == 2 * is_positive.sum() and (np.diff(rows) > 0).all()
+    chosen = np.array(names)[rows]
+    assert np.array_equal(chosen == "a", is_positive)
+    counts = {name: np.count_nonzero(chosen == name) for name in set(names) - {"a"}}
+    most = max(counts.values())
+    # A class with fewer than another gives all it has, or just one fewer.
+    assert all(count in (most - 1, most, names.count(name)) for name, count in counts.items())
+    again = balanced_rows(names, "a", seed=seed)
+    assert np.array_equal(rows, again[0])
+
+
+def test_zero_shot_names_what_is_missing():
+    predicted, target = random_prediction(0, list("aab"), list("ab")), class_labels("aab")
+    with pytest.raises(ValueError, match="no target row is of class pagoda"):
+        zero_shot.compute(predicted, target, zero_shot.Options(classes=("a", "pagoda")))
+    with pytest.raises(ValueError, match="class 'a' has 2 of 2 rows"):
+        zero_shot.prepare(predicted, target, zero_shot.Options(classes=("a",)))(np.array([0, 1]))
+    with pytest.raises(ValueError, match="needs positives and negatives, got 2 and 0"):
+        balanced_accuracy(np.ones(2, bool), np.ones(2, bool))
+
+
+def test_nearest_seen_class_by_cosine():
+    seen = np.array([[3.0, 0], [0, 0.1], [4, 4], [1, 1]])
+    names = ["x", "y", "both", "the same"]
+    found = nearest_seen_classes(np.array([[9.0, 1], [-1, 0], [2, 2]]), seen, names, count=2)
+    assert [[name for name, _ in row] for row in found] == [
+        ["x", "both"],
+        ["y", "both"],
+        ["both", "the same"],
+    ]
+    assert found[0][0][1] == pytest.approx(9 / 82**0.5) and found[2][0][1] == pytest.approx(1)
+    assert found[1][0][1] == pytest.approx(0, abs=1e-15)
+    with pytest.raises(ValueError, match="unseen embedding of row 1 is zero or not finite"):
+        nearest_seen_classes(np.array([[1.0, 0], [0, 0]]), seen, names)
+    with pytest.raises(ValueError, match="a name each"):
+        nearest_seen_classes(seen, seen, names[:2])
