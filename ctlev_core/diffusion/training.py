@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, denoising_loss, generator_for
+from ctlev_core.diffusion.muon import Muon
 from ctlev_core.diffusion.options import TrainingOptions
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
@@ -38,15 +40,27 @@ def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray
 class Trainer:
     """Optimiser, averaged weights and history of the trainable parameters, saved and restored as one."""
 
-    def __init__(self, parameters: Sequence[torch.nn.Parameter], options: TrainingOptions, identity: str) -> None:
+    def __init__(
+        self,
+        parameters: Sequence[torch.nn.Parameter],
+        options: TrainingOptions,
+        identity: str,
+        optimizer: Literal["adamw", "muon"] = "adamw",
+    ) -> None:
         """Prepare to train `parameters`; `identity` names the run, so that foreign state is refused."""
         self.parameters = list(parameters)
         self.options = options
         self.identity = identity
-        fused = self.parameters[0].device.type in ("cpu", "cuda")
-        self.optimizer = torch.optim.AdamW(
-            self.parameters, lr=options.learning_rate, betas=BETAS, weight_decay=options.weight_decay, fused=fused
-        )
+        settings: dict[str, Any] = {
+            "lr": options.learning_rate,
+            "betas": BETAS,
+            "weight_decay": options.weight_decay,
+        }
+        if optimizer == "muon":
+            self.optimizer: torch.optim.Optimizer = Muon(self.parameters, **settings)
+        else:
+            fused = self.parameters[0].device.type in ("cpu", "cuda")
+            self.optimizer = torch.optim.AdamW(self.parameters, fused=fused, **settings)
         self.average = [parameter.detach().clone() for parameter in self.parameters]
         self.history = History()
         self.step = 0
