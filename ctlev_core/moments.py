@@ -7,7 +7,8 @@ import numpy as np
 from data_contracts.errors import DataError
 from data_contracts.labels import BodyMotions, Labels
 
-NUM_KEY_POSES = 9
+KEY_POSE_SPACING_US = 10_000
+"""At most, so that a limb between two key poses is within a fraction of a pixel of its path."""
 
 
 def nearest_pair(track_us: np.ndarray, start_us: int, end_us: int, where: str) -> tuple[int, int]:
@@ -50,8 +51,8 @@ def motion_around(track: Labels, moment_us: int, half_us: int, where: str) -> tu
         half_us: how far to go to either side.
         where: for the message.
     Returns:
-        t_us [K] int64, smpl_pose [K, 72] and smpl_transl [K, 3] float32, K = `NUM_KEY_POSES`; between two labels each
-        joint turns at constant speed.
+        t_us [K] int64, smpl_pose [K, 72] and smpl_transl [K, 3] float32; K depends on `half_us` alone. Between two
+        labels each joint turns at constant speed.
     Raises:
         DataError: the labels have no SMPL parameters, or those around the moment are of no more than one time.
     """
@@ -60,12 +61,13 @@ def motion_around(track: Labels, moment_us: int, half_us: int, where: str) -> tu
     if track.smpl_pose is None or track.smpl_betas is None or track.smpl_transl is None:
         raise DataError(f"{where}: needs labels with SMPL parameters to see a body move")
     start_us, stop_us = max(track.t_us[0], moment_us - half_us), min(track.t_us[-1], moment_us + half_us)
-    if stop_us - start_us < NUM_KEY_POSES:
+    num_spans = max(-(-2 * half_us // KEY_POSE_SPACING_US), 1)
+    if stop_us - start_us < num_spans:
         raise DataError(
             f"{where}: needs labels over a time to see a body move, got {len(track)} from {track.t_us[0]} to "
             f"{track.t_us[-1]} us around {moment_us} us"
         )
-    t_us = np.rint(np.linspace(start_us, stop_us, NUM_KEY_POSES)).astype(np.int64)
+    t_us = np.rint(np.linspace(start_us, stop_us, num_spans + 1)).astype(np.int64)
     clip = MotionClip(
         track.smpl_pose.astype(np.float64), track.smpl_betas[0], track.smpl_transl.astype(np.float64), 1e-6 * track.t_us
     )

@@ -33,7 +33,7 @@ class Options(Frozen):
         default=200.0, gt=0, le=10_000, description="Labels a second; DHP19's motion capture has 100."
     )
     condition_rate_hz: float = Field(
-        default=20.0, gt=0, le=10_000, description="Labels a second, at least two, of a label-only recording."
+        default=50.0, gt=0, le=10_000, description="Labels a second, at least two, of a label-only recording."
     )
     intensity_rate_hz: float | None = Field(
         default=None,

@@ -46,9 +46,7 @@ def realism(
     learnt = _summarise_recordings(recordings, "train")
     found = [_compare("events", "train", "test", learnt, _summarise_recordings(recordings, "test"), recordings)]
     if reference is not None:
-        splits = sorted({part["split"] for part in reference.attached(tables.PARTS).to_pylist()})
-        theirs = [summary for split in splits for summary in _summarise_recordings(reference, split)]
-        found.append(_compare("reference", "reference", "train", theirs, learnt, recordings))
+        found.append(_compare("reference", "reference", "train", _summarise_whole(reference), learnt, recordings))
     real = _summarise_frames(frames)
     groups = ["frames", *(f"frames of {name}" for name in names[1:])]
     for group, name, made in zip(groups, names, generated, strict=True):
@@ -62,12 +60,25 @@ def realism(
 def _summarise_recordings(recordings: Manifest, split: str) -> list[Summary]:
     files = dict(zip(recordings.column("recording_id"), recordings.column("events_file"), strict=True))
     parts = [part for part in recordings.attached(tables.PARTS).to_pylist() if part["split"] == split]
-    parts = [part for part in parts if files[part["recording_id"]]]
+    stretches = [(files[part["recording_id"]], part["event_start"], part["event_stop"]) for part in parts]
+    return _summarise_stretches(recordings, stretches)
+
+
+def _summarise_whole(recordings: Manifest) -> list[Summary]:
+    """Every recording once, also where splits divide it."""
+    table = recordings.table
+    files, counts = table["events_file"].to_pylist(), table["num_events"].to_pylist()
+    return _summarise_stretches(recordings, [(file, 0, count) for file, count in zip(files, counts, strict=True)])
+
+
+def _summarise_stretches(recordings: Manifest, stretches: list[tuple[str, int, int]]) -> list[Summary]:
+    """Of stretches (events file, first event, one past the last) those with events, the middle of long ones."""
+    stretches = [stretch for stretch in stretches if stretch[0]]
     found = []
-    for number in spread(len(parts), MAX_RECORDINGS).tolist():
-        start, stop = parts[number]["event_start"], parts[number]["event_stop"]
+    for number in spread(len(stretches), MAX_RECORDINGS).tolist():
+        file, start, stop = stretches[number]
         start += max(0, stop - start - MAX_EVENTS) // 2
-        path = recordings.path(files[parts[number]["recording_id"]])
+        path = recordings.path(file)
         found.append(summarise_events(event_files.read_events_range(path, start, min(stop, start + MAX_EVENTS))))
     return found
 

@@ -9,21 +9,20 @@ SMPL poses; the poses are those that the other generators get.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from pydantic import Field
 
+from ctlev_core.render.body_normals import given_body_file, render_labelled_normals
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import BodyMotions, Conditions, Labels, check_body_motions
 
 VERSION = 1
 NEEDS = "motion"
-BATCH = 64
-"""Bodies posed at a time: 64 of SMPL's are 5 MB."""
+WHERE = "condition 'body_motion'"
 SAME_TOLERANCE = 1e-3
 """Shape coefficients of a label and of its motion differ by rounding at most."""
 
@@ -48,11 +47,7 @@ def input_files(options: Options) -> list[Path]:
     Raises:
         DataError: no such file.
     """
-    if options.body is None:
-        return []
-    if not options.body.is_file():
-        raise DataError(f"condition 'body_motion': {options.body}: no such file; expected an SMPL body (.pkl or .npz)")
-    return [options.body]
+    return given_body_file(options.body, WHERE)
 
 
 def render(
@@ -72,20 +67,12 @@ def render(
         DataError: the labels have no SMPL parameters or no intrinsics, a motion is malformed or of a body of another
             shape, the numbers of rows differ, or the body file is wrong.
     """
-    if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
-        raise DataError("condition 'body_motion': the labels have no SMPL parameters")
-    if labels.intrinsics is None:
-        raise DataError(
-            "condition 'body_motion': the labels have no camera intrinsics, so bodies have no place in the image"
-        )
     if not len(seeds) == len(motions) == len(labels):
-        raise DataError(
-            f"condition 'body_motion': {len(labels)} labels but {len(motions)} motions and {len(seeds)} seeds"
-        )
-    check_body_motions(motions, "condition 'body_motion'")
-    _check_same_bodies(labels.smpl_betas, motions.smpl_betas)
-    pose = labels.smpl_pose, labels.smpl_betas, labels.smpl_transl
-    images = _render_poses(*pose, labels.intrinsics, image_size, options)
+        raise DataError(f"{WHERE}: {len(labels)} labels but {len(motions)} motions and {len(seeds)} seeds")
+    check_body_motions(motions, WHERE)
+    if labels.smpl_betas is not None:
+        _check_same_bodies(labels.smpl_betas, motions.smpl_betas)
+    images = render_labelled_normals(labels, image_size, WHERE, body_file=options.body, workers=options.workers)
     return Conditions((options.prompt,) * len(labels), images, motions)
 
 
@@ -95,33 +82,6 @@ def _check_same_bodies(labelled: np.ndarray, moving: np.ndarray) -> None:
     if differs.any():
         row = int(np.argmax(differs))
         raise DataError(
-            f"condition 'body_motion': row {row} has smpl_betas {labelled[row].tolist()} in the label but "
+            f"{WHERE}: row {row} has smpl_betas {labelled[row].tolist()} in the label but "
             f"{moving[row].tolist()} in the motion"
         )
-
-
-def _render_poses(
-    pose: np.ndarray,
-    betas: np.ndarray,
-    transl: np.ndarray,
-    intrinsics: np.ndarray,
-    image_size: tuple[int, int],
-    options: Options,
-) -> np.ndarray:
-    """Normal maps [N, H, W, 3] uint8 of SMPL parameters in the camera frame."""
-    from ctlev_core.body.layer import load_body, pose_vertices
-    from ctlev_core.body.rotations import matrix_from_axis_angle
-    from ctlev_core.render.normals import render_normal_maps
-
-    body = load_body(options.body)
-    workers = options.workers or os.cpu_count() or 1
-    width, height = image_size
-    images = np.empty((len(pose), height, width, 3), dtype=np.uint8)
-    for start in range(0, len(pose), BATCH):
-        rows = slice(start, start + BATCH)
-        rotations = matrix_from_axis_angle(pose[rows].reshape(-1, 24, 3))
-        vertices, _ = pose_vertices(body, rotations, betas[rows], transl[rows])
-        images[rows] = render_normal_maps(
-            vertices, body.faces, intrinsics[rows], image_size, "controlnet", workers=workers
-        )
-    return images

@@ -6,21 +6,18 @@ bundled procedural one unless a licensed SMPL file is given; no light, colour or
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import Field
 
+from ctlev_core.render.body_normals import given_body_file, render_labelled_normals
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, Labels
 
 VERSION = 1
-BATCH = 64
-"""Bodies posed at a time: 64 of SMPL's are 5 MB."""
 
 
 class Options(Frozen):
@@ -52,11 +49,7 @@ def input_files(options: Options) -> list[Path]:
     Raises:
         DataError: no such file.
     """
-    if options.body is None:
-        return []
-    if not options.body.is_file():
-        raise DataError(f"condition 'normals': {options.body}: no such file; expected an SMPL body (.pkl or .npz)")
-    return [options.body]
+    return given_body_file(options.body, "condition 'normals'")
 
 
 def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds: Sequence[int]) -> Conditions:
@@ -73,28 +66,15 @@ def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds:
         DataError: the labels have no SMPL parameters or no intrinsics, the body file is wrong, the number of seeds
             differs, or the renderer needs an OpenGL that is not there.
     """
-    from ctlev_core.body.layer import load_body, pose_vertices
-    from ctlev_core.body.rotations import matrix_from_axis_angle
-    from ctlev_core.render.normals import render_normal_maps
-
-    if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
-        raise DataError("condition 'normals': the labels have no SMPL parameters; use condition 'skeleton' for joints")
-    if labels.intrinsics is None:
-        raise DataError(
-            "condition 'normals': the labels have no camera intrinsics, so bodies have no place in the image"
-        )
     if len(seeds) != len(labels):
         raise DataError(f"condition 'normals': {len(labels)} labels but {len(seeds)} seeds")
-    body = load_body(options.body)
-    width, height = image_size
-    images = np.empty((len(labels), height, width, 3), dtype=np.uint8)
-    rotations = matrix_from_axis_angle(labels.smpl_pose.reshape(-1, 24, 3))
-    workers = options.workers or os.cpu_count() or 1
-    for start in range(0, len(labels), BATCH):
-        rows = slice(start, start + BATCH)
-        vertices, _ = pose_vertices(body, rotations[rows], labels.smpl_betas[rows], labels.smpl_transl[rows])
-        intrinsics = labels.intrinsics[rows]
-        images[rows] = render_normal_maps(
-            vertices, body.faces, intrinsics, image_size, options.convention, renderer=options.renderer, workers=workers
-        )
+    images = render_labelled_normals(
+        labels,
+        image_size,
+        "condition 'normals'",
+        convention=options.convention,
+        body_file=options.body,
+        renderer=options.renderer,
+        workers=options.workers,
+    )
     return Conditions((options.prompt,) * len(labels), images)

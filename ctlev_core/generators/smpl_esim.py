@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
+from ctlev_core.render.body_normals import given_body_file
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
@@ -76,11 +77,7 @@ def input_files(options: SampleOptions) -> list[Path]:
     Raises:
         DataError: no such file.
     """
-    if options.body is None:
-        return []
-    if not options.body.is_file():
-        raise DataError(f"generator 'smpl_esim': {options.body}: no such file; expected an SMPL body (.pkl or .npz)")
-    return [options.body]
+    return given_body_file(options.body, "generator 'smpl_esim'")
 
 
 def sample_events(

@@ -96,7 +96,7 @@ def _shown(image: np.ndarray, labels: Labels | None = None, row: int = 0) -> np.
 
 def _training_section(frames: Manifest, conditions: Manifest) -> Section:
     rows = {name: row for row, name in enumerate(frames.column("sample_id"))}
-    chosen = spread(len(conditions), COLUMNS)
+    chosen = _in_turns(conditions.column("class_name"))
     members = [rows[conditions.column("sample_id")[row]] for row in chosen]
     names = [frames.column("class_name")[row] or frames.column("subject")[row] for row in members]
     images = np.asarray(conditions.array("images")[chosen]) if "images.npy" in conditions.files else None
@@ -113,6 +113,16 @@ def _sampling_section(conditions: Manifest) -> Section:
     shown = np.concatenate([_of_class(classes, name) for name in dict.fromkeys(classes)])
     images = np.asarray(conditions.array("images")[shown])
     return sampling_grid(images, conditions.labels.take(shown), [classes[row] for row in shown])
+
+
+def _in_turns(classes: list[str]) -> np.ndarray:
+    """Rows for the columns: classes take turns, and the rows of each are evenly spread."""
+    names = list(dict.fromkeys(classes))
+    share = -(-COLUMNS // len(names))
+    queues = [np.array([row for row, of_row in enumerate(classes) if of_row == name]) for name in names]
+    queues = [rows[spread(len(rows), share)] for rows in queues]
+    turns = [rows[turn] for turn in range(share) for rows in queues if turn < len(rows)]
+    return np.array(turns[:COLUMNS], np.int64)
 
 
 def _of_class(classes: list[str], name: str) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 
 from ctlev_core.body_views import with_joints
 from ctlev_core.conditions import body_motion, normals
+from ctlev_core.render import body_normals
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import BodyMotions, Labels
@@ -73,7 +74,7 @@ def test_the_picture_is_the_one_of_the_normals_condition():
 def test_a_row_depends_on_nothing_but_itself(monkeypatch):
     labels = people(7)
     together = render(labels, motions_of(labels)).images
-    monkeypatch.setattr(body_motion, "BATCH", 3)
+    monkeypatch.setattr(body_normals, "BATCH", 3)
     np.testing.assert_array_equal(render(labels, motions_of(labels), workers=3).images, together)
 
 

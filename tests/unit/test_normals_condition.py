@@ -8,6 +8,7 @@ import pytest
 from ctlev_core.body.layer import BUNDLED_BODY
 from ctlev_core.body_views import with_joints
 from ctlev_core.conditions import normals
+from ctlev_core.render import body_normals
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
@@ -50,7 +51,7 @@ def test_every_labelled_joint_lies_in_its_body():
 def test_a_row_depends_on_nothing_but_itself(monkeypatch):
     labels = people(7)
     together = render(labels).images
-    monkeypatch.setattr(normals, "BATCH", 3)
+    monkeypatch.setattr(body_normals, "BATCH", 3)
     np.testing.assert_array_equal(render(labels, workers=3).images, together)
     np.testing.assert_array_equal(render(labels.take([4]), workers=1).images[0], together[4])
 

@@ -143,12 +143,12 @@ def test_condition_recordings_are_tracks_of_labels():
     joints, shapes = [], []
     for recording in of_split("condition"):
         labels = check_labels(studio.read_labels(recording, OPTIONS), recording.recording_id)
-        assert labels.t_us.tolist() == [0, 50_000, 100_000, 150_000, 200_000, 250_000]
+        np.testing.assert_array_equal(labels.t_us, np.rint(np.linspace(0, 250_000, 13)))  # 50 Hz, both ends
         assert labels.visible.mean() > 0.8
         joints.append(labels.joints2d)
         shapes.append(labels.smpl_betas[0])
     assert np.std([track[0] for track in joints], axis=0).mean() > 2
-    assert np.median([np.abs(np.diff(track, axis=0)).max() for track in joints]) > 1
+    assert np.median([np.ptp(track, axis=0).max() for track in joints]) > 2  # they move
     assert len(np.unique(shapes, axis=0)) == len(shapes)
     with pytest.raises(DataError, match="has no events"):
         studio.read_events(of_split("condition")[0], OPTIONS)
