@@ -38,10 +38,10 @@ def compute_joint_errors_px(
     if points.shape != target.joints2d.shape:
         raise ValueError(f"predicted joints2d must be {target.joints2d.shape}, got {points.shape}")
     joints = target.joints2d.astype(np.float64)
-    counts = target.visible if counted == "visible" else np.isfinite(joints).all(axis=-1)
+    counts = target.visible if counted == "visible" else _is_finite(joints)
     if not counts.any():
         raise ValueError(f"no joint is {counted} in any of the {len(target)} target rows")
-    distance = np.linalg.norm(points - (np.floor(joints) + 0.5 if whole_pixels else joints), axis=-1)
+    distance = _lengths(points - (np.floor(joints) + 0.5 if whole_pixels else joints))
     wrong = counts & ~np.isfinite(distance)
     if wrong.any():
         row, joint = np.argwhere(wrong)[0]
@@ -71,19 +71,32 @@ def compute_joint_errors_mm(predicted: Mapping[str, Any], target: Labels, alignm
     if points.shape != joints.shape:
         raise ValueError(f"predicted joints3d must be {joints.shape}, got {points.shape}")
     if not np.isfinite(points).all():
-        row, joint = np.argwhere(~np.isfinite(points).all(axis=-1))[0]
+        row, joint = np.argwhere(~_is_finite(points))[0]
         raise ValueError(
             f"predicted joint {joint} of row {row} is {points[row, joint].tolist()}, not a finite position"
         )
-    known = np.asarray(np.isfinite(joints).all(axis=-1))
+    known = _is_finite(joints)
     if not known.any():
         raise ValueError(f"no joint is known in any of the {len(target)} target rows")
-    if alignment == "pelvis":
-        hips = _hips(target.joint_set)
-        points, joints = (array - array[:, hips].mean(axis=1, keepdims=True) for array in (points, joints))
-    elif alignment == "procrustes":
+    if alignment == "procrustes":
         points = align_similarity(points, joints, known)
-    return np.linalg.norm(points - joints, axis=-1)
+    apart = points - joints
+    if alignment == "pelvis":
+        left, right = _hips(target.joint_set)
+        # Both moved by their own hips: their difference moves by the difference of the hips.
+        apart -= (apart[:, [left]] + apart[:, [right]]) / 2
+    return _lengths(apart)
+
+
+def _is_finite(points: np.ndarray) -> np.ndarray:
+    """[N, J] of [N, J, 2 or 3]: are all coordinates finite?"""
+    finite = np.isfinite(points)
+    return np.ones(points.shape[:-1], bool) if finite.all() else np.logical_and.reduce(finite, axis=-1)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Lengths of vectors [..., 2 or 3]; several times faster than `numpy.linalg.norm` for so short ones."""
+    return np.sqrt(np.einsum("...c,...c->...", vectors, vectors))
 
 
 def _hips(joint_set: str) -> list[int]:
@@ -96,7 +109,9 @@ def _hips(joint_set: str) -> list[int]:
 def row_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sum and number [N] of the entries of [N, J] that are not NaN: what means over any rows are made of."""
     known = ~np.isnan(values)
-    return np.where(known, values, 0.0).sum(axis=-1), known.sum(axis=-1)
+    # Rows are short: a matrix product adds them up several times faster than a sum over an axis.
+    ones = np.ones(values.shape[-1])
+    return np.where(known, values, 0.0) @ ones, known @ ones
 
 
 def quotients(sums: Sums) -> dict[str, float]:

@@ -28,12 +28,17 @@ def align_similarity(points: np.ndarray, target: np.ndarray, known: np.ndarray) 
     """
     from ctlev_core.procrustes_kernels import align_rows
 
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    target = np.ascontiguousarray(target, dtype=np.float64)
     if points.shape != target.shape or points.ndim != 3 or points.shape[2] != 3 or known.shape != points.shape[:2]:
         raise ValueError(
             f"points and target must be [N, J, 3] and known [N, J], got {points.shape}, {target.shape}, {known.shape}"
         )
-    aligned = np.empty_like(points)
-    align_rows(points, target, np.ascontiguousarray(known, dtype=np.bool_), RELATIVE_SIZE, aligned)
+    aligned = np.empty(points.shape)
+    align_rows(
+        _floating(points), _floating(target), np.ascontiguousarray(known, dtype=np.bool_), RELATIVE_SIZE, aligned
+    )
     return aligned
+
+
+def _floating(array: np.ndarray) -> np.ndarray:
+    """Sums are float64 in any case; float32 need not be copied for that."""
+    return np.ascontiguousarray(array, dtype=np.float32 if array.dtype == np.float32 else np.float64)

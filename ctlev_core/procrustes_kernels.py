@@ -36,13 +36,26 @@ def align_rows(
         scale = 0.0
         if size > relative_size * farthest:
             scale = _best_rotation(product, turned, rotation) / size
-        for joint in range(points.shape[1]):
-            x = points[row, joint, 0] - centre[0]
-            y = points[row, joint, 1] - centre[1]
-            z = points[row, joint, 2] - centre[2]
-            for axis in range(3):
-                moved = x * rotation[0, axis] + y * rotation[1, axis] + z * rotation[2, axis]
-                aligned[row, joint, axis] = scale * moved + centre_target[axis]
+        for axis in range(3):
+            a, b, c = scale * rotation[0, axis], scale * rotation[1, axis], scale * rotation[2, axis]
+            for joint in range(points.shape[1]):
+                x = points[row, joint, 0] - centre[0]
+                y = points[row, joint, 1] - centre[1]
+                z = points[row, joint, 2] - centre[2]
+                aligned[row, joint, axis] = a * x + b * y + c * z + centre_target[axis]
+
+
+@numba.njit(cache=True, nogil=True)
+def mean_distances(points: np.ndarray, target: np.ndarray, shifts: np.ndarray, means: np.ndarray) -> None:
+    """Mean distances of `points` [N, V, 3], moved by `shifts` [N, 3], from `target` [N, V, 3], into `means` [N]."""
+    for row in range(len(points)):
+        total = 0.0
+        for point in range(points.shape[1]):
+            x = points[row, point, 0] - target[row, point, 0] + shifts[row, 0]
+            y = points[row, point, 1] - target[row, point, 1] + shifts[row, 1]
+            z = points[row, point, 2] - target[row, point, 2] + shifts[row, 2]
+            total += np.sqrt(x * x + y * y + z * z)
+        means[row] = total / points.shape[1]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -74,21 +87,24 @@ def _product(
     centre_target: np.ndarray,
     product: np.ndarray,
 ) -> float:
-    """Sum of the outer products of centred points, those of unit size, with the target's; returns the size."""
+    """Sum of the outer products of centred points and centred target, over the points' size, which is returned."""
     square = 0.0
+    xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
     for joint in range(len(points)):
         if known[joint]:
-            for axis in range(3):
-                square += (points[joint, axis] - centre[axis]) ** 2
+            x, y, z = points[joint, 0] - centre[0], points[joint, 1] - centre[1], points[joint, 2] - centre[2]
+            u = target[joint, 0] - centre_target[0]
+            v = target[joint, 1] - centre_target[1]
+            w = target[joint, 2] - centre_target[2]
+            square += x * x + y * y + z * z
+            xx, xy, xz = xx + x * u, xy + x * v, xz + x * w
+            yx, yy, yz = yx + y * u, yy + y * v, yz + y * w
+            zx, zy, zz = zx + z * u, zy + z * v, zz + z * w
     size = np.sqrt(square)
     unit = 1.0 / size if size > 0.0 else 0.0
-    product[:] = 0.0
-    for joint in range(len(points)):
-        if known[joint]:
-            for axis in range(3):
-                coordinate = unit * (points[joint, axis] - centre[axis])
-                for other in range(3):
-                    product[axis, other] += coordinate * (target[joint, other] - centre_target[other])
+    product[0, 0], product[0, 1], product[0, 2] = unit * xx, unit * xy, unit * xz
+    product[1, 0], product[1, 1], product[1, 2] = unit * yx, unit * yy, unit * yz
+    product[2, 0], product[2, 1], product[2, 2] = unit * zx, unit * zy, unit * zz
     return size
 
 

@@ -13,7 +13,8 @@ from ctlev_core.procrustes import align_similarity
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.labels import Labels
 
-_ROWS_AT_ONCE = 32
+_ROWS_AT_ONCE = 8
+"""Vertices of so many bodies stay in the cache."""
 _PARAMETERS = {"smpl_pose": 72, "smpl_betas": 10, "smpl_transl": 3}
 
 
@@ -35,22 +36,23 @@ def compute_vertex_errors_mm(
         DataError: the body cannot be read.
     """
     from ctlev_core.body.layer import load_body
+    from ctlev_core.procrustes_kernels import mean_distances
 
     body = load_body(body_file)
     both = _check("predicted", predicted, len(target)), _check("target", target.arrays, len(target))
-    errors: dict[Alignment, np.ndarray] = {alignment: np.empty(len(target)) for alignment in alignments}
+    errors_m: dict[Alignment, np.ndarray] = {alignment: np.empty(len(target)) for alignment in alignments}
     for start in range(0, len(target), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
-        (vertices, hips), (true, true_hips) = (_pose(body, *(array[rows] for array in arrays)) for arrays in both)
+        (vertices, hips), (true, true_hips) = (_pose(body, pose[rows], betas[rows]) for pose, betas, _ in both)
+        # Vertices and hips are as seen from a body at the origin: places in space come in as float64.
+        shifts = {"none": both[0][2][rows] - both[1][2][rows], "pelvis": true_hips - hips}
         for alignment in alignments:
             if alignment == "procrustes":
-                moved = align_similarity(vertices, true, np.ones(vertices.shape[:2], bool)) - true
+                aligned = align_similarity(vertices, true, np.ones(vertices.shape[:2], bool))
+                mean_distances(aligned, true, np.zeros_like(hips), errors_m[alignment][rows])
             else:
-                moved = vertices - true
-                if alignment == "pelvis":
-                    moved -= hips - true_hips
-            errors[alignment][rows] = 1000 * np.linalg.norm(moved, axis=-1).mean(axis=-1)
-    return errors
+                mean_distances(vertices, true, shifts[alignment], errors_m[alignment][rows])
+    return {alignment: 1000 * errors for alignment, errors in errors_m.items()}
 
 
 def _check(name: str, arrays: Mapping[str, Any], count: int) -> list[np.ndarray]:
@@ -69,13 +71,11 @@ def _check(name: str, arrays: Mapping[str, Any], count: int) -> list[np.ndarray]
     return checked
 
 
-def _pose(body: Any, pose: np.ndarray, betas: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [N, V, 3] and the middle of the hips [N, 1, 3], float64, m."""
+def _pose(body: Any, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [N, V, 3] float32 and the middle of the hips [N, 3] float64, m, of bodies at the origin."""
     from ctlev_core.body.layer import pose_vertices
     from ctlev_core.body.rotations import matrix_from_axis_angle
 
     rotations = matrix_from_axis_angle(pose.reshape(-1, len(SMPL_JOINTS), 3))
-    # Vertices are float32: near the origin they keep 0.1 um, and the place in space is added afterwards.
-    vertices, joints = pose_vertices(body, rotations, betas, np.zeros_like(transl))
-    hips = joints[:, [SMPL_JOINTS.index("left_hip"), SMPL_JOINTS.index("right_hip")]].mean(axis=1)
-    return vertices.astype(np.float64) + transl[:, None], (hips + transl)[:, None]
+    vertices, joints = pose_vertices(body, rotations, betas, np.zeros((len(pose), 3)))
+    return vertices, joints[:, [SMPL_JOINTS.index("left_hip"), SMPL_JOINTS.index("right_hip")]].mean(axis=1)

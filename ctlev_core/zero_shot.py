@@ -99,7 +99,8 @@ def nearest_seen_classes(
         )
     similarity = unit[0] @ unit[1].T
     order = np.argsort(-similarity, axis=1, kind="stable")[:, :count]
+    names = list(seen_names)
     return [
-        [(seen_names[column], float(np.clip(row[column], -1, 1))) for column in columns]
+        [(names[column], float(np.clip(row[column], -1, 1))) for column in columns]
         for row, columns in zip(similarity, order.tolist(), strict=True)
     ]

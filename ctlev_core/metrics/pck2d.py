@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.body_lengths import head_length, torso_length
-from ctlev_core.joint_errors import Sums, compute_joint_errors_px, row_means, row_sums
+from ctlev_core.joint_errors import Sums, compute_joint_errors_px, quotients
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
@@ -44,27 +44,26 @@ def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> d
     Raises:
         ValueError: shapes differ, no joint is visible, or no row has a normaliser.
     """
-    correct = _correct(predicted, target, options)
-    if np.isnan(correct).all():
+    sums = compute_sums(predicted, target, options)
+    if not any(count.any() for _, count in sums.values()):
         raise ValueError(f"no row with a visible joint has a {options.normaliser} length to measure the threshold with")
-    return {f"pck_{options.normaliser}{options.threshold:g}": float(np.nanmean(correct))}
+    return quotients(sums)
 
 
 def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options) -> Sums:
     """Of each row the number [N] of correct joints and of scored ones; `compute` is their quotient over all rows."""
-    return {f"pck_{options.normaliser}{options.threshold:g}": row_sums(_correct(predicted, target, options))}
+    errors_px = compute_joint_errors_px(predicted, target)
+    limit_px = options.threshold * _normaliser_px(target, options)
+    has_limit, ones = limit_px > 0, np.ones(errors_px.shape[1])
+    # An error that is unknown, NaN, is not within any limit.
+    correct, count = (errors_px <= limit_px[:, None]) @ ones, ~np.isnan(errors_px) @ ones
+    return {f"pck_{options.normaliser}{options.threshold:g}": (correct * has_limit, count * has_limit)}
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
     """Fraction [N] of correct joints of each row, NaN where the row is left out: what intervals are made of."""
-    return row_means(_correct(predicted, target, options))
-
-
-def _correct(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
-    """[N, J]: 1 correct, 0 wrong, NaN not scored."""
-    errors_px = compute_joint_errors_px(predicted, target)
-    limit_px = options.threshold * _normaliser_px(target, options)[:, None]
-    return np.where(np.isnan(errors_px) | ~(limit_px > 0), np.nan, errors_px <= limit_px)
+    ((correct, count),) = compute_sums(predicted, target, options).values()
+    return np.where(count > 0, correct / np.maximum(count, 1), np.nan)
 
 
 def _normaliser_px(target: Labels, options: Options) -> np.ndarray:
@@ -73,7 +72,8 @@ def _normaliser_px(target: Labels, options: Options) -> np.ndarray:
         raise ValueError("the target labels have no joints2d")
     if options.normaliser == "px":
         return np.ones(len(target))
-    points = np.where(target.visible[..., None], target.joints2d.astype(np.float64), np.nan)
+    points = target.joints2d.astype(np.float64)
+    points[~target.visible] = np.nan
     if options.normaliser == "bbox":
         size = np.full(len(target), np.nan)
         seen = target.visible.any(axis=1)

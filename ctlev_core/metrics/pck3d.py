@@ -60,22 +60,20 @@ def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options)
     """Of each row the number [N] of correct joints, or the area, and of scored ones; `compute` is their quotient."""
     errors_mm = compute_joint_errors_mm(predicted, target, options.alignment)
     tag = TAGS[options.alignment]
-    sums = {f"pck3d_{tag}{limit:g}mm": row_sums(_within(errors_mm, limit)) for limit in options.thresholds_mm}
-    area = 1 - np.minimum(errors_mm, options.auc_max_mm) / options.auc_max_mm
-    sums[f"auc3d_{tag}{options.auc_max_mm:g}mm"] = row_sums(area)
+    total, count = row_sums(np.minimum(errors_mm, options.auc_max_mm))
+    ones = np.ones(errors_mm.shape[1])
+    # An unknown error, NaN, is not within any limit.
+    sums = {f"pck3d_{tag}{limit:g}mm": ((errors_mm <= limit) @ ones, count) for limit in options.thresholds_mm}
+    sums[f"auc3d_{tag}{options.auc_max_mm:g}mm"] = (count - total / options.auc_max_mm, count)
     if options.head_threshold and target.joints3d is not None:
         head_mm = head_length(target.joints3d.astype(np.float64), target.joint_set)[:, None]
-        limits_mm = options.head_threshold * np.where(head_mm > 0, head_mm, np.nan)
-        sums[f"pckh3d_{tag}{options.head_threshold:g}"] = row_sums(_within(errors_mm, limits_mm))
+        has_head = (head_mm > 0)[:, 0]
+        correct = (errors_mm <= options.head_threshold * head_mm) @ ones
+        sums[f"pckh3d_{tag}{options.head_threshold:g}"] = (correct * has_head, count * has_head)
     return sums
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
     """Fraction [N] of joints of each row within the first threshold, NaN for a row without a known joint."""
     errors_mm = compute_joint_errors_mm(predicted, target, options.alignment)
-    return row_means(_within(errors_mm, options.thresholds_mm[0]))
-
-
-def _within(errors_mm: np.ndarray, limit_mm: float | np.ndarray) -> np.ndarray:
-    """[N, J]: 1 within the limit, 0 not, NaN unknown."""
-    return np.where(np.isnan(errors_mm + limit_mm), np.nan, errors_mm <= limit_mm)
+    return row_means(np.where(np.isnan(errors_mm), np.nan, errors_mm <= options.thresholds_mm[0]))

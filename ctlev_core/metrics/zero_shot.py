@@ -62,10 +62,9 @@ def prepare(predicted: Mapping[str, Any], target: Labels, options: Options) -> C
         found = {}
         for name in names:
             is_positive, is_called = (column[rows] == numbers[name] for column in (guesses.truth, guesses.guess))
-            if is_positive.all() or not is_positive.any():
-                raise ValueError(
-                    f"class {name!r} has {is_positive.sum()} of {len(rows)} rows; it needs some and not all"
-                )
+            count = int(np.count_nonzero(is_positive))
+            if count in (0, len(rows)):
+                raise ValueError(f"class {name!r} has {count} of {len(rows)} rows; it needs some and not all")
             found[f"binary_accuracy_{name}"] = balanced_accuracy(is_positive, is_called)
         return {"binary_accuracy_mean": float(np.mean(list(found.values()))), **found}
 

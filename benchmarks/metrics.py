@@ -1,0 +1,165 @@
+"""How fast and how exact the scores are: Frechet distances beside other packages' algorithms, poses beside a loop.
+
+    python benchmarks/metrics.py
+    python benchmarks/metrics.py --widths 64 768 --figure metrics.png
+
+One thread (set OMP_NUM_THREADS=1), CPU seconds. Frechet distances are timed from features to the number, with the
+covariances that an algorithm needs; errors are relative to the distance itself, against multi-precision arithmetic
+(mpmath, which torch brings along) or, in many dimensions, a closed form. `neg` marks a negative result, `raises` an
+error. Pose scores are timed beside the plainest loop over frames, which must give the same numbers.
+
+A machine that does other things moves each time by tens of per cent: read the ratios.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pose_loops
+from frechet_algorithms import (
+    OURS,
+    PEERS,
+    Distance,
+    closed_form_case,
+    exact_distance,
+    hard_cases,
+)
+
+ROWS = (500, 2000, 10_000)
+ERROR_WANTED, SQRTM_WANTED, FEW_ROWS_WANTED, POSES_WANTED = 1e-12, 4.0, 100.0, 20.0
+CONSERVATIVE = ("ctlev", "exact route", "stream")
+"""What keeps the wanted error; a covariance alone does not hold enough digits for it."""
+
+
+def main() -> None:
+    """Print the tables, then what was reached."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--error-width", type=int, default=24, help="features of the hard cases")
+    parser.add_argument("--widths", type=int, nargs="*", default=[64, 768, 2048], help="features of the timings")
+    parser.add_argument("--frames", type=int, default=2000, help="frames of the pose scores")
+    parser.add_argument("--rounds", type=int, default=3, help="timings of what takes less than a second")
+    parser.add_argument("--figure", type=Path, help="file for a plot of time against error")
+    arguments = parser.parse_args()
+    reached: list[tuple[str, float, float, bool]] = []
+    errors = print_errors(arguments.error_width, reached)
+    times = print_times(arguments.widths, arguments.rounds, reached)
+    print_poses(arguments.frames, arguments.rounds, reached)
+    print("\nTargets:")
+    for name, wanted, got, is_met in reached:
+        print(f"  {'met   ' if is_met else 'missed'}  {name}: {got:.3g}, wanted {wanted:g}")
+    if arguments.figure:
+        draw(arguments.figure, errors, times)
+
+
+def print_errors(width: int, reached: list[tuple[str, float, float, bool]]) -> dict[str, float]:
+    """Relative errors in the hard cases; returns the largest of each algorithm."""
+    algorithms = PEERS | OURS
+    print(f"\nRelative error of Frechet distances, d = {width}\n{'case':34}" + "".join(f"{n:>13}" for n in algorithms))
+    worst = dict.fromkeys(algorithms, 0.0)
+    cases: list[tuple[str, np.ndarray, np.ndarray, float | None]]
+    cases = [(name, a, b, None) for name, (a, b) in hard_cases(width).items()]
+    for count in (256, 4096):
+        a, b, exact = closed_form_case(1024, count)
+        cases.append((f"d = 1024, N = {count}, closed form", a, b, exact))
+    for name, a, b, closed in cases:
+        exact = exact_distance(a, b) if closed is None else closed
+        cells = []
+        for algorithm, function in algorithms.items():
+            error, text = relative_error(function, a, b, exact)
+            # Nearly identical sets differ by less than the rounding of their own features: no target there.
+            if "near-identical" not in name:
+                worst[algorithm] = max(worst[algorithm], error)
+            cells.append(f"{text:>13}")
+        print(f"{name:34}" + "".join(cells), flush=True)
+    print(f"{'worst, without near-identical':34}" + "".join(f"{error:13.0e}" for error in worst.values()))
+    for name in CONSERVATIVE:
+        reached.append((f"largest relative error, {name}", ERROR_WANTED, worst[name], worst[name] <= ERROR_WANTED))
+    return worst
+
+
+def relative_error(function: Distance, a: np.ndarray, b: np.ndarray, exact) -> tuple[float, str]:
+    """The error, and how to print it; of a distance of 0 the result itself, as a share of the squared features."""
+    try:
+        found = function(a, b)
+    except (ValueError, np.linalg.LinAlgError):
+        return float("inf"), "raises"
+    size = exact if exact > 1e-30 else float(np.square(a - a.mean(axis=0)).sum())
+    error = float(abs(found - exact) / size)
+    if not np.isfinite(error):
+        return float("inf"), "nan"
+    return error, f"{error:.0e}{' neg' if found < 0 else ''}"
+
+
+def print_times(
+    widths: list[int], rounds: int, reached: list[tuple[str, float, float, bool]]
+) -> dict[str, dict[str, float]]:
+    """CPU seconds by size and algorithm."""
+    algorithms = {name: f for name, f in (PEERS | OURS).items() if name != "eigh"}
+    print(f"\nCPU seconds of a Frechet distance (times ctlev)\n{'d, N':16}" + "".join(f"{n:>18}" for n in algorithms))
+    found: dict[str, dict[str, float]] = {}
+    for width in widths:
+        for count in ROWS:
+            random = np.random.default_rng(0)
+            a, b = random.normal(size=(count, width)), 1.2 * random.normal(size=(count, width)) + 0.1
+            seconds = {name: measure(partial(function, a, b), rounds) for name, function in algorithms.items()}
+            key = f"{width}, {count}"
+            found[key] = seconds
+            cells = [f"{s:.3f} ({s / seconds['ctlev']:.2g}x)" for s in seconds.values()]
+            print(f"{key:16}" + "".join(f"{cell:>18}" for cell in cells), flush=True)
+            ratio = seconds["sqrtm"] / seconds["ctlev"]
+            if (width, count) == (2048, 10_000):
+                reached.append((f"faster than sqrtm, d, N = {key}", SQRTM_WANTED, ratio, ratio >= SQRTM_WANTED))
+            elif width == 2048 and count < width // 2:
+                reached.append((f"faster than sqrtm, d, N = {key}", FEW_ROWS_WANTED, ratio, ratio >= FEW_ROWS_WANTED))
+    return found
+
+
+def print_poses(num_frames: int, rounds: int, reached: list[tuple[str, float, float, bool]]) -> None:
+    """CPU microseconds a frame, ours and a plain loop's."""
+    print(f"\nPose scores of {num_frames} frames: CPU us a frame\n{'score':34}{'ctlev':>10}{'loop':>10}{'ratio':>8}")
+    for name, ours, loop in pose_loops.jobs(num_frames):
+        pose_loops.check(name, ours(), loop())
+        fast, slow = measure(ours, rounds), measure(loop, 1)
+        us = 1e6 / num_frames
+        print(f"{name:34}{us * fast:10.2f}{us * slow:10.1f}{slow / fast:8.0f}", flush=True)
+        reached.append((f"{name}, times a loop", POSES_WANTED, slow / fast, slow / fast >= POSES_WANTED))
+
+
+def measure(run: Callable[[], object], rounds: int) -> float:
+    """CPU seconds, the median of rounds; of one only where that takes longer than a second."""
+    seconds: list[float] = []
+    while len(seconds) < rounds and not (seconds and seconds[0] > 1):
+        start = time.process_time()
+        run()
+        seconds.append(time.process_time() - start)
+    return statistics.median(seconds)
+
+
+def draw(file: Path, errors: dict[str, float], times: dict[str, dict[str, float]]) -> None:
+    """Time at the largest size against the largest error, one point an algorithm."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    key, seconds = list(times.items())[-1]
+    figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
+    for name, second in seconds.items():
+        error = min(max(errors[name], 1e-17), 10.0)
+        axes.loglog(second, error, "o" if name in OURS else "s")
+        note = f" {name}" + (" (raises)" if not np.isfinite(errors[name]) else "")
+        axes.annotate(note, (second, error), va="center")
+    axes.axhline(ERROR_WANTED, color="0.7", linestyle="--")
+    axes.margins(x=0.3)
+    axes.set(xlabel=f"CPU seconds, d, N = {key}", ylabel="largest relative error, hard cases", title="Frechet distance")
+    figure.savefig(file, dpi=120)
+
+
+if __name__ == "__main__":
+    main()
