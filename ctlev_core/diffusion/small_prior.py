@@ -30,7 +30,6 @@ CONDITION_WIDTHS = (16, 32, 64)  # two strided stages: 64 px conditions to 16 x 
 # The noise schedule of Stable Diffusion v1.4, but with beta_end 0.02 instead of 0.012. There the last step keeps 7 % of
 # the signal's amplitude, enough to read the brightness of the whole picture from 48 x 256 latents; sampling, which
 # starts from pure noise, would always begin half grey and leave a fog over black event images. Here 1.5 % remain.
-# v-prediction stays well conditioned at every noise level.
 SCHEDULER_CONFIG = {
     "_class_name": "DDPMScheduler",
     "num_train_timesteps": 1000,
@@ -42,6 +41,12 @@ SCHEDULER_CONFIG = {
     "steps_offset": 1,
 }
 PredictionType = Literal["v_prediction", "sample"]
+"""What the U-Net predicts: v, or the latents themselves.
+
+Noise fills all 48 channels of every latent, pictures only a few directions of them. A trunk of 64 channels that must
+give the noise back, as v asks, leaves grain in its samples; one that gives the latents leaves clean surfaces (Li and
+He, "Back to basics: let denoising generative models denoise", 2025). v is better where hardly any noise is left.
+"""
 WORD_GAIN = 12.0
 """How loud the mean of a prompt's words is beside a single word; 24 tokens share the mean, a handful are words."""
 START, END = "<|startoftext|>", "<|endoftext|>"
