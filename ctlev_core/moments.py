@@ -7,6 +7,8 @@ import numpy as np
 from data_contracts.errors import DataError
 from data_contracts.labels import BodyMotions, Labels
 
+DARKEST = 5.0
+"""Grey level below which a sensor's response is no longer logarithmic: 0.02 of white."""
 KEY_POSE_SPACING_US = 10_000
 """At most, so that a limb between two key poses is within a fraction of a pixel of its path."""
 
@@ -40,6 +42,46 @@ def nearest_pair(track_us: np.ndarray, start_us: int, end_us: int, where: str) -
         other = first + step if 0 <= first + step < len(track_us) else first - step
         first, last = sorted((first, other))
     return first, last
+
+
+def picture_difference(before: np.ndarray, after: np.ndarray) -> float:
+    """Mean magnitude of the change of log intensity between two pictures [H, W] uint8: in proportion to events."""
+    first, second = (np.maximum(picture.astype(np.float32), DARKEST) for picture in (before, after))
+    return float(np.abs(np.log(second / first)).mean())
+
+
+def equally_different_window(
+    images: np.ndarray, track_us: np.ndarray, moment_us: int, reach_us: int, wanted: float, where: str
+) -> tuple[int, int]:
+    """The shortest window around a moment over which the pictures change as much as `wanted`.
+
+    Windows of equal numbers of events are longer where less moves. Where there are pictures and no events, this is the
+    window that would have as many.
+
+    Args:
+        images: [N, H, W] uint8.
+        track_us: [N] int64, their times, ascending.
+        moment_us: in the middle, as far as the track goes.
+        reach_us: how far to go to either side.
+        wanted: as `picture_difference` measures it.
+        where: for the message.
+    Returns:
+        Times of two pictures; the farthest within reach where none differ so much.
+    Raises:
+        DataError: there is one picture alone.
+    """
+    if len(track_us) < 2:
+        raise DataError(f"{where}: a pair needs two intensity frames, got {len(track_us)}")
+    right = int(np.clip(np.searchsorted(track_us, moment_us), 1, len(track_us) - 1))
+    left = right - 1
+    while picture_difference(images[left], images[right]) < wanted:
+        can_left = left > 0 and moment_us - track_us[left - 1] <= reach_us
+        can_right = right < len(track_us) - 1 and track_us[right + 1] - moment_us <= reach_us
+        if not (can_left or can_right):
+            break
+        is_nearer = not can_right or (can_left and moment_us - track_us[left - 1] <= track_us[right + 1] - moment_us)
+        left, right = (left - 1, right) if is_nearer else (left, right + 1)
+    return int(track_us[left]), int(track_us[right])
 
 
 def motion_around(track: Labels, moment_us: int, half_us: int, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -84,6 +84,7 @@ def condition_asked_samples(
         frames,
         condition=condition,
         encoding=experiment.encoding,
+        windows=experiment.windows,
         count=experiment.num_synthetic,
         order=experiment.pose_order,
         views=experiment.pose_views,

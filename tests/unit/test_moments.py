@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.body_views import from_new_side
-from ctlev_core.moments import body_motions, motion_around, nearest_pair
+from ctlev_core.moments import body_motions, equally_different_window, motion_around, nearest_pair
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_body_motions
 
@@ -53,6 +53,24 @@ def test_a_pair_needs_two_pictures_that_show_the_window():
         nearest_pair(TIMES[:1], 0, 10, "here")
     with pytest.raises(DataError, match="from 0 to 300 us do not show a window from 401 to 410 us"):
         nearest_pair(TIMES, 401, 410, "here")
+
+
+def test_a_window_is_as_long_as_it_takes_the_pictures_to_change():
+    images = np.full((9, 4, 4), 100, np.uint8)
+    for frame in range(9):
+        images[frame, 0, 0] = 100 + 10 * frame  # one pixel of 16 gets lighter
+    track = np.arange(9) * 1000
+    steps = np.abs(np.log(images[:, None, 0, 0] / images[None, :, 0, 0].astype(float))) / 16
+    assert equally_different_window(images, track, 4000, 9000, 1e-9, "here") == (3000, 4000)
+    for wanted in (0.004, 0.01, 0.02, 0.03):
+        start, end = np.array(equally_different_window(images, track, 4000, 9000, wanted, "here")) // 1000
+        assert steps[start, end] >= wanted
+        assert min(steps[start + 1, end], steps[start, end - 1]) < wanted  # and no longer
+        assert abs((start + end) / 2 - 4) <= 1
+    assert equally_different_window(images, track, 4000, 9000, 9.0, "here") == (0, 8000)
+    assert equally_different_window(images, track, 4000, 2500, 9.0, "here") == (2000, 6000)
+    assert equally_different_window(images, track, 0, 9000, 0.02, "here")[0] == 0
+    assert equally_different_window(images, track, 9000, 9000, 1e-9, "here") == (7000, 8000)
 
 
 def turning(times_us, rate=4.0, betas=0.5):

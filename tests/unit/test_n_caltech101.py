@@ -124,12 +124,12 @@ def test_only_the_zero_shot_classes_are_sampled_and_none_of_them_is_learnt(root,
     options = {"root": str(root), "zero_shot": True}
     recordings = run_stage(ingest, dataset=DatasetChoice(name="n_caltech101", options=options))
     encoding = EncodingChoice(name="event_histogram", options={"image_size": (16, 16)})
-    frames = run_stage(encode, recordings=recordings, encoding=encoding, windows=Windows(method="whole"))
-    text = ConditionChoice(name="text")
-    learnt = run_stage(condition_frames, recordings=recordings, frames=frames, condition=text, seed=0)
-    asked = {"encoding": encoding, "count": 6, "order": "random", "views": "labelled", "seed": 0}
-    both = {"poses": recordings, "recordings": recordings, "frames": frames}
-    sampled = run_stage(condition_samples, **both, condition=text, **asked)
+    windows = Windows(method="whole")
+    frames = run_stage(encode, recordings=recordings, encoding=encoding, windows=windows)
+    both = {"recordings": recordings, "frames": frames, "condition": ConditionChoice(name="text"), "encoding": encoding}
+    learnt = run_stage(condition_frames, **both, seed=0)
+    asked = {"poses": recordings, "windows": windows, "count": 6, "order": "random", "views": "labelled", "seed": 0}
+    sampled = run_stage(condition_samples, **both, **asked)
     names = [set(read_manifest(manifest).column("prompt")) for manifest in (learnt, sampled)]
     assert names[0] == {"A photo of accordion", "A photo of crocodile head"}
     assert names[1] == {"A photo of bonsai", "A photo of ferry"}

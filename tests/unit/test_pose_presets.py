@@ -88,8 +88,9 @@ def test_a_preset_prepares_its_dataset(write, preset, counts, num_joints, sample
     recordings = run_stage(ingest, dataset=experiment.dataset)
     frames = run_stage(encode, recordings=recordings, encoding=experiment.encoding, windows=experiment.windows)
     both = {"recordings": recordings, "frames": frames, "condition": experiment.condition, "seed": 0}
+    both["encoding"] = experiment.encoding
     of_frames = read_manifest(run_stage(condition_frames, **both))
-    asked = {"poses": recordings, "encoding": experiment.encoding, "count": 4, "order": "random", "views": "labelled"}
+    asked = {"poses": recordings, "windows": experiment.windows, "count": 4, "order": "random", "views": "labelled"}
     of_samples = read_manifest(run_stage(condition_samples, **both, **asked))
     table = read_manifest(frames)
     assert {split: len(table.rows_where(split=split)) for split in counts} == counts
