@@ -1,15 +1,11 @@
 """What conditions are rendered from: labelled rows, the grey pictures of their windows, the motions around them."""
 
-# pyarrow.compute makes its functions when it is imported, where a type checker cannot see them.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pyarrow.compute as pc
 
 from ctlev_core import moments, plugins
 from ctlev_core.image_resampling import resample_images
@@ -18,7 +14,7 @@ from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
 from data_contracts.labels import BodyMotions, Labels
-from data_contracts.manifest import Manifest, labels_of
+from data_contracts.manifest import Manifest, by_recording, labels_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +113,10 @@ def read_motions(rows: LabelledRows, recordings: Manifest, frames: Manifest, enc
     learnt = frames.rows_where(split="train")
     reach_us = int((frames.table["t_end_us"].to_numpy() - frames.table["t_start_us"].to_numpy())[learnt].max())
     where = f"{rows.recordings.ref.path}: condition of body motions"
-    table = rows.recordings.attached(tables.LABELS)
+    tracks = by_recording(rows.recordings.attached(tables.LABELS))
     found: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     for name, members in _by_name(rows.recording_ids).items():
-        track = labels_of(table.filter(pc.equal(table["recording_id"], name)))
+        track = labels_of(tracks[name])
         for row in members.tolist():
             moment_us = int(rows.labelled.t_us[row])
             found[row] = moments.motion_around(track, moment_us, reach_us, f"{where}, {name}")

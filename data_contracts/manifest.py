@@ -218,6 +218,14 @@ def labels_of(table: pa.Table) -> Labels:
     return Labels(class_names, t_us.astype(np.int64), joint_set="".join(joint_sets), **arrays)
 
 
+def by_recording(table: pa.Table) -> dict[str, pa.Table]:
+    """The rows of each recording, which lie together."""
+    names = np.array(table["recording_id"].to_pylist())
+    starts = np.flatnonzero(np.concatenate([[True], names[1:] != names[:-1]])) if len(names) else np.zeros(0, int)
+    stops = [*starts[1:].tolist(), len(names)]
+    return {names[a]: table.slice(a, b - a) for a, b in zip(starts.tolist(), stops, strict=False)}
+
+
 def concat_labels(parts: Iterable[Labels], *, common: bool = False) -> Labels:
     """Stack label rows; all parts must carry the same kinds of labels, or (`common`) only what all have is kept."""
     parts = [part for part in parts if len(part)]

@@ -19,7 +19,7 @@ from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import Labels
-from data_contracts.manifest import Manifest, concat_labels, label_columns, labels_of
+from data_contracts.manifest import Manifest, by_recording, concat_labels, label_columns, labels_of
 from tasks.stage import Output, stage
 
 MAX_EVENTS = 1 << 22
@@ -88,11 +88,11 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
 
 def _sources(recordings: Manifest, windows: Windows) -> list[_Source]:
     """Every recording that something can be seen of, with its rows of the attached tables."""
-    parts = _by_recording(recordings.attached(tables.PARTS))
-    tracks = _by_recording(recordings.attached(tables.LABELS))
+    parts = by_recording(recordings.attached(tables.PARTS))
+    tracks = by_recording(recordings.attached(tables.LABELS))
     own = windows.method == "dataset"
-    ranges = _by_recording(recordings.attached(tables.WINDOWS)) if own else {}
-    window_labels = _by_recording(recordings.attached(tables.WINDOW_LABELS)) if own else {}
+    ranges = by_recording(recordings.attached(tables.WINDOWS)) if own else {}
+    window_labels = by_recording(recordings.attached(tables.WINDOW_LABELS)) if own else {}
     found = []
     for row in recordings.table.to_pylist():
         name = row["recording_id"]
@@ -110,14 +110,6 @@ def _sources(recordings: Manifest, windows: Windows) -> list[_Source]:
         labels = labels_of(window_labels[name]) if name in window_labels else None
         found.append(_Source(row, parts[name].to_pylist(), labels_of(tracks[name]), dataset_windows, labels))
     return found
-
-
-def _by_recording(table: pa.Table) -> dict[str, pa.Table]:
-    """The rows of each recording, which lie together."""
-    names = np.array(table["recording_id"].to_pylist())
-    starts = np.flatnonzero(np.concatenate([[True], names[1:] != names[:-1]])) if len(names) else np.zeros(0, int)
-    stops = [*starts[1:].tolist(), len(names)]
-    return {names[a]: table.slice(a, b - a) for a, b in zip(starts.tolist(), stops, strict=False)}
 
 
 def _encode_events(
