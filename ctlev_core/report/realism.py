@@ -65,8 +65,10 @@ def realism_sections(rows: Sequence[dict[str, Any]], distributions: Sequence[dic
 
 def _values(rows: Sequence[dict[str, Any]]) -> list[Section]:
     series: dict[str, tuple[Sequence[float], Sequence[float]]] = {}
+    # Real frames are in the comparison with each generator, and the same in all.
+    groups = {row["setting"]: row["group"] for row in reversed(rows)}
     for setting in dict.fromkeys(row["setting"] for row in rows):
-        of_set = [row for row in rows if row["setting"] == setting]
+        of_set = [row for row in rows if row["setting"] == setting and row["group"] == groups[setting]]
         series[setting] = ([row["centre"] for row in of_set], np.cumsum([row["share"] for row in of_set]).tolist())
     caption = (
         "The area between the lines is their Wasserstein-1 distance in grey levels. Real lines have steps: event "

@@ -156,7 +156,14 @@ def test_prompts_draw_from_the_names_the_dataset_knows(frames_of):
 
     def prompts(**options):
         choice = ConditionChoice(name="text", options={"template": "{class_name}", **options})
-        made = run_stage(condition_frames, recordings=recordings.ref, frames=frames.ref, condition=choice, seed=0)
+        made = run_stage(
+            condition_frames,
+            recordings=recordings.ref,
+            frames=frames.ref,
+            condition=choice,
+            encoding=EncodingChoice(name="event_histogram"),
+            seed=0,
+        )
         return set(read_manifest(made).column("prompt"))
 
     assert prompts() == {"stroll", "amble"}
@@ -192,5 +199,14 @@ def test_recordings_larger_than_what_is_held_give_the_same_frames(frames_of, mon
 
 def test_recordings_without_events_have_no_event_numbers_in_the_realism_table(frames_of):
     recordings, frames = frames_of(make_dataset(images=True), polarity=False)
-    made = read_manifest(run_stage(realism, recordings=recordings.ref, frames=frames.ref, synthetic=frames.ref))
+    made = read_manifest(
+        run_stage(
+            realism,
+            recordings=recordings.ref,
+            frames=frames.ref,
+            generated=[frames.ref],
+            reference=None,
+            names=["synthetic"],
+        )
+    )
     assert set(made.column("group")) == {"frames"}

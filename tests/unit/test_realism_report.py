@@ -36,19 +36,45 @@ DISTRIBUTIONS = [
 def test_frames_come_first_with_both_sets_their_distance_and_the_floor():
     frames, values, events = realism_sections(ROWS, DISTRIBUTIONS)
     assert isinstance(frames, Table) and isinstance(values, Curves) and isinstance(events, Table)
-    assert frames.columns == ["number", "real (6)", "synthetic (9)", "distance", "floor: real, halves"]
+    assert frames.columns == ["number", "real (6)", "synthetic (9)", "ratio", "distance", "floor: real, halves"]
     assert frames.rows == [
-        ["speckle_share", "0.25 [0.2, 0.3]", "0.05", "0.2 [0.1, 0.3]", "0.02 [0, 0.04]"],
-        ["value_js_bits", "", "", "0.01", "0.02 [0, 0.04]"],
+        ["speckle_share", "0.25 [0.2, 0.3]", "0.05", "0.2", "0.2 [0.1, 0.3]", "0.02 [0, 0.04]"],
+        ["value_js_bits", "", "", "", "0.01", "0.02 [0, 0.04]"],
     ]
-    assert events.rows == [["spread", "0.5", "0.75", "0.25", "0.1"]]
+    assert events.rows == [["spread", "0.5", "0.75", "1.5", "0.25", "0.1"]]
 
 
 def test_bold_is_what_lies_above_the_interval_of_the_floor():
     frames, _, events = realism_sections(ROWS, DISTRIBUTIONS)
     assert isinstance(frames, Table) and isinstance(events, Table)
-    assert set(frames.bold) == {(0, 3)}
+    assert set(frames.bold) == {(0, 4)}
     assert not events.bold  # the floor has no interval, so nothing is known
+
+
+def test_a_ratio_beyond_a_factor_of_ten_is_bold():
+    numbers = [(0.05, 0.6), (0.05, 0.004), (0.05, 0.4), (0.0, 0.4)]
+    rows = [
+        row("reference", setting, f"number{i}", value)
+        for i, pair in enumerate(numbers)
+        for setting, value in zip(("reference", "train"), pair, strict=True)
+    ]
+    (table,) = realism_sections(rows, [])
+    assert isinstance(table, Table) and table.title == "How alike are the recordings and the reference?"
+    assert [cells[3] for cells in table.rows] == ["12", "0.08", "8", ""] and set(table.bold) == {(0, 3), (1, 3)}
+
+
+def test_frames_of_baselines_have_tables_of_their_own_and_a_line_in_the_chart():
+    baseline = [
+        {**one, "group": "frames of gan", "setting": one["setting"].replace("synthetic", "gan")} for one in ROWS[4:]
+    ]
+    more = [
+        {**one, "group": "frames of gan", "setting": one["setting"].replace("synthetic", "gan")}
+        for one in DISTRIBUTIONS
+    ]
+    frames, values, of_gan, events = realism_sections([*ROWS, *baseline], [*DISTRIBUTIONS, *more])
+    assert isinstance(of_gan, Table) and of_gan.title == "How real do the frames of gan look?"
+    assert isinstance(values, Curves) and list(values.series) == ["real", "synthetic", "gan"]
+    assert values.series["real"] == ([26.0, 27.0], [0.75, 1.0])
 
 
 def test_large_numbers_are_written_out():
@@ -65,6 +91,6 @@ def test_the_chart_adds_the_shares_up():
 def test_what_is_missing_is_left_out():
     assert realism_sections([], []) == []
     (only,) = realism_sections([row("events", "train", "spread", 0.5)], [])
-    assert isinstance(only, Table) and only.rows == [["spread", "0.5", "", "", ""]]
+    assert isinstance(only, Table) and only.rows == [["spread", "0.5", "", "", "", ""]]
     page = render_report(title="t", lead="", verdict="", sections=realism_sections(ROWS, DISTRIBUTIONS))
     assert "How real do the synthetic frames look?" in page and "<svg" in page
