@@ -71,7 +71,7 @@ def test_frames_of_baselines_have_tables_of_their_own_and_a_line_in_the_chart():
         {**one, "group": "frames of gan", "setting": one["setting"].replace("synthetic", "gan")}
         for one in DISTRIBUTIONS
     ]
-    frames, values, of_gan, events = realism_sections([*ROWS, *baseline], [*DISTRIBUTIONS, *more])
+    _, values, of_gan, _ = realism_sections([*ROWS, *baseline], [*DISTRIBUTIONS, *more])
     assert isinstance(of_gan, Table) and of_gan.title == "How real do the frames of gan look?"
     assert isinstance(values, Curves) and list(values.series) == ["real", "synthetic", "gan"]
     assert values.series["real"] == ([26.0, 27.0], [0.75, 1.0])
