@@ -1,0 +1,231 @@
+"""Does a generator copy? How near its frames lie to training frames, against how near other real frames lie to them.
+
+Other real frames are those of other recordings: a frame beside another of the same recording resembles it without being
+copied. A generated frame is called close where it is nearer to a training frame than the closest 1 % of the other real
+frames are to theirs; of a generator that does not copy, about 1 % are. Frames are compared in features of a network, or
+as small blurred pictures (`small_pictures`), by Euclidean distance. Both see copies that are mirrored or shifted badly,
+and neither says why a frame is close: look at the closest pairs.
+
+Sources: Somepalli et al., Diffusion Art or Digital Forgery?, CVPR 2023 (nearest neighbours and their figure); Meehan,
+Chaudhuri & Dasgupta, A Non-Parametric Test to Detect Data-Copying in Generative Models, AISTATS 2020 (generated to
+training against held-out to training distances).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctlev_core.gaussian_factors import check_features, check_same_width
+
+NEAR_QUANTILE = 0.01
+NUM_REPLICATES = 1000
+_BLOCK_NUMBERS = 4_000_000
+_ROUNDING = 4 * float(np.finfo(np.float64).eps)
+"""Of squared distances, relative to the squared norms they are the difference of, for each feature added up."""
+
+
+@dataclass(frozen=True, eq=False)
+class CopyCheck:
+    """Distances of N generated and M other real frames to their nearest training frames.
+
+    Attributes:
+        distances: [N] float64, generated to nearest training frame.
+        nearest: [N] int64, that training frame; the first where several are equally near.
+        real_distances: [M] float64, other real to nearest training frame of another recording.
+        threshold: quantile `NEAR_QUANTILE` of `real_distances`.
+        close_share: share of generated frames nearer than the threshold.
+        low: lower end of the 95 % interval of `close_share`, under resampling of the frames and of the real recordings.
+        high: upper end. Both NaN where there are fewer than two real recordings, or generated frames.
+        num_duplicates: generated frames equal to a training frame in all features.
+        ratio: median of `distances` / median of `real_distances`; NaN where the latter is 0.
+    """
+
+    distances: np.ndarray
+    nearest: np.ndarray
+    real_distances: np.ndarray
+    threshold: float
+    close_share: float
+    low: float
+    high: float
+    num_duplicates: int
+    ratio: float
+
+    def closest(self, count: int) -> list[tuple[int, int, float]]:
+        """The closest (generated row, training row, distance), no training row twice, nearest first."""
+        found: list[tuple[int, int, float]] = []
+        seen: set[int] = set()
+        for row in np.argsort(self.distances, kind="stable").tolist():
+            if len(found) == count:
+                break
+            if int(self.nearest[row]) not in seen:
+                seen.add(int(self.nearest[row]))
+                found.append((row, int(self.nearest[row]), float(self.distances[row])))
+        return found
+
+
+def check_copies(
+    generated: np.ndarray,
+    training: np.ndarray,
+    real: np.ndarray,
+    *,
+    training_recordings: Sequence[str] | np.ndarray,
+    real_recordings: Sequence[str] | np.ndarray,
+    seed: int = 0,
+) -> CopyCheck:
+    """Compare generated with training frames; see the head of this file.
+
+    With fewer than 100 other real frames the threshold is hardly more than the smallest of their distances.
+
+    Args:
+        generated: [N, D] features, N >= 1.
+        training: [T, D] features of the frames the generator learnt from, T >= 1.
+        real: [M, D] features of other real frames, M >= 1; the training frames themselves may be given again.
+        training_recordings: [T] recording of each training frame.
+        real_recordings: [M] recording of each other real frame; it is not compared with training frames of the same.
+        seed: of the resampling.
+    Raises:
+        ValueError: shapes do not fit, a set is empty, a value is not finite (names the row), or all training frames are
+            of one recording and so is a real frame.
+    """
+    distances, nearest = nearest_rows(generated, training)
+    real_distances, _ = nearest_rows(real, training, row_groups=real_recordings, reference_groups=training_recordings)
+    threshold = float(np.quantile(real_distances, NEAR_QUANTILE))
+    low, high = _interval(distances, real_distances, np.asarray(real_recordings), seed)
+    median = float(np.median(real_distances))
+    return CopyCheck(
+        distances=distances,
+        nearest=nearest,
+        real_distances=real_distances,
+        threshold=threshold,
+        close_share=float((distances < threshold).mean()),
+        low=low,
+        high=high,
+        num_duplicates=int(np.count_nonzero(distances == 0)),
+        ratio=float(np.median(distances)) / median if median > 0 else float("nan"),
+    )
+
+
+def nearest_rows(
+    rows: np.ndarray,
+    references: np.ndarray,
+    *,
+    row_groups: Sequence[str] | np.ndarray | None = None,
+    reference_groups: Sequence[str] | np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest reference of each row, exactly: equal rows have distance 0.
+
+    Matrix products name the candidates, blocks of rows at a time; their distances are then computed from differences.
+
+    Args:
+        rows: [N, D].
+        references: [M, D].
+        row_groups: [N], or None; a row is not compared with references of its own group.
+        reference_groups: [M], or None.
+    Returns:
+        Euclidean distances [N] float64 and the numbers [N] int64 of the references, the first of equally near ones.
+    Raises:
+        ValueError: shapes do not fit, a set is empty, a value is not finite (names the row), or a row has no reference
+            of another group.
+    """
+    rows = check_features(rows, "first", least_rows=1).astype(np.float64)
+    references = check_features(references, "second", least_rows=1).astype(np.float64)
+    check_same_width(rows, references)
+    groups = _numbers_of_groups(row_groups, reference_groups, len(rows), len(references))
+    centred_rows, centred = rows - references[0], references - references[0]
+    norms, row_norms = (np.einsum("nd,nd->n", part, part) for part in (centred, centred_rows))
+    distances, nearest = np.empty(len(rows)), np.empty(len(rows), np.int64)
+    step = max(1, _BLOCK_NUMBERS // len(references))
+    for start in range(0, len(rows), step):
+        block = slice(start, start + step)
+        squared = row_norms[block, None] + norms
+        slack = _ROUNDING * rows.shape[1] * squared
+        squared -= 2 * (centred_rows[block] @ centred.T)
+        if groups is not None:
+            squared[groups[0][block, None] == groups[1]] = np.inf
+        # No reference that is farther than another by more than rounding can be the nearest.
+        candidates = squared - slack <= (squared + slack).min(axis=1, keepdims=True)
+        candidates &= np.isfinite(squared)
+        for row in range(len(squared)):
+            chosen = np.flatnonzero(candidates[row])
+            if len(chosen) == 0:
+                raise ValueError(f"row {start + row} has no reference of another group")
+            distances[start + row], nearest[start + row] = _nearest_of(rows[start + row], references, chosen)
+    return distances, nearest
+
+
+def small_pictures(frames: np.ndarray, size: int = 32, blur: float = 1.0) -> np.ndarray:
+    """Features of frames without a network: scaled down to `size` px along the longer side and blurred.
+
+    The mean of the absolute or squared difference of event images punishes a shift of one pixel as much as another
+    scene; small and blurred, neighbours resemble one another.
+
+    Args:
+        frames: [N, H, W, 3] uint8.
+        size: px.
+        blur: standard deviation of the Gaussian, px of the small picture; 0 = none.
+    Returns:
+        [N, D] float32 in 0 .. 1.
+    Raises:
+        ValueError: another shape or dtype, or no frame.
+    """
+    import cv2
+
+    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or not frames.size:
+        raise ValueError(f"frames must be [N, H, W, 3] uint8, not empty, got {frames.shape} {frames.dtype}")
+    height, width = frames.shape[1:3]
+    scale = min(1.0, size / max(height, width))
+    small_size = max(1, round(width * scale)), max(1, round(height * scale))
+    pictures = np.empty((len(frames), small_size[1], small_size[0], 3), np.float32)
+    for row, frame in enumerate(frames):
+        small = cv2.resize(frame.astype(np.float32) / 255, small_size, interpolation=cv2.INTER_AREA)
+        pictures[row] = cv2.GaussianBlur(small, (0, 0), blur) if blur > 0 else small
+    return pictures.reshape(len(frames), -1)
+
+
+def _numbers_of_groups(
+    row_groups: Sequence[str] | np.ndarray | None,
+    reference_groups: Sequence[str] | np.ndarray | None,
+    num_rows: int,
+    num_references: int,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    if row_groups is None and reference_groups is None:
+        return None
+    if row_groups is None or reference_groups is None:
+        raise ValueError("groups are needed of both sets, or of none")
+    first, second = np.asarray(row_groups), np.asarray(reference_groups)
+    if first.shape != (num_rows,) or second.shape != (num_references,):
+        raise ValueError(f"groups must be [{num_rows}] and [{num_references}], got {first.shape} and {second.shape}")
+    numbers = np.unique(np.concatenate([first, second]), return_inverse=True)[1]
+    return numbers[:num_rows], numbers[num_rows:]
+
+
+def _nearest_of(row: np.ndarray, references: np.ndarray, chosen: np.ndarray) -> tuple[float, int]:
+    """Distance and number of the nearest of some references."""
+    best, number = np.inf, -1
+    step = max(1, _BLOCK_NUMBERS // len(row))
+    for start in range(0, len(chosen), step):
+        part = chosen[start : start + step]
+        distances = np.linalg.norm(references[part] - row, axis=1)
+        first = int(np.argmin(distances))
+        if distances[first] < best:
+            best, number = float(distances[first]), int(part[first])
+    return best, number
+
+
+def _interval(distances: np.ndarray, real: np.ndarray, recordings: np.ndarray, seed: int) -> tuple[float, float]:
+    """Percentiles of the share of close frames over replicates of both sets; whole recordings of the real one."""
+    _, group = np.unique(recordings, return_inverse=True)
+    if group.max(initial=0) == 0 or len(distances) < 2:
+        return float("nan"), float("nan")
+    members = [np.flatnonzero(group == number) for number in range(group.max() + 1)]
+    rng = np.random.default_rng(seed)
+    shares = np.empty(NUM_REPLICATES)
+    for replicate in range(NUM_REPLICATES):
+        drawn = np.concatenate([members[number] for number in rng.integers(0, len(members), len(members))])
+        threshold = np.quantile(real[drawn], NEAR_QUANTILE)
+        shares[replicate] = (rng.choice(distances, len(distances)) < threshold).mean()
+    low, high = np.quantile(shares, [0.025, 0.975])
+    return float(low), float(high)
