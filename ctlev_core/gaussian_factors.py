@@ -17,8 +17,8 @@ import numpy as np
 
 from data_contracts.errors import DataError
 
-BLOCK_ROWS = 1024
-"""So many rows of 2,048 features stay in the last cache."""
+BLOCK_NUMBERS = 2**21
+"""So many stay in the last cache."""
 LEAST_STREAM_ROWS = 256
 
 
@@ -111,10 +111,11 @@ def mean_and_covariance(features: np.ndarray, origin: np.ndarray) -> tuple[np.nd
     from scipy.linalg import get_blas_funcs
 
     width = features.shape[1]
-    block = np.empty((min(len(features), BLOCK_ROWS), width))
+    block = np.empty((min(len(features), max(256, BLOCK_NUMBERS // width)), width))
     pieces = [features[start : start + len(block)] for start in range(0, len(features), len(block))]
     mean, covariance = np.zeros(width), np.zeros((width, width), order="F")
-    (syrk,) = get_blas_funcs(("syrk",), (covariance,))
+    # Both add to the lower triangle of the matrix in place.
+    syrk, syr = get_blas_funcs(("syrk", "syr"), (covariance,))
     for rows in pieces:
         mean += np.subtract(rows, origin, out=block[: len(rows)]).sum(axis=0)
     mean /= len(features)
@@ -123,11 +124,11 @@ def mean_and_covariance(features: np.ndarray, origin: np.ndarray) -> tuple[np.nd
         centred = np.subtract(rows, origin, out=block[: len(rows)])
         centred -= mean
         left_over += centred.sum(axis=0)
-        # beta and overwrite_c: adds to the matrix in place.
         covariance = syrk(1.0, centred.T, beta=1.0, c=covariance, overwrite_c=1, lower=1)
     left_over /= len(features)
-    covariance -= len(features) * np.outer(left_over, left_over)
-    return mean + left_over, covariance / (len(features) - 1)
+    covariance = syr(-len(features), left_over, lower=1, a=covariance, overwrite_a=1)
+    covariance /= len(features) - 1
+    return mean + left_over, covariance
 
 
 def triangular(rows: np.ndarray) -> np.ndarray:

@@ -103,11 +103,23 @@ def test_nearly_identical_sets_lose_only_what_their_own_rounding_does():
 
 
 def test_the_fast_route_is_left_where_its_own_estimate_says_so():
-    """A covariance with a condition number of 1e20: both routes are asked, and the answers are the same."""
-    a, b = normal(31, 60) * np.logspace(0, -10, D), normal(32, 60) * np.logspace(0, -10, D)
-    assert frechet_distance(a, b) == frechet_distance(a, b, tolerance=0)
+    """Sets so near one another that the traces cancel: both routes are asked, and the answers are the same."""
+    a = normal(31, 60)
+    for near in (a * (1 + 1e-5), a[::-1]):
+        assert frechet_distance(a, near) == frechet_distance(a, near, tolerance=0)
     easy = normal(33, 60), normal(34, 60)
     assert frechet_distance(*easy) != frechet_distance(*easy, tolerance=0)
+
+
+@pytest.mark.parametrize("smallest", [1e-2, 1e-5, 1e-8, 1e-12])
+def test_no_condition_number_gets_past_the_estimates(smallest):
+    """Deviations from 1 down to `smallest`, each set in directions of its own; Cholesky alone would lose digits."""
+    rotation = np.linalg.qr(np.random.default_rng(35).normal(size=(D, D)))[0]
+    deviations = np.logspace(0, np.log10(smallest), D)
+    random = np.random.default_rng(36)
+    a, b = (random.normal(size=(60, D)) * deviations @ turn for turn in (np.eye(D), rotation))
+    exact = exact_distance(a, b)
+    assert abs(frechet_distance(a, b) - exact) <= 1e-12 * exact
 
 
 @settings(max_examples=30, deadline=None)
