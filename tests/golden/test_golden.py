@@ -68,12 +68,31 @@ def skeletons(module):
     return [module.render(fixed_labels(), (64, 64), options, [1, 2, 3]).images for options in choices]
 
 
+def class_scores(module):
+    """Rows right or wrong; of two equal maxima the first column wins."""
+    probability = np.array([[4, 2, 2], [1, 3, 4], [3, 3, 2], [0, 8, 0]]) / 8
+    predicted = {"probability": probability, "classes": np.array(["walk", "run", "jump"])}
+    target = Labels(("walk", "run", "walk", "traffic_light"), np.arange(4))
+    return [module.compute_rows(predicted, target, module.Options()).astype(np.uint8)]
+
+
+def correct_joints(module):
+    """Joints moved by 3-4-5 triangles and their multiples: ties at thresholds of 5 px are exact."""
+    labels = fixed_labels()
+    moved = labels.joints2d + np.arange(13)[:, None] % 3 * np.array([3, 4], np.float32)
+    options = module.Options(normaliser="px", threshold=5)
+    ((correct, count),) = module.compute_sums({"joints2d": moved}, labels, options).values()
+    return [correct.astype(np.int64), count.astype(np.int64)]
+
+
 CASES = {
     ("encodings", "event_histogram"): lambda module, _: histogram_counts(module),
     ("formats", "evt2"): written_bytes,
     ("formats", "evt3"): written_bytes,
     ("conditions", "skeleton"): lambda module, _: skeletons(module),
     ("conditions", "text"): lambda module, _: prompts(module),
+    ("metrics", "classification"): lambda module, _: class_scores(module),
+    ("metrics", "pck2d"): lambda module, _: correct_joints(module),
 }
 
 
