@@ -4,6 +4,9 @@
 <home>/work/<key>/                resumable state of a stage that is running or was interrupted
 <home>/tmp/<key>/                 an artefact being put together; renamed into place when complete
 <home>/locks/<key>                held (flock) while a process makes the artefact; freed by the kernel on death
+<home>/locks/store                shared by every process that uses the store, until it ends; exclusive while pruning
+<home>/damaged/<stage>/           artefacts that were set aside; nothing here deletes them
+<home>/pruned/                    on its way out
 """
 
 from __future__ import annotations
@@ -12,10 +15,16 @@ import contextlib
 import fcntl
 import json
 import os
+import re
 import shutil
+import stat
+import threading
+import time
+import uuid
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from data_contracts.errors import DataError
 from data_contracts.manifest import RUN_FILE, ManifestRef, file_digest, read_manifest
@@ -24,6 +33,29 @@ from data_contracts.manifest import RUN_FILE, ManifestRef, file_digest, read_man
 def home_folder() -> Path:
     """Folder of all state: `CTLEV_HOME`, by default `.ctlev` in the working directory."""
     return Path(os.environ.get("CTLEV_HOME", ".ctlev")).absolute()
+
+
+@dataclass(frozen=True)
+class Stored:
+    """One folder of the store that could be pruned.
+
+    Attributes:
+        kind: `artefact`, `work` or `tmp`.
+        name: stage/key of an artefact, else the key.
+        folder: where it is.
+        size_bytes: of all its files.
+        last_used_s: when a run last found it or wrote to it, in seconds since the epoch.
+    """
+
+    kind: str
+    name: str
+    folder: Path
+    size_bytes: int
+    last_used_s: float
+
+
+_used: dict[Path, IO[bytes]] = {}
+_used_guard = threading.Lock()
 
 
 class Store:
@@ -46,24 +78,27 @@ class Store:
 
     def find(self, stage: str, key: str) -> ManifestRef | None:
         """The finished artefact, or None. A damaged one is moved aside, so that it is made anew."""
+        self.use()
         folder = self.folder(stage, key)
         if not folder.exists():
             return None
         try:
             record = json.loads((folder / RUN_FILE).read_text())
-            ref = ManifestRef(key=key, path=folder, digest=record["digest"])
-            return read_manifest(ref).ref
+            ref = read_manifest(ManifestRef(key=key, path=folder, digest=record["digest"])).ref
+            _touch(folder)
+            return ref
         except (DataError, OSError, KeyError, ValueError):
             self.set_aside(folder)
             return None
 
-    def set_aside(self, folder: Path) -> None:
-        """Move a damaged or outdated artefact out of the way without deleting it."""
+    def set_aside(self, folder: Path) -> Path:
+        """Move a damaged or outdated artefact out of the way without deleting it; returns its new place."""
         target = self.home / "damaged" / folder.parent.name
         target.mkdir(parents=True, exist_ok=True)
         number = sum(1 for _ in target.glob(f"{folder.name}.*"))
         with contextlib.suppress(FileNotFoundError):
             folder.rename(target / f"{folder.name}.{number}")
+        return target / f"{folder.name}.{number}"
 
     def upstream_digests(self, stage: str, key: str) -> dict[str, str]:
         """Digests of the manifests a finished artefact was made from."""
@@ -74,8 +109,44 @@ class Store:
         """Only one process makes an artefact; a second waits here and then finds it finished."""
         path = self.home / "locks" / key
         path.parent.mkdir(parents=True, exist_ok=True)
+        self.use()
         with path.open("w") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    def use(self) -> None:
+        """Nothing is pruned from now until this process ends, for it holds references to what it finds.
+
+        Waits while another process prunes, which takes as long as renaming does. A store that we may not write to is
+        not held: its owner should not prune while others read.
+        """
+        with _used_guard:
+            if self.home in _used or not self.home.is_dir():
+                return
+            path = self.home / "locks" / "store"
+            try:
+                path.parent.mkdir(exist_ok=True)
+                file = path.open("ab")
+            except OSError:
+                return
+            fcntl.flock(file, fcntl.LOCK_SH)
+            _used[self.home] = file
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Inside this block no other process uses the store; one that starts meanwhile waits.
+
+        Raises:
+            StoreInUseError: a process uses it.
+            OSError: the home cannot be written.
+        """
+        path = self.home / "locks" / "store"
+        path.parent.mkdir(exist_ok=True)
+        with path.open("ab") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise StoreInUseError(f"{self.home}: a run uses this store; prune when it has ended") from None
             yield
 
     def publish(self, stage: str, key: str, temporary: Path, record: dict[str, Any]) -> ManifestRef:
@@ -89,6 +160,83 @@ class Store:
         _sync(folder.parent)
         shutil.rmtree(self.work_folder(key), ignore_errors=True)
         return read_manifest(ManifestRef(key=key, path=folder, digest=record["digest"])).ref
+
+    def artefacts(self) -> list[Stored]:
+        """All finished artefacts, by stage and key. Links are not followed."""
+        stages = _folders(self.home / "artefacts")
+        return [
+            _stored("artefact", f"{stage.name}/{folder.name}", folder) for stage in stages for folder in _folders(stage)
+        ]
+
+    def check(self, folder: Path) -> None:
+        """Hash every file of an artefact again.
+
+        Raises:
+            DataError: it is damaged: a file is missing or has changed, or is a link to something outside the artefact.
+            OSError: it cannot be read.
+        """
+        try:
+            record = json.loads((folder / RUN_FILE).read_text())
+            ref = ManifestRef(key=folder.name, path=folder, digest=record["digest"])
+        except (FileNotFoundError, IsADirectoryError, KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{folder / RUN_FILE}: is not a provenance record: {error!r}") from error
+        for path in (path for path in folder.rglob("*") if path.is_symlink()):
+            if not path.resolve().is_relative_to(folder.resolve()):
+                raise DataError(f"{path}: is a link to something outside the artefact")
+        read_manifest(ref, full=True)
+
+    def unneeded(self, keep_days: float) -> tuple[list[Stored], list[Stored]]:
+        """What can go, and what stays, if everything that was used within `keep_days` stays.
+
+        An artefact stays if it was used, or if the provenance record of one that stays names its key: what a report was
+        made from stays as long as the report. Half-made artefacts (`tmp`) can always go, for a rerun begins them anew;
+        the resumable state of an interrupted stage (`work`) is kept as long as an artefact.
+
+        Raises:
+            DataError: a provenance record cannot be read, so that what it refers to is not known.
+        """
+        oldest_s = time.time() - keep_days * 86_400
+        stored = self.artefacts()
+        referred = {item.folder: _keys_in(item.folder / RUN_FILE) for item in stored}
+        waiting = [item for item in stored if item.last_used_s >= oldest_s]
+        kept = {item.folder for item in waiting}
+        while waiting:
+            named = referred[waiting.pop().folder]
+            new = [item for item in stored if item.folder.name in named and item.folder not in kept]
+            kept.update(item.folder for item in new)
+            waiting += new
+        work = [_stored("work", folder.name, folder) for folder in _folders(self.home / "work")]
+        kept.update(item.folder for item in work if item.last_used_s >= oldest_s)
+        half_made = [_stored("tmp", folder.name, folder) for folder in _folders(self.home / "tmp")]
+        found = [*stored, *work, *half_made]
+        return [item for item in found if item.folder not in kept], [item for item in found if item.folder in kept]
+
+    def prune(self, keep_days: float) -> list[Stored]:
+        """Remove what `unneeded` says can go, and return it; what an interrupted pruning left goes too.
+
+        Everything is renamed out of the store while no run can start, and deleted after. A link is deleted, never what
+        it points to.
+
+        Raises:
+            StoreInUseError: a run uses the store; nothing was removed.
+            DataError: as `unneeded`; nothing was removed.
+            OSError: the home cannot be written.
+        """
+        pruned = self.home / "pruned"
+        with self.alone():
+            if pruned.is_symlink():
+                raise DataError(f"{pruned}: is a link; nothing is moved out of the home")
+            pruned.mkdir(exist_ok=True)
+            leaving, _ = self.unneeded(keep_days)
+            for item in leaving:
+                item.folder.rename(pruned / uuid.uuid4().hex)
+        for folder in _folders(pruned):
+            shutil.rmtree(folder)
+        return leaving
+
+
+class StoreInUseError(RuntimeError):
+    """The store cannot be pruned because a run uses it."""
 
 
 class RawFileDigests:
@@ -108,7 +256,11 @@ class RawFileDigests:
         """SHA-256 of the file's content."""
         status = path.stat()
         identity = [status.st_size, status.st_mtime_ns, status.st_ino]
-        name = str(path.resolve())
+        resolved = path.resolve()
+        name = str(resolved)
+        artefacts = self.path.parent.resolve() / "artefacts"
+        if resolved.is_relative_to(artefacts):  # a prior that was trained here, say
+            _touch(artefacts.joinpath(*resolved.relative_to(artefacts).parts[:2]))
         entry = self.known.get(name)
         if entry is None or entry[:3] != identity:
             entry = [*identity, file_digest(path)]
@@ -125,6 +277,47 @@ class RawFileDigests:
         temporary.write_text(json.dumps(self.known))
         temporary.replace(self.path)
         self.changed = False
+
+
+def _touch(folder: Path) -> None:
+    """Note that an artefact is used, as the modification time of its provenance record.
+
+    A time stamp needs no file or lock of its own, moves with the artefact, and no digest covers it.
+    """
+    with contextlib.suppress(OSError):  # not ours to write; reading goes on
+        os.utime(folder / RUN_FILE)
+
+
+def _folders(folder: Path) -> list[Path]:
+    """The folders in a folder, sorted; links are not followed, and without the folder there are none."""
+    if folder.is_symlink() or not folder.is_dir():
+        return []
+    with os.scandir(folder) as entries:
+        return sorted(Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False))
+
+
+def _stored(kind: str, name: str, folder: Path) -> Stored:
+    """Measure a folder, without following links."""
+    found: dict[Path, os.stat_result] = {}
+    for path in [folder, *folder.rglob("*")]:  # which does not enter links to folders
+        with contextlib.suppress(FileNotFoundError):  # a run moves on meanwhile
+            found[path] = path.lstat()
+    size_bytes = sum(status.st_size for status in found.values() if not stat.S_ISDIR(status.st_mode))
+    record = found.get(folder / RUN_FILE)
+    last_used_s = (
+        record.st_mtime if record else max((status.st_mtime for status in found.values()), default=time.time())
+    )
+    return Stored(kind, name, folder, size_bytes, last_used_s)
+
+
+def _keys_in(record: Path) -> set[str]:
+    """Whatever looks like a key in a provenance record: its inputs, and artefacts whose path an option names."""
+    try:
+        text = record.read_text()
+        json.loads(text)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{record}: cannot be read, so its inputs are unknown; run flows/verify.py first") from error
+    return set(re.findall(r"(?<![0-9a-f])[0-9a-f]{32}(?![0-9a-f])", text))
 
 
 def _sync(path: Path) -> None:
