@@ -17,8 +17,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 
 from ctlev_core.gaussian_factors import check_features, check_same_width
+from data_contracts.tables import Column, TableSchema
+
+CLOSEST_PAIRS = TableSchema(
+    "closest_pairs",
+    1,
+    None,
+    (
+        Column("setting", pa.string(), "which generated frames"),
+        Column("features", pa.string(), "what frames were compared in"),
+        Column("generated_id", pa.string(), "sample_id of a generated frame"),
+        Column("training_id", pa.string(), "sample_id of the training frame nearest to it"),
+        Column("generated_row", pa.int64(), "row of the generated frame", minimum=0),
+        Column("training_row", pa.int64(), "row of the training frame", minimum=0),
+        Column("distance", pa.float64(), "Euclidean, in the features", minimum=0),
+        Column("threshold", pa.float64(), "the distance that 1 % of other real frames lie below", minimum=0),
+    ),
+)
 
 NEAR_QUANTILE = 0.01
 NUM_REPLICATES = 1000

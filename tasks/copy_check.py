@@ -1,0 +1,105 @@
+"""Do generated frames copy training frames? Distances to the nearest, and the closest pairs to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core import plugins
+from ctlev_core.copy_check import CLOSEST_PAIRS, CopyCheck, check_copies, small_pictures
+from ctlev_core.windows import spread
+from data_contracts import tables
+from data_contracts.config import DownstreamChoice
+from data_contracts.errors import DataError
+from data_contracts.manifest import Manifest
+from tasks.stage import Output, stage
+
+MAX_OTHER_FRAMES = 5_000
+"""Of more other real, or generated, frames so many, evenly spread. Training frames are never left out: any of them may
+have been copied."""
+NUM_PAIRS = 10
+PICTURES = "small pictures"
+
+
+@stage(version=1, schema=tables.SCORES)
+def copy_check(
+    out: Output,
+    frames: Manifest,
+    generated: Manifest,
+    extractor: Manifest | None,
+    *,
+    downstream: DownstreamChoice | None,
+    setting: str,
+) -> pa.Table:
+    """Rows of the task `copies`, one group for small pictures and, with a feature extractor, one for its features.
+
+    Other real frames are the training frames against those of other recordings; where all training frames are of one
+    recording, the test frames. The closest pairs lie beside the table.
+    """
+    learnt, made = frames.rows_where(split="train"), generated.rows_where(split="train")
+    made = made[spread(len(made), MAX_OTHER_FRAMES)]
+    recordings = np.array(frames.column("recording_id"))
+    other = learnt if len(set(recordings[learnt])) > 1 else frames.rows_where(split="test")
+    other = other[spread(len(other), MAX_OTHER_FRAMES)]
+    if not len(learnt) or not len(made) or not len(other):
+        raise DataError(
+            f"copies: needs training, other real and generated frames, got {len(learnt)}, {len(other)} and {len(made)}"
+        )
+    ways: dict[str, Callable[[np.ndarray], np.ndarray]] = {PICTURES: small_pictures}
+    if extractor is not None and downstream is not None:
+        plugin, folder = plugins.load_options(downstream), extractor.ref.path / "model"
+        ways[f"features of {plugin.name}"] = lambda images: plugin.module.features(folder, images)
+    scores: list[dict[str, Any]] = []
+    pairs: list[dict[str, Any]] = []
+    for name, features_of in ways.items():
+        found = check_copies(
+            features_of(np.asarray(generated.array("frames")[made])),
+            features_of(np.asarray(frames.array("frames")[learnt])),
+            features_of(np.asarray(frames.array("frames")[other])),
+            training_recordings=recordings[learnt],
+            real_recordings=recordings[other],
+        )
+        digest = extractor.ref.digest if extractor is not None and name != PICTURES else ""
+        same = {"setting": setting, "group": name, "num_train": len(learnt), "model_digest": digest}
+        scores += _scores(found, same | {"data_digest": generated.ref.digest})
+        for of_made, of_learnt, distance in found.closest(NUM_PAIRS):
+            rows = int(made[of_made]), int(learnt[of_learnt])
+            pairs.append(
+                {
+                    "setting": setting,
+                    "features": name,
+                    "generated_id": generated.table["sample_id"][rows[0]].as_py(),
+                    "training_id": frames.table["sample_id"][rows[1]].as_py(),
+                    "generated_row": rows[0],
+                    "training_row": rows[1],
+                    "distance": distance,
+                    "threshold": found.threshold,
+                }
+            )
+    out.write_table(pa.Table.from_pylist(pairs, CLOSEST_PAIRS.arrow()), CLOSEST_PAIRS)
+    return pa.Table.from_pylist(scores, schema=tables.SCORES.arrow())
+
+
+def _scores(found: CopyCheck, same: dict[str, Any]) -> list[dict[str, Any]]:
+    values = {
+        "close_share": (found.close_share, found.low, found.high),
+        "duplicates": (float(found.num_duplicates), np.nan, np.nan),
+        "nearest_distance_ratio": (found.ratio, np.nan, np.nan),
+    }
+    return [
+        {
+            "task": "copies",
+            "seed": 0,
+            "metric": metric,
+            "value": value,
+            "low": None if np.isnan(low) else low,
+            "high": None if np.isnan(high) else high,
+            "num_samples": len(found.distances),
+            **same,
+        }
+        for metric, (value, low, high) in values.items()
+        if not np.isnan(value)
+    ]

@@ -1,0 +1,212 @@
+"""Generated frames as event streams in files, for users of events rather than images."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from tqdm import tqdm
+
+from ctlev_core import event_files, plugins
+from ctlev_core.event_streams import TimeModel, fit_times, sample_streams
+from ctlev_core.image_counts import CountModel, estimate_counts, fit_counts
+from ctlev_core.windows import spread
+from data_contracts import tables
+from data_contracts.config import EncodingChoice
+from data_contracts.errors import DataError
+from data_contracts.event_export import EVENT_STREAMS, EventExport
+from data_contracts.events import Events
+from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef
+from tasks.stage import Output, stage
+
+MAX_WINDOWS = 64
+"""Real windows that times are learnt from, evenly spread over those of the training split."""
+BLOCK_ROWS = 64
+READ_EVENTS = 1 << 20
+_COUNT_STREAM, _TIME_STREAM = 1, 2
+_ENCODING = "event_histogram"
+
+
+@stage(version=1, schema=EVENT_STREAMS)
+def export_events(
+    out: Output,
+    generated: Manifest,
+    frames: Manifest,
+    recordings: Manifest,
+    *,
+    encoding: EncodingChoice,
+    export: EventExport,
+) -> pa.Table:
+    """An event stream for every generated frame, under `events/`; the table says where each lies, with its label.
+
+    Counts and times are drawn as in the training windows of `frames`, which were cut from `recordings`; each row from
+    its own seed.
+    """
+    plugin, writer = plugins.load_options(encoding), plugins.load("formats", export.format)
+    if plugin.name != _ENCODING:
+        raise DataError(f"events can be drawn from counts, encoding {_ENCODING!r}, alone; got {plugin.name!r}")
+    if not hasattr(writer, "write"):
+        raise DataError(f"format {export.format!r} is read, not written; choose parquet, evt2 or evt3, for example")
+    counts, times = _learn(frames, recordings, plugin)
+    folder = out.folder / "events"
+    folder.mkdir()
+    rows: list[dict[str, Any]] = []
+    made = _streams(generated, counts, times, export, rows)
+    streams = iter(tqdm(made, "export events", total=len(generated), unit="stream", leave=False, disable=None))
+    if export.one_file:
+        _write_together(folder / f"events{_suffix(export.format, writer)}", streams, rows, export, writer)
+    else:
+        for number, events in enumerate(streams):
+            path = folder / f"{number:06d}{_suffix(export.format, writer)}"
+            _write(path, [events], export.format, writer)
+            rows[number] |= _place(path, events, 0)
+    table = pa.Table.from_pylist(rows)
+    for name in ("sample_id", "class_name", "joint_set", *LABEL_COLUMNS.values()):
+        table = table.append_column(name, generated.table[name])
+    return table.select([column.name for column in EVENT_STREAMS.columns]).cast(EVENT_STREAMS.arrow())
+
+
+def publish_events(ref: ManifestRef, home: Path, name: str) -> str:
+    """Put the newest events of an experiment where a person looks for them, and say where that is."""
+    folder = home / "events" / name
+    temporary = folder.with_name(f".{name}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    shutil.copytree(ref.path / "events", temporary / "events")
+    shutil.copyfile(ref.path / "manifest.parquet", temporary / "event_streams.parquet")
+    shutil.rmtree(folder, ignore_errors=True)
+    temporary.rename(folder)
+    return f"events: {ref.rows} streams in {folder}, listed in {folder / 'event_streams.parquet'}"
+
+
+def _learn(frames: Manifest, recordings: Manifest, plugin: plugins.Plugin) -> tuple[CountModel, TimeModel]:
+    """What the training windows say about counts and about times."""
+    rows = frames.rows_where(split="train")
+    num_events = frames.table["num_events"].to_numpy()
+    if not num_events[rows].all():
+        raise DataError(
+            f"{frames.ref.path}: row {rows[int(np.argmin(num_events[rows]))]} comes from a finished event image; "
+            "events can be drawn only where the real windows have events"
+        )
+    histograms = frames.array("histograms")
+    counts = fit_counts(np.asarray(histograms[rows[spread(len(rows), 4 * MAX_WINDOWS)]]), plugin.options)
+    chosen = frames.table.take(pa.array(rows[spread(len(rows), MAX_WINDOWS)]))
+    return counts, fit_times(_windows(chosen.to_pylist(), recordings))
+
+
+def _windows(rows: list[dict[str, Any]], recordings: Manifest) -> Iterator[Events]:
+    """The events of each row; at its ends also those others that have the same time stamp."""
+    files = dict(zip(recordings.column("recording_id"), recordings.column("events_file"), strict=True))
+    parts = recordings.attached(tables.PARTS).to_pylist()
+    for row in rows:
+        path = recordings.path(files[row["recording_id"]])
+        start_us, end_us = row["t_start_us"], row["t_end_us"]
+        found = []
+        for part in parts:
+            if part["recording_id"] == row["recording_id"] and part["split"] == row["split"]:
+                found += _events_between(path, part["event_start"], part["event_stop"], start_us, end_us)
+        if found:
+            yield _joined(found)
+
+
+def _events_between(path: Path, start: int, stop: int, start_us: int, end_us: int) -> list[Events]:
+    """Events of a stretch of a file from one time to another, both included, in pieces."""
+    # By halves, so that a window of a long recording costs a few reads of single events.
+    low, high = start, stop
+    while low < high:
+        middle = (low + high) // 2
+        if event_files.read_events_range(path, middle, middle + 1).t[0] < start_us:
+            low = middle + 1
+        else:
+            high = middle
+    found = []
+    while low < stop:
+        piece = event_files.read_events_range(path, low, min(low + READ_EVENTS, stop))
+        last = int(np.searchsorted(piece.t, end_us, "right"))
+        found.append(piece.slice(0, last))
+        if last < len(piece):
+            break
+        low += len(piece)
+    return found
+
+
+def _streams(
+    generated: Manifest, counts: CountModel, times: TimeModel, export: EventExport, rows: list[dict[str, Any]]
+) -> Iterator[Events]:
+    """The stream of each row, from 0 us; what is known of it is appended to `rows` before it comes."""
+    frames, seeds = generated.array("frames"), generated.column("seed")
+    for start in range(0, len(generated), BLOCK_ROWS):
+        block = range(start, min(start + BLOCK_ROWS, len(generated)))
+        made = estimate_counts(
+            np.asarray(frames[start : block.stop]), counts, seeds=[_seed(seeds[row], _COUNT_STREAM) for row in block]
+        )
+        time_seeds = [_seed(seeds[row], _TIME_STREAM) for row in block]
+        streams = sample_streams(made.counts, times, seeds=time_seeds, spread=export.spread)
+        for number, events in enumerate(streams):
+            rows.append(
+                {
+                    "has_polarity": made.counts.shape[1] == 2,
+                    "is_exact": bool(made.is_exact[number]),
+                    "error_levels": float(made.error_levels[number]),
+                    "seed": seeds[start + number],
+                }
+            )
+            yield events
+
+
+def _seed(seed: int, stream: int) -> int:
+    return int(np.random.SeedSequence([seed, stream]).generate_state(1)[0])
+
+
+def _write_together(
+    path: Path, streams: Iterator[Events], rows: list[dict[str, Any]], export: EventExport, writer: ModuleType
+) -> None:
+    """All streams in one file, one after another on one clock."""
+
+    def shifted() -> Iterator[Events]:
+        start_us, event_start = 0, 0
+        for number, events in enumerate(streams):
+            moved = replace(events, t=events.t + start_us)
+            rows[number] |= _place(path, moved, event_start) | {"t_start_us": start_us}
+            rows[number]["t_end_us"] = max(rows[number]["t_end_us"], start_us)
+            start_us = rows[number]["t_end_us"] + export.gap_us
+            event_start += len(events)
+            yield moved
+
+    _write(path, shifted(), export.format, writer)
+
+
+def _place(path: Path, events: Events, event_start: int) -> dict[str, Any]:
+    last_us = int(events.t[-1]) if len(events) else 0
+    file = f"{path.parent.name}/{path.name}"
+    return {
+        "file": file,
+        "t_start_us": 0,
+        "t_end_us": last_us,
+        "event_start": event_start,
+        "num_events": len(events),
+    }
+
+
+def _suffix(name: str, writer: ModuleType) -> str:
+    """The format's own suffix: where several formats share one, that with its name."""
+    own = f".{name}"
+    return own if own in writer.SUFFIXES else writer.SUFFIXES[0]
+
+
+def _write(path: Path, pieces: Iterable[Events], name: str, writer: ModuleType) -> None:
+    """Parquet piece by piece; other formats write a recording as a whole, which must fit into memory."""
+    if name == "parquet":
+        event_files.write_event_chunks_parquet(path, pieces)
+        return
+    writer.write(path, _joined(list(pieces)))
+
+
+def _joined(pieces: list[Events]) -> Events:
+    t, x, y, p = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "x", "y", "p"))
+    return Events(t, x, y, p, pieces[0].sensor_size)
