@@ -79,6 +79,7 @@ def class_scores(module):
 def correct_joints(module):
     """Joints moved by 3-4-5 triangles and their multiples: ties at thresholds of 5 px are exact."""
     labels = fixed_labels()
+    assert labels.joints2d is not None
     moved = labels.joints2d + np.arange(13)[:, None] % 3 * np.array([3, 4], np.float32)
     options = module.Options(normaliser="px", threshold=5)
     ((correct, count),) = module.compute_sums({"joints2d": moved}, labels, options).values()
