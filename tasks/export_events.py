@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from ctlev_core import event_files, plugins
 from ctlev_core.event_streams import TimeModel, fit_times, sample_streams
+from ctlev_core.format_files import event_pieces
 from ctlev_core.image_counts import CountModel, estimate_counts, fit_counts
 from ctlev_core.windows import spread
 from data_contracts import tables
@@ -111,7 +112,7 @@ def _windows(rows: list[dict[str, Any]], recordings: Manifest) -> Iterator[Event
             if part["recording_id"] == row["recording_id"] and part["split"] == row["split"]:
                 found += _events_between(path, part["event_start"], part["event_stop"], start_us, end_us)
         if found:
-            yield _joined(found)
+            yield event_pieces.concatenate(found)
 
 
 def _events_between(path: Path, start: int, stop: int, start_us: int, end_us: int) -> list[Events]:
@@ -204,9 +205,4 @@ def _write(path: Path, pieces: Iterable[Events], name: str, writer: ModuleType) 
     if name == "parquet":
         event_files.write_event_chunks_parquet(path, pieces)
         return
-    writer.write(path, _joined(list(pieces)))
-
-
-def _joined(pieces: list[Events]) -> Events:
-    t, x, y, p = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "x", "y", "p"))
-    return Events(t, x, y, p, pieces[0].sensor_size)
+    writer.write(path, event_pieces.concatenate(pieces))
