@@ -6,8 +6,8 @@ saturated pixels. Both are found again from what real windows say (`fit_counts`)
 * Full scale. The values of a real image lie on the levels floor(255 k / scale), k = 0, 1, 2, ..., which few scales
   explain. Of those the one is taken under which the counts are most probable, given how often real windows of such a
   scale have each count. The values of a generated image scatter around levels: of a grid of scales, each blurred by
-  decoders of several widths, the one is taken under which the values are most probable, and for each value the most
-  probable count. So faint values become events only where levels lie that close.
+  decoders of several widths, the one is taken under which the values and the number of events are most probable, and
+  for each value the most probable count. So faint values become events only where levels lie that close.
 * Saturated pixels. Their counts are drawn from the real ones, as multiples of the full scale. With `three_sigma` the
   full scale follows from all counts, so they are then changed, event by event, until it does.
 
@@ -33,12 +33,14 @@ if TYPE_CHECKING:
 
 MAX_WINDOWS = 256
 """Real windows learnt from, evenly spread."""
-MAX_SCALES = 512
+MAX_SCALES = 256
 BLURS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0)
 """Standard deviations of the decoders tried, grey levels."""
 FAINT = 26
 """Values below do not decide about the scale: what a decoder makes of the many black pixels would outweigh the rest."""
 NUM_QUANTILES = 257
+LEAST_DEVIATION = 0.1
+"""Of the logarithm of the number of events: where all real windows have equally many, images may still have others."""
 BANDWIDTH = 0.1
 """Of the smoothing over full scales, natural logarithm: real windows within 10 % lend one another their counts."""
 _FLOOR = 1e-9
@@ -61,6 +63,8 @@ class CountModel:
         grid: [G] float64, ascending: full scales that generated images may have.
         log_probabilities: [G, B, 256] float64, of each value at each of these scales, after each of B blurs, among the
             values that are not faint; 0 for those that are.
+        counts: [G, B, 256] float32, the most probable count of each value there, that of saturated cells on average.
+        log_num_events: mean and standard deviation of the logarithm of the number of events of real windows.
         excess: [Q] float64, ascending: quantiles of count / full scale of saturated cells, at least 1.
     """
 
@@ -69,6 +73,8 @@ class CountModel:
     count_shares: np.ndarray
     grid: np.ndarray
     log_probabilities: np.ndarray
+    counts: np.ndarray
+    log_num_events: tuple[float, float]
     excess: np.ndarray
 
 
@@ -119,7 +125,16 @@ def fit_counts(histograms: np.ndarray, options: Options) -> CountModel:
     blurred = blurred[:, :, FAINT:] + _FLOOR
     log_probabilities = np.zeros((*blurred.shape[:2], 256))
     log_probabilities[:, :, FAINT:] = np.log(blurred / blurred.sum(axis=2, keepdims=True))
-    return CountModel(options, scales, shares, grid, log_probabilities, excess)
+    num_events = np.log(counts.sum(axis=(1, 2, 3), dtype=np.float64))
+    log_num_events = float(num_events.mean()), max(float(num_events.std()), LEAST_DEVIATION)
+    blurs = [_blur(width) for width in BLURS]
+    tables = np.empty(log_probabilities.shape, np.float32)
+    for number, scale in enumerate(grid):
+        of_scale = _shares_at(scale, scales, shares)
+        for blur, width in enumerate(BLURS):
+            table = _most_probable_counts(scale, of_scale, width, blurs[blur])
+            tables[number, blur] = np.where(table < 0, max(scale * excess.mean(), 1.0), table)
+    return CountModel(options, scales, shares, grid, log_probabilities, tables, log_num_events, excess)
 
 
 def estimate_counts(frames: np.ndarray, model: CountModel, *, seeds: Sequence[int]) -> CountEstimate:
@@ -220,10 +235,13 @@ def _estimate(values: np.ndarray, frequencies: np.ndarray, model: CountModel, rn
         counts, fits = _counts_by_table(values, _nearest_counts(scale)[stretch], model, rng, (low, high))
         if fits:
             return counts
-    best = np.argmax(model.log_probabilities @ frequencies)
+    mean, deviation = model.log_num_events
+    num_events = np.log(np.maximum(model.counts @ frequencies.astype(np.float32), 1))
+    best = np.argmax(model.log_probabilities @ frequencies - 0.5 * ((num_events - mean) / deviation) ** 2)
     number, blur = np.unravel_index(best, model.log_probabilities.shape[:2])
     scale = float(model.grid[number])
-    table = _most_probable_counts(scale, BLURS[blur], model)
+    shares = _shares_at(scale, model.full_scales, model.count_shares)
+    table = _most_probable_counts(scale, shares, BLURS[blur], _blur(BLURS[blur]))
     wanted = (scale, scale)
     if model.options.normalisation == "three_sigma":
         # One part in 500 of it moves no value by more than half a grey level; up to 1 all events come out white.
@@ -283,13 +301,13 @@ def _nearest_counts(scale: float) -> np.ndarray:
     return table
 
 
-def _most_probable_counts(scale: float, blur: float, model: CountModel) -> np.ndarray:
+def _most_probable_counts(scale: float, shares: np.ndarray, width: float, blur: np.ndarray) -> np.ndarray:
     """The most probable count [256] of each value that a decoder of this width has blurred; -1 = saturated."""
     levels = _levels(scale)
-    shares = _shares_of_levels(_shares_at(scale, model.full_scales, model.count_shares), levels)
-    found = np.argmax(np.log(shares)[:, None] + np.log(_blur(blur)[levels] + 1e-300), axis=0)
+    log_shares = np.log(_shares_of_levels(shares, levels))
+    found = np.argmax(log_shares[:, None] + np.log(blur[levels] + 1e-300), axis=0)
     # A level so close to 255 cannot be told from it; that there are saturated pixels at all decides about the scale.
-    found[levels[found] >= 255 - blur] = -1
+    found[levels[found] >= 255 - width] = -1
     return found
 
 
