@@ -196,7 +196,7 @@ def test_nothing_is_pruned_while_a_run_uses_the_store_and_a_killed_run_frees_it(
         stdout=subprocess.PIPE,
     )
     try:
-        assert user.stdout.readline() == b"using\n"
+        assert user.stdout is not None and user.stdout.readline() == b"using\n"
         with pytest.raises(StoreInUseError, match="a run uses this store"):
             store.prune(0)
         assert folder.exists()

@@ -1,0 +1,93 @@
+"""Every flow as a deployment, asked for as its script is: a preset and options to change. `prefect.yaml` lists them.
+
+A run happens in a process of a Prefect worker, on the worker's server, and keeps its state in the worker's home: its
+CTLEV_HOME, else `.ctlev` in the folder that was deployed. The flows are those of the scripts, and so are the artefacts.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from prefect import Flow
+from prefect.artifacts import create_table_artifact
+from prefect.logging import get_run_logger
+
+from ctlev_core.diffusion.pretraining import PretrainingOptions
+from flows import baselines as of_baselines
+from flows import evaluate as of_evaluate
+from flows import full_experiment as of_full_experiment
+from flows import prepare_dataset as of_prepare_dataset
+from flows import pretrain_prior as of_pretrain_prior
+from flows import synthesize as of_synthesize
+from flows import train_generator as of_train_generator
+from flows.command_line import PRESETS, _check_home, _use_cores, load_experiment, load_preset
+from flows.settings import HOME, flow
+from tasks.contact_sheet import publish_contact_sheet
+from tasks.report import publish_report
+from tasks.stage import planning
+
+_ARGUMENTS = """
+
+Args:
+    preset: name of a bundled preset, or path of a .yaml file.
+    overrides: options to change, each as `key=value`.
+    home: folder of all state; by default that of the worker.
+"""
+
+
+def _deployable(
+    script_flow: Flow[..., Any],
+    *,
+    default_preset: str = "demo",
+    load: Callable[[str, list[str]], Any] = load_experiment,
+    publish: Callable[[Any, Path, str], str] | None = None,
+) -> Flow[..., Any]:
+    """A flow that does what a flow's script does, within the flow run that a worker has begun.
+
+    Args:
+        script_flow: a flow of one parameter, its options.
+        default_preset: of the options.
+        load: from a preset's name and overrides to the options.
+        publish: puts the result where a person looks for it, and says where that is.
+    """
+
+    def run(preset: str = default_preset, overrides: tuple[str, ...] = (), home: str | None = None) -> Any:
+        folder = Path(home).absolute() if home else HOME
+        folder.mkdir(parents=True, exist_ok=True)
+        _check_home(folder)
+        os.environ["CTLEV_HOME"] = str(folder)  # this process runs this one flow, and stages look there
+        options = load(preset, list(overrides))
+        with planning() as rows:
+            script_flow.fn(options)
+        plan = [{"stage": row.label, "plan": "cached" if row.cached else "to run", "key": row.key} for row in rows]
+        create_table_artifact(plan, key="plan", description=f"{script_flow.name}, preset {preset}, in {folder}")
+        _use_cores(rows)
+        made = script_flow.fn(options)  # called as a flow it would be a second run of the same name within this one
+        if publish is not None:
+            get_run_logger().info(publish(made, folder, options.name))
+        return made
+
+    run.__name__ = script_flow.fn.__name__
+    run.__doc__ = (inspect.getdoc(script_flow.fn) or "") + _ARGUMENTS
+    return flow(name=script_flow.name)(run)
+
+
+full_experiment = _deployable(of_full_experiment.full_experiment, publish=publish_report)
+prepare_dataset = _deployable(
+    of_prepare_dataset.prepare_dataset,
+    publish=lambda made, folder, name: publish_contact_sheet(made.contact_sheet, folder, name),
+)
+train_generator = _deployable(of_train_generator.train_generator)
+synthesize = _deployable(of_synthesize.synthesize)
+baselines = _deployable(of_baselines.baselines)
+evaluate = _deployable(of_evaluate.evaluate)
+pretrain_prior = _deployable(
+    of_pretrain_prior.pretrain_prior,
+    default_preset="small_prior",
+    load=functools.partial(load_preset, PretrainingOptions, PRESETS / "pretraining"),
+)
