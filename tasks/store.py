@@ -247,6 +247,7 @@ class RawFileDigests:
 
     def __init__(self, home: Path) -> None:
         self.path = home / "raw_file_digests.json"
+        self.artefacts = home.resolve() / "artefacts"
         self.known: dict[str, list] = {}
         with contextlib.suppress(OSError, ValueError):
             self.known = json.loads(self.path.read_text())
@@ -258,9 +259,8 @@ class RawFileDigests:
         identity = [status.st_size, status.st_mtime_ns, status.st_ino]
         resolved = path.resolve()
         name = str(resolved)
-        artefacts = self.path.parent.resolve() / "artefacts"
-        if resolved.is_relative_to(artefacts):  # a prior that was trained here, say
-            _touch(artefacts.joinpath(*resolved.relative_to(artefacts).parts[:2]))
+        if resolved.is_relative_to(self.artefacts):  # a prior that was trained here, say
+            _touch(self.artefacts.joinpath(*resolved.relative_to(self.artefacts).parts[:2]))
         entry = self.known.get(name)
         if entry is None or entry[:3] != identity:
             entry = [*identity, file_digest(path)]
