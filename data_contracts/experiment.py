@@ -18,6 +18,7 @@ from data_contracts.config import (
     SamplingChoice,
     Windows,
 )
+from data_contracts.event_export import EventExport
 
 Setting = Literal["real", "synthetic", "real+synthetic"]
 PoseOrder = Literal["random", "in_time"]
@@ -71,6 +72,7 @@ class Experiment(Frozen):
     downstream_seeds: tuple[int, ...] = Field((0,), min_length=1, description="one training per setting and seed")
     metrics: tuple[MetricChoice, ...] = Field(min_length=1)
     feature_extractor: DownstreamChoice | None = None
+    export: EventExport | None = Field(None, description="also write the synthetic frames as event streams")
     realism_reference: DatasetChoice | None = Field(
         None, description="recordings that the experiment's own are compared with, number by number, in the report"
     )

@@ -202,6 +202,25 @@ SYNTHETIC = TableSchema(
         *_LABELS,
     ),
 )
+EVENT_STREAMS = TableSchema(
+    "event_streams",
+    1,
+    "sample_id",
+    (
+        Column("sample_id", pa.string(), "the generated frame"),
+        _CLASS,
+        Column("file", pa.string(), "event file that holds the stream, relative to this table"),
+        Column("t_start_us", pa.int64(), "where its window starts, on the clock of the file", minimum=0),
+        Column("t_end_us", pa.int64(), "its last event, or the start where it has none", minimum=0),
+        Column("event_start", pa.int64(), "its first event in the file", minimum=0),
+        Column("num_events", pa.int64(), "its events", minimum=0),
+        Column("has_polarity", pa.bool_(), "False: p is 1 throughout, because the image has no polarity"),
+        Column("is_exact", pa.bool_(), "encoding the stream gives the generated image itself"),
+        Column("error_levels", pa.float64(), "else mean difference over values that are not black", minimum=0),
+        Column("seed", pa.int64(), "seed of this row alone", minimum=0),
+        *_LABELS,
+    ),
+)
 SCORES = TableSchema(
     "scores",
     1,
@@ -248,6 +267,7 @@ _ALL = (
     CONDITIONS,
     TRAINING,
     SYNTHETIC,
+    EVENT_STREAMS,
     SCORES,
     SAMPLE_SCORES,
     REPORT,

@@ -19,8 +19,9 @@ from tasks.stage import call_flow, call_together
 
 
 class Evaluation(Frozen):
-    """Scores, and the models behind them."""
+    """Scores, and the models behind them; `extractor` is the model in whose features frames are compared."""
 
+    extractor: ManifestRef | None
     scores: list[ManifestRef]
     models: list[ManifestRef]
     model_names: list[str]
@@ -48,6 +49,7 @@ def evaluate(
         calls.append(partial(_distances, experiment.feature_extractor, experiment.seed, frames, generated))
     found = call_together(*calls)
     return Evaluation(
+        extractor=found[-1][0] if experiment.feature_extractor is not None else None,
         scores=[score for _, scores in found for score in scores],
         models=[model for model, _ in found[: len(trained)]],
         model_names=[f"{setting}, seed {seed}" for setting, seed in trained],

@@ -12,10 +12,12 @@ from data_contracts.manifest import ManifestRef
 from flows.baselines import baselines
 from flows.command_line import main
 from flows.evaluate import evaluate
+from flows.export_events import export_streams
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
+from tasks.copy_check import copy_check
 from tasks.ingest import ingest
 from tasks.realism import realism
 from tasks.report import publish_report, report
@@ -42,6 +44,19 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
         names=experiment.generator_names,
         label=f"training frames and {', '.join(experiment.generator_names)}",
     )
+    copies = [
+        copy_check(
+            dataset.frames,
+            frames,
+            evaluation.extractor,
+            downstream=experiment.feature_extractor,
+            setting=name,
+            label=name,
+        )
+        for name, frames in zip(experiment.generator_names, generated, strict=True)
+    ]
+    if experiment.export is not None:
+        call_flow(export_streams, experiment, dataset, synthetic)
     return report(
         dataset.recordings,
         dataset.frames,
@@ -52,6 +67,7 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
         evaluation.scores,
         evaluation.models,
         looks,
+        copies,
         title=experiment.name,
         notice=experiment.data_notice,
         settings=experiment.trained_settings,

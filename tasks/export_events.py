@@ -21,7 +21,7 @@ from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
-from data_contracts.event_export import EVENT_STREAMS, EventExport
+from data_contracts.event_export import EventExport
 from data_contracts.events import Events
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef
 from tasks.stage import Output, stage
@@ -34,7 +34,7 @@ _COUNT_STREAM, _TIME_STREAM = 1, 2
 _ENCODING = "event_histogram"
 
 
-@stage(version=1, schema=EVENT_STREAMS)
+@stage(version=1, schema=tables.EVENT_STREAMS)
 def export_events(
     out: Output,
     generated: Manifest,
@@ -70,7 +70,7 @@ def export_events(
     table = pa.Table.from_pylist(rows)
     for name in ("sample_id", "class_name", "joint_set", *LABEL_COLUMNS.values()):
         table = table.append_column(name, generated.table[name])
-    return table.select([column.name for column in EVENT_STREAMS.columns]).cast(EVENT_STREAMS.arrow())
+    return table.select([column.name for column in tables.EVENT_STREAMS.columns]).cast(tables.EVENT_STREAMS.arrow())
 
 
 def publish_events(ref: ManifestRef, home: Path, name: str) -> str:

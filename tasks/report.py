@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from ctlev_core.intervals import MIN_RECORDINGS, bootstrap_interval
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.report.contact_sheet import contact_sheet_sections
+from ctlev_core.report.copies import copy_sections
 from ctlev_core.report.html import Animation, Curves, ImageGrid, Section, Table, render_report
 from ctlev_core.report.realism import realism_sections
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
@@ -29,7 +30,7 @@ MAX_CLIPS = 6
 _TABLES = ("scores", "realism", "recordings")
 
 
-@stage(version=4, schema=tables.REPORT)
+@stage(version=5, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -41,6 +42,7 @@ def report(
     scores: list[Manifest],
     models: list[Manifest],
     realism: Manifest,
+    copies: list[Manifest],
     *,
     title: str,
     notice: str,
@@ -63,6 +65,7 @@ def report(
         *_motion(conditions, generated[0]),
         _real_grid(frames),
         *details,
+        *copy_sections(frames, generated, copies),
         *contact_sheet_sections(frames, frame_conditions, conditions),
         *realism_sections(realism.table.to_pylist(), realism.attached(DISTRIBUTIONS).to_pylist()),
         *[
@@ -72,7 +75,18 @@ def report(
         _curves("Downstream training", models, model_names),
         _recordings_table(recordings, frames),
         _cost_table(
-            [recordings, frames, frame_conditions, conditions, *checkpoints, *generated, *models, *scores, realism]
+            [
+                recordings,
+                frames,
+                frame_conditions,
+                conditions,
+                *checkpoints,
+                *generated,
+                *models,
+                *scores,
+                realism,
+                *copies,
+            ]
         ),
     ]
     page = render_report(

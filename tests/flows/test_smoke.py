@@ -15,13 +15,14 @@ import pyarrow.parquet as pq
 import pytest
 from flow_scripts import REPOSITORY, artefacts, digests, run_script, script
 
+from ctlev_core.event_files import read_events_file
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef, read_manifest
 
 # Everything but the report is a pure function of options and data: on one machine, digests must repeat exactly.
 # The report's digest covers the time each stage took.
 DETERMINISTIC = (
     "ingest", "encode", "condition_frames", "condition_samples", "finetune", "sample", "simulate", "train_downstream",
-    "score_model", "score_distance", "realism",
+    "score_model", "score_distance", "realism", "copy_check",
 )  # fmt: skip
 
 
@@ -29,7 +30,14 @@ def test_smoke_ends_in_a_report(smoke_home):
     (report,) = (smoke_home / "reports").glob("*.html")
     text = report.read_text()
     assert "far too small to learn from" in text[:20_000]
-    for expected in ("mpjpe2d", "fd_event_classifier_", "real+synthetic", "real+smpl_esim", "data:image/png;base64,"):
+    for expected in (
+        "mpjpe2d",
+        "fd_event_classifier_",
+        "real+synthetic",
+        "real+smpl_esim",
+        "Does it copy?",
+        "data:image/png;base64,",
+    ):
         assert expected in text
     assert "http://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", text) and "<script src" not in text
     output = (smoke_home / "first_run.txt").read_text()
@@ -174,7 +182,7 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
         ),
         (
             "encoding.options.normalisation=max",
-            {"encode", "condition", "finetune", "sample", "simulate", "train", "score", "report"},
+            {"encode", "condition", "finetune", "sample", "simulate", "train", "score", "copy_check", "report"},
         ),
         ("name=renamed", {"report", "contact_sheet"}),
     ],
@@ -237,6 +245,19 @@ def test_private_server_dies_with_a_killed_script(tmp_path):
     while any(os.path.exists(f"/proc/{pid}") for pid in children) and time.monotonic() < deadline:
         time.sleep(0.2)
     assert not any(os.path.exists(f"/proc/{pid}") for pid in children)
+
+
+def test_synthetic_frames_become_event_files(smoke_home):
+    """The frames of a finished run, read back and counted again."""
+    finished = run_script("export_events", "--preset", "smoke", "--set", "export={format: evt3}", home=smoke_home)
+    assert finished.status == 0, finished.errors
+    folder = smoke_home / "events" / "smoke"
+    listed = pq.read_table(folder / "event_streams.parquet").to_pylist()
+    (synthetic,) = artefacts(smoke_home, "sample", "generators/controlnet")
+    assert [row["sample_id"] for row in listed] == synthetic.column("sample_id")
+    for row in listed:
+        events = read_events_file(folder / row["file"])
+        assert len(events) == row["num_events"] > 0 and events.sensor_size == (64, 64)
 
 
 def test_scores_are_tables(smoke_home):

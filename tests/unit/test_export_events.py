@@ -12,7 +12,7 @@ from ctlev_core.copy_check import CLOSEST_PAIRS
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
-from data_contracts.event_export import EVENT_STREAMS, EventExport
+from data_contracts.event_export import EventExport
 from data_contracts.events import Events
 from data_contracts.labels import Labels
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, label_columns, read_manifest, write_manifest
@@ -24,11 +24,6 @@ SIZE = (24, 18)
 NUM_EVENTS = 200
 PER_RECORDING = 6
 ENCODING = plugins.load("encodings", "event_histogram")
-
-
-@pytest.fixture(autouse=True)
-def known_table(monkeypatch):
-    monkeypatch.setitem(tables.TABLES, EVENT_STREAMS.name, EVENT_STREAMS)
 
 
 def make_events(seed: int) -> Events:
@@ -114,7 +109,7 @@ def export(tmp_path, generated, polarity=True, name="out", **options) -> Manifes
     encoding = EncodingChoice(name="event_histogram", options={"polarity": polarity})
     inputs = (Output(folder, tmp_path), generated, frames, recordings)
     table = task.export_events.function(*inputs, encoding=encoding, export=EventExport(**options))
-    return read_manifest(write_manifest(folder, table, EVENT_STREAMS))
+    return read_manifest(write_manifest(folder, table, tables.EVENT_STREAMS))
 
 
 def streams(made: Manifest) -> list[Events]:

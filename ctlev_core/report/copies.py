@@ -1,0 +1,45 @@
+"""The sections of the report that say whether generated frames are copies of training frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ctlev_core.copy_check import CLOSEST_PAIRS
+from ctlev_core.report.html import ImageGrid, Section, Table
+from data_contracts.manifest import Manifest
+
+_CAPTION = (
+    "close_share: share of generated frames nearer to a training frame than the closest 1 % of real frames are to "
+    "those of other recordings; about 0.01 without copying, in brackets 95 % over frames. duplicates: frames equal to "
+    "a training frame. nearest_distance_ratio: median distance to the nearest training frame, over that of real frames."
+)
+
+
+def copy_sections(frames: Manifest, generated: Sequence[Manifest], copies: Sequence[Manifest]) -> list[Section]:
+    """One table for all generators, and the closest pairs of the first of them.
+
+    Args:
+        frames: with the training frames.
+        generated: frames of each generator.
+        copies: what `tasks.copy_check` found for each.
+    """
+    rows = [row for manifest in copies for row in manifest.table.to_pylist()]
+    if not rows:
+        return []
+    body = []
+    for row in rows:
+        interval = "" if row["low"] is None else f" [{row['low']:.3f}, {row['high']:.3f}]"
+        body.append([row["setting"], row["group"], row["metric"], f"{row['value']:.3f}{interval}", row["num_samples"]])
+    columns = ["frames", "compared in", "score", "value", "frames compared"]
+    sections: list[Section] = [Table("Does it copy?", columns, body, caption=_CAPTION)]
+    pairs = copies[0].attached(CLOSEST_PAIRS).to_pylist()
+    for features in dict.fromkeys(pair["features"] for pair in pairs):
+        shown = [pair for pair in pairs if pair["features"] == features]
+        images = [
+            ("generated", [generated[0].array("frames")[pair["generated_row"]] for pair in shown]),
+            ("training", [frames.array("frames")[pair["training_row"]] for pair in shown]),
+        ]
+        names = [f"{pair['distance'] / pair['threshold']:.2f}" if pair["threshold"] else "0" for pair in shown]
+        caption = "The pairs that lie closest; above each its distance over that of the closest 1 % of real frames."
+        sections.append(ImageGrid(f"Closest pairs: {shown[0]['setting']}, {features}", images, names, caption))
+    return sections

@@ -1,0 +1,38 @@
+"""Write the synthetic frames as event streams, for users of events rather than images."""
+
+from __future__ import annotations
+
+import sys
+
+from data_contracts.event_export import EventExport
+from data_contracts.experiment import Experiment
+from data_contracts.manifest import ManifestRef
+from flows.command_line import main
+from flows.prepare_dataset import PreparedDataset, prepare_dataset
+from flows.settings import HOME, flow
+from flows.synthesize import synthesize
+from tasks.export_events import export_events, publish_events
+from tasks.stage import call_flow
+
+
+@flow(name="export-events")
+def export_streams(
+    experiment: Experiment, dataset: PreparedDataset | None = None, synthetic: ManifestRef | None = None
+) -> ManifestRef:
+    """Write the experiment's synthetic frames as event streams; what is not given is made first."""
+    if dataset is None:
+        dataset = call_flow(prepare_dataset, experiment)
+    if synthetic is None:
+        synthetic = call_flow(synthesize, experiment, dataset)
+    return export_events(
+        synthetic,
+        dataset.frames,
+        dataset.recordings,
+        encoding=experiment.encoding,
+        export=experiment.export or EventExport(),
+        label="event streams",
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(export_streams, lambda made, experiment: publish_events(made, HOME, experiment.name)))
