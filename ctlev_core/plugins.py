@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -267,7 +267,7 @@ class Downstream(Protocol):
 
 
 class Metric(Protocol):
-    """A score. `INPUT` names what it compares: `joints2d`, `classes` or `features`."""
+    """A score. `INPUT` names what it compares: `joints2d`, `joints3d`, `smpl`, `classes` or `features`."""
 
     VERSION: int
     INPUT: str
@@ -283,6 +283,14 @@ class MetricOfRows(Metric, Protocol):
 
     def compute_rows(self, predicted: Any, target: Any, options: Any) -> np.ndarray:
         """One score a row [N], NaN where a row has none."""
+        ...
+
+
+class PreparedMetric(Metric, Protocol):
+    """A metric that can look at all rows once and then score any of them quickly."""
+
+    def prepare(self, predicted: Any, target: Any, options: Any) -> Callable[[np.ndarray], dict[str, float]]:
+        """From row numbers to what `compute` returns for those rows."""
         ...
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-_LOWER = ("mpjpe", "fd_", "kid", "error")
+_LOWER = ("mpjpe", "pve", "fd_", "kid", "error", "calibration_error")
 
 
 @dataclass(frozen=True)
