@@ -30,7 +30,7 @@ MAX_CLIPS = 6
 _TABLES = ("scores", "realism", "recordings")
 
 
-@stage(version=5, schema=tables.REPORT)
+@stage(version=6, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -89,10 +89,12 @@ def report(
             ]
         ),
     ]
+    own, *others = generator_names
+    beside = {other: _difference(scores, f"real+{other}", f"real+{own}") for other in others}
     page = render_report(
         title=title,
         lead=notice,
-        verdict=verdict(rows, settings, _difference(scores, "real", "real+synthetic")),
+        verdict=verdict(rows, settings, _difference(scores, "real", f"real+{own}"), beside),
         sections=sections,
     )
     (out.folder / "report.html").write_text(page, encoding="utf-8")
