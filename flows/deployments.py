@@ -20,6 +20,7 @@ from prefect.logging import get_run_logger
 from ctlev_core.diffusion.pretraining import PretrainingOptions
 from flows import baselines as of_baselines
 from flows import evaluate as of_evaluate
+from flows import export_events as of_export_events
 from flows import full_experiment as of_full_experiment
 from flows import prepare_dataset as of_prepare_dataset
 from flows import pretrain_prior as of_pretrain_prior
@@ -28,6 +29,7 @@ from flows import train_generator as of_train_generator
 from flows.command_line import PRESETS, _check_home, _use_cores, load_experiment, load_preset
 from flows.settings import HOME, flow
 from tasks.contact_sheet import publish_contact_sheet
+from tasks.export_events import publish_events
 from tasks.report import publish_report
 from tasks.stage import planning
 
@@ -86,6 +88,7 @@ train_generator = _deployable(of_train_generator.train_generator)
 synthesize = _deployable(of_synthesize.synthesize)
 baselines = _deployable(of_baselines.baselines)
 evaluate = _deployable(of_evaluate.evaluate)
+export_events = _deployable(of_export_events.export_streams, publish=publish_events)
 pretrain_prior = _deployable(
     of_pretrain_prior.pretrain_prior,
     default_preset="small_prior",

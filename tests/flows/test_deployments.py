@@ -19,6 +19,7 @@ import yaml
 from flow_scripts import REPOSITORY, digests
 
 from ctlev_core.processes import die_with_parent
+from tasks.store import Store
 
 PREFECT = [str(Path(sys.executable).with_name("prefect"))]
 SCRIPTS = {
@@ -34,7 +35,6 @@ def test_every_flow_script_has_a_deployment_with_a_description_and_tags():
         f"flows.deployments.{path.stem}" for path in SCRIPTS.values()
     )
     assert all(item["description"] and item["tags"] and item["work_pool"] == {"name": "ctlev"} for item in listed)
-    assert len(listed) == 7
 
 
 @dataclass
@@ -104,7 +104,7 @@ def end(process):
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory):
-    """All seven deployments, ready to run."""
+    """Every deployment, ready to run."""
     home = tmp_path_factory.mktemp("service")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -194,3 +194,36 @@ def test_wrong_types_are_refused_before_anything_runs(service):
     finished = service.prefect("deployment", "run", "prepare-dataset/default", "-p", "overrides=5")
     assert finished.returncode != 0
     assert "overrides" in finished.stdout + finished.stderr
+
+
+@pytest.mark.slow
+def test_a_run_whose_worker_is_killed_goes_on_with_another(service, tmp_path):
+    first = service.start_run("prepare-dataset", tmp_path)
+    deadline = time.monotonic() + 400
+    while not digests(tmp_path, ("ingest",)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    before = digests(tmp_path)
+    assert before
+    end(service.worker)
+    service.start_worker()
+    second = service.start_run("prepare-dataset", tmp_path)
+    state = service.state(second, until=ENDED)
+    assert first != second and state["type"] == "COMPLETED", state
+    after = digests(tmp_path)
+    assert before.items() <= after.items() and len(after) == 5
+    for name in after:
+        Store(tmp_path).check(tmp_path / "artefacts" / name)
+    (plan,) = service.api("artifacts/filter", {"artifacts": {"flow_run_id": {"any_": [second]}}})
+    cached = {row["stage"].partition(":")[0] for row in json.loads(plan["data"]) if row["plan"] == "cached"}
+    assert "ingest" in cached
+
+
+@pytest.mark.slow
+def test_a_run_that_would_overlap_is_cancelled_and_says_why(service, tmp_path):
+    first = service.start_run("synthesize", tmp_path)
+    service.state(first, until={"PENDING", "RUNNING"})
+    second = service.start_run("synthesize", tmp_path)
+    state = service.state(second, until=ENDED)
+    assert state["type"] == "CANCELLED" and "concurrency limit" in state["message"]
+    assert service.prefect("flow-run", "cancel", first).returncode == 0
+    assert service.state(first, until=ENDED)["type"] == "CANCELLED"
