@@ -127,7 +127,7 @@ def main(
     arguments = _parse(flow, default_preset)
     started = time.perf_counter()
     try:
-        _check_home(Path(os.environ["CTLEV_HOME"]))
+        check_home(Path(os.environ["CTLEV_HOME"]))
         options = load(arguments.preset, arguments.set)
         if not arguments.dry_run:
             local_server.start(Path(os.environ["CTLEV_HOME"]))
@@ -136,7 +136,7 @@ def main(
         if arguments.dry_run:
             print_plan(rows)
             return 0
-        _use_cores(rows)
+        use_cores(rows)
         with local_server.connected():
             result = flow(options)
     except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
@@ -151,12 +151,13 @@ def main(
     return 0
 
 
-def _check_home(home: Path) -> None:
+def check_home(home: Path) -> None:
+    """Raise `PermissionError` where the home folder cannot be written."""
     if not os.access(home, os.W_OK | os.X_OK):
         raise PermissionError(f"{home}: the home folder cannot be written; choose another with --home or CTLEV_HOME")
 
 
-def _use_cores(rows: list[PlannedStage]) -> None:
+def use_cores(rows: list[PlannedStage]) -> None:
     """Torch on all cores, unless everything is cached and torch is not needed at all."""
     if all(row.cached for row in rows):
         return

@@ -26,7 +26,7 @@ from flows import prepare_dataset as of_prepare_dataset
 from flows import pretrain_prior as of_pretrain_prior
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
-from flows.command_line import PRESETS, _check_home, _use_cores, load_experiment, load_preset
+from flows.command_line import PRESETS, check_home, load_experiment, load_preset, use_cores
 from flows.settings import HOME, flow
 from tasks.contact_sheet import publish_contact_sheet
 from tasks.export_events import publish_events
@@ -61,14 +61,14 @@ def _deployable(
     def run(preset: str = default_preset, overrides: tuple[str, ...] = (), home: str | None = None) -> Any:
         folder = Path(home).absolute() if home else HOME
         folder.mkdir(parents=True, exist_ok=True)
-        _check_home(folder)
+        check_home(folder)
         os.environ["CTLEV_HOME"] = str(folder)  # this process runs this one flow, and stages look there
         options = load(preset, list(overrides))
         with planning() as rows:
             script_flow.fn(options)
         plan = [{"stage": row.label, "plan": "cached" if row.cached else "to run", "key": row.key} for row in rows]
         create_table_artifact(plan, key="plan", description=f"{script_flow.name}, preset {preset}, in {folder}")
-        _use_cores(rows)
+        use_cores(rows)
         made = script_flow.fn(options)  # called as a flow it would be a second run of the same name within this one
         if publish is not None:
             get_run_logger().info(publish(made, folder, options.name))

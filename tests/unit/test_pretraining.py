@@ -9,9 +9,10 @@ from ctlev_core.diffusion import pretraining, procedural_images
 from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
 from ctlev_core.diffusion.prior import encode_prompts, load_prior
-from ctlev_core.diffusion.procedural_objects import COLOURS, OBJECTS, draw_object
 from ctlev_core.diffusion.small_prior import WORD_GAIN
 from ctlev_core.render.compositions import RELATIONS, parse_composition
+from ctlev_core.render.object_drawing import draw_object
+from ctlev_core.render.objects import COLOURS, OBJECTS
 from data_contracts.errors import TrainingError
 
 TINY = PretrainingOptions(
