@@ -26,6 +26,10 @@ from typing import Any, BinaryIO, TypeVar
 R = TypeVar("R")
 
 
+END_TIMEOUT_S = 10.0
+"""After being asked to end, a process has so long to clear away what it was writing."""
+
+
 class WorkerError(RuntimeError):
     """A process that did our work is gone."""
 
@@ -70,10 +74,18 @@ class Worker:
             raise result
         return result
 
+    def ask_to_end(self) -> None:
+        """What it is doing is given up, and cleared away."""
+        self._process.terminate()
+
     def close(self) -> None:
-        """End the process, whatever it is doing."""
-        self._process.kill()
-        self._process.wait()
+        """End the process, whatever it is doing, at once where it does not end when asked."""
+        self.ask_to_end()
+        try:
+            self._process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 with contextlib.suppress(OSError):
@@ -108,7 +120,10 @@ class Workers:
         """End all processes; calls that wait for one raise `WorkerError`."""
         with self._lock:
             self._closed = True
-            for worker in filter(None, self._workers):
+            workers = [worker for worker in self._workers if worker is not None]
+            for worker in workers:
+                worker.ask_to_end()
+            for worker in workers:
                 worker.close()
 
 
@@ -179,6 +194,7 @@ def _serve() -> None:
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started us decides
+    signal.signal(signal.SIGTERM, _give_up)
     calls: queue.SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]] | Exception] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(sys.stdin.buffer, calls), daemon=True).start()
     while True:
@@ -192,6 +208,11 @@ def _serve() -> None:
             reply = _as_pickle(error)
         replies.write(reply)
         replies.flush()
+
+
+def _give_up(number: int, frame: object) -> None:
+    """Raise where the work is done, so that what is half written is cleared away."""
+    raise SystemExit(128 + number)
 
 
 def _listen(requests: BinaryIO, calls: queue.SimpleQueue[Any]) -> None:
@@ -217,4 +238,8 @@ def _as_pickle(error: Exception) -> bytes:
 
 
 if __name__ == "__main__":
-    _serve()
+    try:
+        _serve()
+    finally:
+        # Without waiting for the thread that listens, which reads until its source is gone.
+        os._exit(0)

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -68,6 +69,31 @@ def test_the_first_error_ends_the_other_calls_at_once():
     with pytest.raises(DataError, match="wrong"):
         together([lambda: elsewhere(time.sleep, 60), lambda: elsewhere(raise_data_error)])
     assert time.monotonic() - started < 50
+
+
+def test_a_process_that_is_closed_clears_away_what_it_was_writing(tmp_path):
+    pool = Workers(1, 1)
+    thread = threading.Thread(target=lambda: suppress_worker_error(pool, tmp_path), daemon=True)
+    thread.start()
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "half").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    pool.close()
+    thread.join(30)
+    assert not thread.is_alive() and not (tmp_path / "half").exists()
+
+
+def suppress_worker_error(pool, folder):
+    with pytest.raises(WorkerError):
+        pool.call(write_slowly, folder)
+
+
+def write_slowly(folder):
+    (folder / "half").mkdir()
+    try:
+        time.sleep(600)
+    finally:
+        (folder / "half").rmdir()
 
 
 def raise_data_error():
