@@ -30,7 +30,7 @@ MAX_CLIPS = 6
 _TABLES = ("scores", "realism", "recordings")
 
 
-@stage(version=6, schema=tables.REPORT)
+@stage(version=7, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from ctlev_core.copy_check import CLOSEST_PAIRS
 from ctlev_core.report.html import ImageGrid, Section, Table
@@ -26,12 +27,7 @@ def copy_sections(frames: Manifest, generated: Sequence[Manifest], copies: Seque
     rows = [row for manifest in copies for row in manifest.table.to_pylist()]
     if not rows:
         return []
-    body = []
-    for row in rows:
-        interval = "" if row["low"] is None else f" [{row['low']:.3f}, {row['high']:.3f}]"
-        body.append([row["setting"], row["group"], row["metric"], f"{row['value']:.3f}{interval}", row["num_samples"]])
-    columns = ["frames", "compared in", "score", "value", "frames compared"]
-    sections: list[Section] = [Table("Does it copy?", columns, body, caption=_CAPTION)]
+    sections: list[Section] = [_table(rows)]
     pairs = copies[0].attached(CLOSEST_PAIRS).to_pylist()
     for features in dict.fromkeys(pair["features"] for pair in pairs):
         shown = [pair for pair in pairs if pair["features"] == features]
@@ -43,3 +39,22 @@ def copy_sections(frames: Manifest, generated: Sequence[Manifest], copies: Seque
         caption = "The pairs that lie closest; above each its distance over that of the closest 1 % of real frames."
         sections.append(ImageGrid(f"Closest pairs: {shown[0]['setting']}, {features}", images, names, caption))
     return sections
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Generators down, what was compared and how across."""
+    cells = {(row["setting"], row["group"], row["metric"]): row for row in rows}
+    columns = list(dict.fromkeys((row["group"], row["metric"]) for row in rows))
+    body: list[list[str]] = []
+    for setting in dict.fromkeys(row["setting"] for row in rows):
+        found = [cells.get((setting, *column)) for column in columns]
+        body.append([setting, *("" if cell is None else _text(cell) for cell in found)])
+    return Table(
+        "Does it copy?", ["frames", *(f"{metric}, {group}" for group, metric in columns)], body, caption=_CAPTION
+    )
+
+
+def _text(row: dict[str, Any]) -> str:
+    if row["metric"] == "duplicates":
+        return f"{row['value']:.0f}"
+    return f"{row['value']:.3f}" + ("" if row["low"] is None else f" [{row['low']:.3f}, {row['high']:.3f}]")
