@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from ctlev_core import plugins
-from ctlev_core.body_views import from_new_side, with_joints
 from ctlev_core.condition_sources import (
     LabelledRows,
     as_different_as_training,
@@ -152,6 +151,8 @@ def _seen(
     A label-only recording has no sensor of its own: its labels are in the frame of the dataset's sensor, or a virtual
     camera with that sensor looks at its bodies; at those of one number in `turned` [N] from one new side.
     """
+    from ctlev_core.body_views import with_joints  # here, because a cached run needs no numba and no scipy
+
     size = sensor_size_of(recordings)
     if turned is not None:
         labels = _from_new_sides(labels, turned, size, seed)
@@ -165,6 +166,8 @@ def _seen(
 
 def _from_new_sides(labels: Labels, turned: np.ndarray, sensor_size: SensorSize, seed: int) -> Labels:
     """Bodies before new cameras, one for each number in `turned` [N]; row order stays."""
+    from ctlev_core.body_views import from_new_side
+
     if labels.smpl_pose is None:
         raise DataError("pose_views 'new' needs bodies (SMPL parameters) to turn; these labels have joints or classes")
     groups = [np.flatnonzero(turned == number) for number in np.unique(turned)]
