@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import time
@@ -18,7 +19,7 @@ from ctlev_core.plugins import PluginError, validate_options
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.experiment import Experiment
 from flows import local_server
-from tasks.stage import PlannedStage, planning
+from tasks.stage import PlannedStage, in_one_run, planning
 
 PRESETS = Path(__file__).resolve().parent / "presets"
 
@@ -137,7 +138,8 @@ def main(
             print_plan(rows)
             return 0
         use_cores(rows)
-        with local_server.connected():
+        all_cached = all(row.cached for row in rows)
+        with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
             result = flow(options)
     except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -72,6 +72,7 @@ class _Plan:
 
 
 _plan: ContextVar[_Plan | None] = ContextVar("ctlev_plan", default=None)
+_in_one_run: ContextVar[bool] = ContextVar("ctlev_in_one_run", default=False)
 
 
 @contextlib.contextmanager
@@ -85,14 +86,27 @@ def planning() -> Iterator[list[PlannedStage]]:
         _plan.reset(token)
 
 
+@contextlib.contextmanager
+def in_one_run() -> Iterator[None]:
+    """Inside this block a flow's stages are tasks of the run it is called from, one after the other.
+
+    For runs that find everything cached: there, runs of their own for inner flows take longer than what is in them.
+    """
+    token = _in_one_run.set(True)
+    try:
+        yield
+    finally:
+        _in_one_run.reset(token)
+
+
 def call_flow(flow: Flow[P, R], *arguments: P.args, **settings: P.kwargs) -> R:
-    """Call a Prefect flow, or only its wiring while planning."""
-    return (flow.fn if _plan.get() is not None else flow)(*arguments, **settings)
+    """Call a Prefect flow, or only its wiring while planning and `in_one_run`."""
+    return (flow.fn if _plan.get() is not None or _in_one_run.get() else flow)(*arguments, **settings)
 
 
 def call_together(*calls: Callable[[], Any]) -> list[Any]:
-    """The results of all calls, side by side where there are cores; one after the other while planning."""
-    return [call() for call in calls] if _plan.get() is not None else together(calls)
+    """The results of all calls, side by side where there are cores; in order while planning and `in_one_run`."""
+    return [call() for call in calls] if _plan.get() is not None or _in_one_run.get() else together(calls)
 
 
 class Output:
