@@ -113,7 +113,7 @@ def fit_counts(histograms: np.ndarray, options: Options) -> CountModel:
     counts = counts[counts.any(axis=(1, 2, 3))]
     if len(counts) == 0:
         raise DataError(f"counts cannot be learnt: none of {len(values)} real windows has an event")
-    scales = np.maximum(_full_scales(counts, options), 1.0)
+    scales = np.maximum(encoding.full_scales(counts, options), 1.0)
     shares = np.stack([np.bincount(np.minimum(row, 255).reshape(-1), minlength=256) for row in counts])
     shares = shares / counts[0].size
     relative = [row[row >= scale] / scale for row, scale in zip(counts, scales, strict=True)]
@@ -165,19 +165,6 @@ def estimate_counts(frames: np.ndarray, model: CountModel, *, seeds: Sequence[in
     rendered = plugins.load("encodings", "event_histogram").render_image(counts, model.options)
     errors = np.array([kernels.compare(*pair) for pair in zip(frames, rendered, strict=True)]).reshape(-1, 2)
     return CountEstimate(counts, rendered, errors[:, 0] == 0, errors[:, 0] / np.maximum(errors[:, 1], 1))
-
-
-def _full_scales(counts: np.ndarray, options: Options) -> np.ndarray:
-    """The count that becomes 255 in each window, [N] float64."""
-    if options.normalisation == "count":
-        return np.full(len(counts), float(options.full_scale_count))
-    if options.normalisation == "max":
-        return counts.max(axis=(1, 2, 3)).astype(np.float64)
-    from ctlev_core import histogram
-
-    scales = np.empty(len(counts))
-    histogram.full_scales(counts, scales)
-    return scales
 
 
 def _grid(scales: np.ndarray, options: Options) -> np.ndarray:

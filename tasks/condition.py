@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -27,6 +25,7 @@ from ctlev_core.condition_sources import (
 from ctlev_core.labelling import labels_in_image
 from ctlev_core.plugins import Plugin
 from ctlev_core.pose_choice import balanced_choice, surrounded
+from ctlev_core.row_seeds import row_seeds
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import ConditionChoice, EncodingChoice, Windows
@@ -35,18 +34,12 @@ from data_contracts.events import SensorSize
 from data_contracts.experiment import PoseOrder, PoseViews
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, concat_labels, condition_arrays, label_columns, labels_of
-from tasks.stage import Output, stage
+from tasks.stage import Output, input_files_of, stage
 
 VIEW_STREAM = 30
 
 
-def _input_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
-    plugin = plugins.load_options(arguments["condition"])
-    files = plugin.module.input_files(plugin.options) if hasattr(plugin.module, "input_files") else []
-    return [(path.name, path) for path in files]
-
-
-@stage(version=4, schema=tables.CONDITIONS, raw_files=_input_files)
+@stage(version=4, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
 def condition_frames(
     out: Output,
     recordings: Manifest,
@@ -61,7 +54,7 @@ def condition_frames(
     return _render(out, rows.source_ids, rows, condition, recordings, frames, encoding, seed)
 
 
-@stage(version=6, schema=tables.CONDITIONS, raw_files=_input_files)
+@stage(version=6, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
 def condition_samples(
     out: Output,
     poses: Manifest,
@@ -200,7 +193,7 @@ def _render(
 ) -> pa.Table:
     plugin = _load_condition(condition, recordings)
     labels = rows.labels
-    seeds = [int(np.random.SeedSequence([seed, row]).generate_state(1)[0]) for row in range(len(labels))]
+    seeds = row_seeds(seed, len(labels))
     asked = (labels, image_size_of(frames), plugin.options, seeds)
     needs = getattr(plugin.module, "NEEDS", None)
     if needs == "intensity":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,15 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from ctlev_core import plugins
+from ctlev_core.condition_sources import sensor_size_of
+from ctlev_core.row_seeds import row_seeds
 from ctlev_core.windows import window_around
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, conditions_of
-from tasks.stage import Output, stage
+from tasks.stage import Output, input_files_of, stage
 
 SHARD_ROWS = 64
 
@@ -26,20 +27,14 @@ SHARD_ROWS = 64
 def sample(out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling: SamplingChoice, seed: int) -> pa.Table:
     """One frame per condition row, each from a seed of its own; the labels come along unchanged."""
     plugin = plugins.load_options(sampling)
-    seeds = _seeds(len(conditions), seed)
+    seeds = row_seeds(seed, len(conditions))
     folder = checkpoint.ref.path / "checkpoint"
     frames = plugin.module.sample(folder, conditions_of(conditions), plugin.options, seeds=seeds, work=out.work)
     out.write_array("frames", frames)
     return _table(conditions, plugin, checkpoint.ref.digest, seeds)
 
 
-def _input_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
-    plugin = plugins.load_options(arguments["sampling"])
-    files = plugin.module.input_files(plugin.options) if hasattr(plugin.module, "input_files") else []
-    return [(path.name, path) for path in files]
-
-
-@stage(version=1, schema=tables.SYNTHETIC, raw_files=_input_files)
+@stage(version=1, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"))
 def simulate(
     out: Output,
     recordings: Manifest,
@@ -55,13 +50,12 @@ def simulate(
     A frame is the window around the labelled moment; a row without events becomes an empty frame.
     """
     plugin, encoder = plugins.load_options(sampling), plugins.load_options(encoding)
-    asked, seeds = conditions_of(conditions), _seeds(len(conditions), seed)
+    asked, seeds = conditions_of(conditions), row_seeds(seed, len(conditions))
     if asked.motions is None:
         raise DataError(
             f"{conditions.ref.path}: generator {plugin.name!r} needs body motions; use condition 'body_motion'"
         )
-    first = next(row for row in recordings.table.to_pylist() if row["sensor_width_px"])
-    sensor_size = first["sensor_width_px"], first["sensor_height_px"]
+    sensor_size = sensor_size_of(recordings)
     durations_us = conditions.table["t_end_us"].to_numpy() - conditions.table["t_start_us"].to_numpy()
     shards: list[np.ndarray] = []
     with tqdm(total=len(seeds), desc=plugin.name, unit="frame", leave=False, disable=None) as progress:
@@ -98,10 +92,6 @@ def _encode(
         counts = encoder.module.encode(events, window, encoder.options)
         frames.append(encoder.module.render_image(counts, encoder.options)[0])
     return np.stack(frames)
-
-
-def _seeds(count: int, seed: int) -> list[int]:
-    return [int(np.random.SeedSequence([seed, row]).generate_state(1)[0]) for row in range(count)]
 
 
 def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str, seeds: list[int]) -> pa.Table:

@@ -240,6 +240,17 @@ def files_of(folders: Sequence[Path]) -> list[tuple[str, Path]]:
     ]
 
 
+def input_files_of(argument: str) -> RawFiles:
+    """For `raw_files`: the files from outside the store that the plug-in chosen by an argument reads, if any."""
+
+    def find(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
+        plugin = plugins.load_options(arguments[argument])
+        files = plugin.module.input_files(plugin.options) if hasattr(plugin.module, "input_files") else []
+        return [(path.name, path) for path in files]
+
+    return find
+
+
 def stage(
     *, version: int, schema: TableSchema, raw_files: RawFiles | None = None
 ) -> Callable[[Callable[..., pa.Table]], Stage]:

@@ -146,14 +146,14 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
 
     histogram = np.ascontiguousarray(histogram)
     images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
-    kernels.draw(histogram, _full_scales(histogram, options), images)
+    kernels.draw(histogram, full_scales(histogram, options), images)
     return images
 
 
 map_points = image_geometry.map_points
 
 
-def _full_scales(histogram: np.ndarray, options: Options) -> np.ndarray:
+def full_scales(histogram: np.ndarray, options: Options) -> np.ndarray:
     """The count that becomes 255 in each window, [N] float64, positive."""
     if options.normalisation == "count":
         return np.full(len(histogram), float(options.full_scale_count))
