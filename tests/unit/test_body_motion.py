@@ -11,7 +11,7 @@ from ctlev_core.render import body_normals
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import BodyMotions, Labels
-from tasks.condition import _input_files
+from tasks.stage import input_files_of
 
 SIZE = (80, 60)
 KEYS = 4
@@ -125,7 +125,7 @@ def test_a_body_file_is_part_of_the_key(tmp_path):
     path = tmp_path / "body.npz"
     path.write_bytes(b"")
     choice = ConditionChoice(name="body_motion", options={"body": str(path)})
-    assert _input_files({"condition": choice}) == [("body.npz", path)]
+    assert input_files_of("condition")({"condition": choice}) == [("body.npz", path)]
     missing = ConditionChoice(name="body_motion", options={"body": str(tmp_path / "none.pkl")})
     with pytest.raises(DataError, match=r"none\.pkl: no such file; expected an SMPL body"):
-        _input_files({"condition": missing})
+        input_files_of("condition")({"condition": missing})

@@ -12,7 +12,7 @@ from ctlev_core.render import body_normals
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
-from tasks.condition import _input_files
+from tasks.stage import input_files_of
 
 SIZE = (80, 60)
 
@@ -79,11 +79,11 @@ def test_another_body_file_is_used_and_its_content_is_part_of_the_key(tmp_path):
     ]
     assert heights[1] > 1.1 * heights[0]
     choice = ConditionChoice(name="normals", options={"body": str(path)})
-    assert _input_files({"condition": choice}) == [("tall.npz", path)]
+    assert input_files_of("condition")({"condition": choice}) == [("tall.npz", path)]
     missing = ConditionChoice(name="normals", options={"body": str(tmp_path / "none.pkl")})
     with pytest.raises(DataError, match=r"none\.pkl: no such file; expected an SMPL body"):
-        _input_files({"condition": missing})
-    assert _input_files({"condition": ConditionChoice(name="skeleton")}) == []
+        input_files_of("condition")({"condition": missing})
+    assert input_files_of("condition")({"condition": ConditionChoice(name="skeleton")}) == []
 
 
 @pytest.mark.parametrize(
