@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
-from ctlev_core.diffusion.options import FineTuningOptions
 from ctlev_core.diffusion.prior import (
     Prior,
     choose_device,
@@ -28,6 +27,7 @@ from ctlev_core.diffusion.prior import (
 )
 from ctlev_core.diffusion.small_prior import break_zeros
 from ctlev_core.diffusion.training import Trainer, run_training, sample_rows
+from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History

@@ -20,7 +20,6 @@ from pydantic import Field
 
 from ctlev_core.diffusion import procedural_images
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
-from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.prior import (
     Prior,
@@ -33,6 +32,7 @@ from ctlev_core.diffusion.prior import (
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
 from ctlev_core.diffusion.small_prior import IMAGE_SIZE, WIDTHS, PredictionType, build_prior
 from ctlev_core.diffusion.training import Trainer, run_training, sample_rows
+from ctlev_core.diffusion.training_options import TrainingOptions
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
 from data_contracts.labels import History

@@ -21,8 +21,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ctlev_core.diffusion.denoising import Denoiser
-from ctlev_core.diffusion.options import SamplingOptions
 from ctlev_core.diffusion.prior import Prior, choose_device, conditions_to_tensor, encode_prompts, load_prior
+from ctlev_core.diffusion.sampling_options import SamplingOptions
 from data_contracts.config import cache_material
 from data_contracts.labels import Conditions
 

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.muon import Muon
-from ctlev_core.diffusion.options import TrainingOptions
+from ctlev_core.diffusion.training_options import TrainingOptions
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 

@@ -15,7 +15,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.diffusion.options import FineTuningOptions, SamplingOptions
+from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.labels import Conditions, History
 
 VERSION = 1

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.diffusion.muon import MATRIX_RATE, Muon, is_matrix, orthogonalised
-from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.training import Trainer
+from ctlev_core.diffusion.training_options import TrainingOptions
 
 BETAS = (0.9, 0.999)
 

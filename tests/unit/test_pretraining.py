@@ -6,10 +6,10 @@ import torch
 
 from ctlev_core.body.motions import HELD_OUT
 from ctlev_core.diffusion import pretraining, procedural_images
-from ctlev_core.diffusion.options import TrainingOptions
 from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
 from ctlev_core.diffusion.prior import encode_prompts, load_prior
 from ctlev_core.diffusion.small_prior import WORD_GAIN
+from ctlev_core.diffusion.training_options import TrainingOptions
 from ctlev_core.render.compositions import RELATIONS, parse_composition
 from ctlev_core.render.object_drawing import draw_object
 from ctlev_core.render.objects import COLOURS, OBJECTS

@@ -7,9 +7,9 @@ from tiny_prior import SIDE, make_data, make_prior, shared_prior
 
 from ctlev_core.diffusion import sampling
 from ctlev_core.diffusion.denoising import NoiseSchedule
-from ctlev_core.diffusion.options import SamplingOptions
 from ctlev_core.diffusion.prior import load_prior, save_prior
 from ctlev_core.diffusion.sampling import cached_condition_embedding, decode_frames, make_scheduler, sample_frames
+from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.generators import controlnet, stable_diffusion
 from data_contracts.labels import Conditions
 

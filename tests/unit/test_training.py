@@ -12,8 +12,8 @@ from tiny_prior import make_data, make_prior, shared_prior
 from ctlev_core.diffusion import training
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for
 from ctlev_core.diffusion.finetuning import fine_tune, forget_weights
-from ctlev_core.diffusion.options import FineTuningOptions
 from ctlev_core.diffusion.training import sample_rows
+from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.errors import TrainingError
 from data_contracts.labels import Conditions
 
