@@ -22,6 +22,11 @@ class Options(Frozen):
     num_condition_recordings: int = Field(
         default=1200, ge=0, description="Label-only recordings of random people, UNSEEN motions."
     )
+    film_conditions: bool = Field(
+        default=False,
+        description="Record events of the people of split `condition` too, as training data: the most that synthetic "
+        "data of their poses can give.",
+    )
     num_cameras: int = Field(
         default=1,
         ge=1,

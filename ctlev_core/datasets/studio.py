@@ -3,7 +3,8 @@
 It stands in for recordings of real people, which users must download under their own licences. Training recordings
 show four subjects and the SEEN motions; tests show two other subjects and all motions; `condition` recordings carry
 labels, and grey pictures where asked for, but no events: random people in UNSEEN motions, from whose poses synthetic
-data is sampled. The HELD_OUT motions appear in tests alone.
+data is sampled; `film_conditions` films the very same people as training recordings, which is what synthetic data
+stands in for. The HELD_OUT motions appear in tests alone.
 
 Recordings like those of a real dataset are options: DHP19 is 346 x 260 px, `dhp19`, 4 cameras; CDEHP is 1280 x 800 px,
 `cdehp`, Event-HPE a square sensor, `smpl`, both with intensity frames.
@@ -66,18 +67,18 @@ def list_recordings(options: Options) -> list[Recording]:
 def _recording(split: str, index: int, camera: int, options: Options) -> Recording:
     motions = MOTIONS_OF_SPLIT[split]
     motion, turn = motions[index % len(motions)], index // len(motions)
-    has_events = split != "condition"
+    has_events = split != "condition" or options.film_conditions
     if split == "train":
         subject = f"subject{turn % options.num_train_subjects}"
     elif split == "test":
         subject = f"subject{options.num_train_subjects + turn % options.num_test_subjects}"
     else:
         subject = f"stranger{index}"
-    suffix = f"_cam{camera}" if has_events and options.num_cameras > 1 else ""
+    suffix = f"_cam{camera}" if split != "condition" and options.num_cameras > 1 else ""
     return Recording(
         recording_id=f"{split}/{subject}_{motion}_{index:05d}{suffix}",
         subject=subject,
-        parts=(Part(split),),
+        parts=(Part("train" if split == "condition" and has_events else split),),
         class_name=motion,
         sensor_size=options.sensor_size,
         has_events=has_events,
@@ -179,7 +180,7 @@ def _perform(recording: Recording, options: Options) -> _Performance:
     framed_s = 1e-6 * options.recording_duration_us * np.array([0.0, 0.5, 1.0])
     rotations, transl = pose_at(recording.class_name, framed_s, style)
     _, joints = joint_transforms(load_body(), rotations, subject.betas, transl)
-    count = options.num_cameras if recording.has_events else 1
+    count = 1 if recording.recording_id.startswith("condition/") else options.num_cameras
     cameras = [_camera(entropy, camera, count, joints, options) for camera in dict.fromkeys((0, number))]
     return _Performance(style, subject, cameras[-1], cameras[0])
 

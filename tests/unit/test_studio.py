@@ -47,6 +47,19 @@ def test_splits_share_no_subject_and_held_out_motions_are_in_tests_alone():
     assert len({(r.subject, r.class_name) for r in of_split("train")}) == 16
 
 
+def test_condition_people_can_be_filmed_as_training_recordings():
+    filmed = changed(film_conditions=True, num_train_recordings=0, num_test_recordings=1, num_cameras=2)
+    recordings = [r for r in studio.list_recordings(filmed) if r.recording_id.startswith("condition/")]
+    assert [r.recording_id for r in recordings] == [r.recording_id for r in of_split("condition")]
+    assert all(r.has_events and r.parts[0].split == "train" for r in recordings)
+    for recording, label_only in zip(recordings[:3], of_split("condition")[:3], strict=True):
+        labels, asked = studio.read_labels(recording, filmed), studio.read_labels(label_only, OPTIONS)
+        shared = np.isin(labels.t_us, asked.t_us)
+        assert shared.sum() >= 3  # 5 ms against 20.8 ms: 0, 125 and 250 ms at least
+        np.testing.assert_array_equal(labels.joints2d[shared], asked.joints2d[np.isin(asked.t_us, labels.t_us)])
+        assert len(check_events(studio.read_events(recording, filmed), recording.recording_id)) > 100
+
+
 def test_recording_ids_say_what_they_are():
     assert RECORDINGS[5].recording_id == "train/subject1_run_00005"
     assert all(recording.has_events == (recording.parts[0].split != "condition") for recording in RECORDINGS)
