@@ -257,6 +257,36 @@ REPORT = TableSchema(
     None,
     (Column("table", pa.string(), "name of a table of the report"), Column("file", pa.string(), "its Parquet file")),
 )
+TIMED_SAMPLES = TableSchema(
+    "timed_samples",
+    1,
+    None,
+    (
+        Column("condition_id", pa.string(), "sample_id of the condition; row i of the array `frames` is row i here"),
+        Column("seed", pa.int64(), "seed of this row alone", minimum=0),
+        Column("wall_seconds", pa.float64(), "time of its batch, networks loaded and warm, shared equally", minimum=0),
+        Column("cpu_seconds", pa.float64(), "CPU time of its batch over all threads, shared equally", minimum=0),
+        Column("unet_evaluations", pa.float64(), "forward passes of the U-Net an image, counted", minimum=1),
+        Column("controlnet_evaluations", pa.float64(), "forward passes of the ControlNet an image", minimum=0),
+    ),
+)
+SPEED_VS_ERROR = TableSchema(
+    "speed_vs_error",
+    1,
+    None,
+    (
+        Column("study", pa.string(), "what was sampled from", choices=("generator", "exact_score", "precision")),
+        Column("line", pa.string(), "which line of the plot: a solver with its settings, or what it is compared with"),
+        Column("num_inference_steps", pa.int32(), "steps; 0 where nothing was sampled", minimum=0),
+        Column("evaluations", pa.float64(), "evaluations of the U-Net an image; 0 where there were none", minimum=0),
+        Column("metric", pa.string(), "what was measured, with its unit"),
+        Column("against", pa.string(), "what it was compared with; empty for times and counts"),
+        Column("value", pa.float64(), "the measurement"),
+        Column("low", pa.float64(), "lower end of its 95 % interval", nullable=True),
+        Column("high", pa.float64(), "upper end of its 95 % interval", nullable=True),
+        Column("num_samples", pa.int64(), "images, or values, it was measured on", minimum=1),
+    ),
+)
 _ALL = (
     RECORDINGS,
     PARTS,
@@ -271,6 +301,8 @@ _ALL = (
     SCORES,
     SAMPLE_SCORES,
     REPORT,
+    TIMED_SAMPLES,
+    SPEED_VS_ERROR,
 )
 TABLES = {schema.name: schema for schema in _ALL}
 
