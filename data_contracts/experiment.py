@@ -66,6 +66,9 @@ class Experiment(Frozen):
     generator: GeneratorChoice
     sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
     num_synthetic: int = Field(gt=0, description="synthetic frames to sample, of the generator and of each baseline")
+    max_tries: int = Field(
+        3, ge=1, description="samplings of a frame, until it passes ctlev_core.image_gate; 1 = count refusals only"
+    )
     baselines: dict[str, Baseline] = Field(default_factory=dict, description="other generators, by a name of each")
     downstream: DownstreamChoice
     settings: tuple[Setting, ...] = Field(("real", "synthetic", "real+synthetic"), min_length=1)
