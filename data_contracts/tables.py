@@ -182,7 +182,7 @@ TRAINING = TableSchema(
 )
 SYNTHETIC = TableSchema(
     "synthetic",
-    3,
+    4,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),
@@ -198,7 +198,9 @@ SYNTHETIC = TableSchema(
         Column("scheduler", pa.string(), "sampler"),
         Column("num_inference_steps", pa.int32(), "network evaluations per image", minimum=1),
         Column("guidance_scale", pa.float64(), "classifier-free guidance; 1 = none", minimum=0),
-        Column("seed", pa.int64(), "seed of this row alone", minimum=0),
+        Column("seed", pa.int64(), "seed of this row's last try, from which it can be made again alone", minimum=0),
+        Column("num_tries", pa.int32(), "samplings of this row; the gate refused all but the last", minimum=1),
+        Column("refused", pa.string(), "why the gate refused the last try; empty where it passed"),
         *_LABELS,
     ),
 )

@@ -46,6 +46,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str) -> Baseli
     if hasattr(plugins.load("generators", baseline.generator.name), "sample_events"):
         synthetic = simulate(
             dataset.recordings,
+            dataset.frames,
             asked,
             sampling=baseline.sampling_choice,
             encoding=experiment.encoding,
@@ -56,7 +57,15 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str) -> Baseli
         return BaselineFrames(sample_conditions=asked, checkpoint=None, synthetic=synthetic)
     learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition)
     checkpoint = finetune(dataset.frames, learnt, generator=baseline.generator, seed=experiment.seed, label=name)
-    synthetic = sample(checkpoint, asked, sampling=baseline.sampling_choice, seed=experiment.seed, label=name)
+    synthetic = sample(
+        checkpoint,
+        dataset.frames,
+        asked,
+        sampling=baseline.sampling_choice,
+        max_tries=experiment.max_tries,
+        seed=experiment.seed,
+        label=name,
+    )
     return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)
 
 

@@ -1,4 +1,4 @@
-"""Sample labelled synthetic event images from a fine-tuned generator; what a schedule runs."""
+"""Sample labelled synthetic event images from a fine-tuned generator."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ def synthesize(
         checkpoint = call_flow(train_generator, experiment, dataset)
     return sample(
         checkpoint,
+        dataset.frames,
         dataset.sample_conditions,
         sampling=experiment.sampling_choice,
+        max_tries=experiment.max_tries,
         seed=experiment.seed,
         label=experiment.generator.name,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,33 +11,67 @@ from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.condition_sources import sensor_size_of
+from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
 from ctlev_core.row_seeds import row_seeds
-from ctlev_core.windows import window_around
+from ctlev_core.windows import spread, window_around
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events
+from data_contracts.labels import Conditions
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, conditions_of
 from tasks.stage import Output, input_files_of, stage
 
 SHARD_ROWS = 64
+MAX_GATE_FRAMES = 2_000
+"""Training frames the gate is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
-@stage(version=2, schema=tables.SYNTHETIC)
-def sample(out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling: SamplingChoice, seed: int) -> pa.Table:
-    """One frame per condition row, each from a seed of its own; the labels come along unchanged."""
-    plugin = plugins.load_options(sampling)
-    seeds = row_seeds(seed, len(conditions))
+@stage(version=3, schema=tables.SYNTHETIC)
+def sample(
+    out: Output,
+    checkpoint: Manifest,
+    frames: Manifest,
+    conditions: Manifest,
+    *,
+    sampling: SamplingChoice,
+    max_tries: int,
+    seed: int,
+) -> pa.Table:
+    """One frame per condition row, each from a seed of its own; the labels come along unchanged.
+
+    A row whose frame cannot be an event image, beside the training frames among `frames`, is sampled again, in all
+    `max_tries` times. If the last is refused as well it is kept, and says why.
+    """
+    plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
     folder = checkpoint.ref.path / "checkpoint"
-    frames = plugin.module.sample(folder, conditions_of(conditions), plugin.options, seeds=seeds, work=out.work)
-    out.write_array("frames", frames)
-    return _table(conditions, plugin, checkpoint.ref.digest, seeds)
+
+    def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
+        return plugin.module.sample(folder, _take(asked, rows), plugin.options, seeds=seeds, work=out.work)
+
+    made = sample_until_accepted(sample_rows, row_seeds(seed, len(asked)), gate_of(frames), max_tries=max_tries)
+    out.write_array("frames", made.frames)
+    return _table(conditions, plugin, checkpoint.ref.digest, made)
 
 
-@stage(version=1, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"))
+def gate_of(frames: Manifest) -> ImageGate:
+    """The gate of the training frames. Red and blue images have no green; grey ones have as much of it as of red."""
+    rows = frames.rows_where(split="train")
+    real = np.asarray(frames.array("frames")[rows[spread(len(rows), MAX_GATE_FRAMES)]])
+    return fit_gate(real, polarity=not real[..., 1].any())
+
+
+def _take(conditions: Conditions, rows: np.ndarray) -> Conditions:
+    """Some of the rows, which are text or images: bodies in motion are filmed, not sampled."""
+    images = None if conditions.images is None else np.asarray(conditions.images[rows])
+    return Conditions(tuple(conditions.prompts[row] for row in rows), images)
+
+
+@stage(version=2, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"))
 def simulate(
     out: Output,
     recordings: Manifest,
+    frames: Manifest,
     conditions: Manifest,
     *,
     sampling: SamplingChoice,
@@ -47,7 +81,8 @@ def simulate(
 ) -> pa.Table:
     """The events of each condition row on a sensor like that of `recordings`, encoded as those are.
 
-    A frame is the window around the labelled moment; a row without events becomes an empty frame.
+    A frame is the window around the labelled moment; a row without events becomes an empty frame. What the gate of
+    `sample` would refuse says so, but is not simulated again: a body that keeps still would send no events then either.
     """
     plugin, encoder = plugins.load_options(sampling), plugins.load_options(encoding)
     asked, seeds = conditions_of(conditions), row_seeds(seed, len(conditions))
@@ -67,15 +102,17 @@ def simulate(
                     asked.take(rows), sensor_size, plugin.options, seeds=seeds[rows]
                 )
                 moments_us = asked.motions.moment_us[rows]
-                frames = _encode(simulated, moments_us, durations_us[rows], windows, encoder)
+                encoded = _encode(simulated, moments_us, durations_us[rows], windows, encoder)
                 temporary = path.with_suffix(".tmp")
                 with temporary.open("wb") as file:
-                    np.save(file, frames, allow_pickle=False)
+                    np.save(file, encoded, allow_pickle=False)
                 temporary.replace(path)
             shards.append(np.load(path, allow_pickle=False))
             progress.update(len(shards[-1]))
-    out.write_array("frames", np.concatenate(shards))
-    return _table(conditions, plugin, "", seeds)
+    made = np.concatenate(shards)
+    out.write_array("frames", made)
+    gated = GatedImages(made, seeds, [1] * len(seeds), find_causes(made, gate_of(frames)))
+    return _table(conditions, plugin, "", gated)
 
 
 def _encode(
@@ -94,10 +131,10 @@ def _encode(
     return np.stack(frames)
 
 
-def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str, seeds: list[int]) -> pa.Table:
+def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str, made: GatedImages) -> pa.Table:
     # Generators that are no diffusion models make an image in one step, without scheduler or guidance.
     options: dict[str, Any] = plugin.options.model_dump()
-    count = len(seeds)
+    count = len(made.seeds)
     same = {
         "split": "train",
         "generator": f"{plugin.name} {plugin.version}",
@@ -115,6 +152,8 @@ def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str,
             **{name: pa.array([value] * count, pa.string()) for name, value in same.items()},
             "num_inference_steps": pa.array([options.get("num_inference_steps", 1)] * count, pa.int32()),
             "guidance_scale": pa.array([float(options.get("guidance_scale", 1.0))] * count, pa.float64()),
-            "seed": pa.array(seeds, pa.int64()),
+            "seed": pa.array(made.seeds, pa.int64()),
+            "num_tries": pa.array(made.num_tries, pa.int32()),
+            "refused": pa.array(made.causes, pa.string()),
         }
     )

@@ -92,7 +92,8 @@ def write_generated(folder, frames: np.ndarray) -> Manifest:
     names = [f"synthetic/{row:06d}" for row in range(count)]
     same = {
         "subject": "s", "split": "train", "class_name": "walk", "prompt": "", "generator": "test 1", "scheduler": "",
-        "checkpoint_digest": "", "num_inference_steps": 1, "guidance_scale": 1.0,
+        "checkpoint_digest": "", "num_inference_steps": 1, "guidance_scale": 1.0, "num_tries": 1,
+        "refused": "",
     }  # fmt: skip
     ids = {name: names for name in ("sample_id", "recording_id", "condition_id", "source_id")}
     columns = {**ids, **{name: [value] * count for name, value in same.items()}, "seed": list(range(count))}
