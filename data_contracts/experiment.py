@@ -23,6 +23,7 @@ from data_contracts.event_export import EventExport
 Setting = Literal["real", "synthetic", "real+synthetic"]
 PoseOrder = Literal["random", "in_time"]
 PoseViews = Literal["labelled", "new"]
+RESERVED = ("real", "synthetic", "more_real", "faithful")
 
 
 class Baseline(Frozen):
@@ -38,13 +39,21 @@ class Baseline(Frozen):
         return SamplingChoice(name=self.generator.name, options=self.sampling)
 
 
+class MoreReal(Frozen):
+    """Other real recordings to train on: of the very poses, say, that synthetic frames are sampled from."""
+
+    dataset: DatasetChoice = Field(description="its training recordings are used; it needs a test recording too")
+    windows: Windows | None = Field(None, description="how they are cut; None = as those of the experiment")
+
+
 class Experiment(Frozen):
     """One experiment: data, generator, how much to sample, and what to train and score with it.
 
     `baselines` are rows of the tables: a baseline `X` adds the settings `X` and `real+X` beside `synthetic` and
-    `real+synthetic`, where those are asked for. `sampling` are the generator's `SampleOptions`. `feature_extractor` is
-    the classifier, trained on real frames, in whose features real and synthetic frames are compared; None leaves the
-    comparison out.
+    `real+synthetic`, where those are asked for; `more_real` adds `more_real` and `real+more_real`, `scaling` and
+    `keep_faithful` the settings named in their descriptions. `sampling` are the generator's `SampleOptions`.
+    `feature_extractor` is the classifier, trained on real frames, in whose features real and synthetic frames are
+    compared; None leaves the comparison out.
     """
 
     name: str = Field(pattern=r"^[A-Za-z0-9._-]+$", description="names the experiment and its report")
@@ -67,7 +76,28 @@ class Experiment(Frozen):
     sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
     num_synthetic: int = Field(gt=0, description="synthetic frames to sample, of the generator and of each baseline")
     max_tries: int = Field(
-        3, ge=1, description="samplings of a frame, until it passes ctlev_core.image_gate; 1 = count refusals only"
+        3,
+        ge=1,
+        description="samplings of a frame, until it passes ctlev_core.image_gate; 1 = count refusals only",
+    )
+    num_generators: int = Field(
+        1,
+        ge=1,
+        description="fine-tunings, each with a seed and synthetic frames of its own, of the generator and of each "
+        "baseline; the downstream seeds take turns with them",
+    )
+    more_real: MoreReal | None = Field(
+        None, description="real recordings of the sampled poses: the most that synthetic frames can give"
+    )
+    scaling: tuple[float, ...] = Field(
+        (), description="train on real frames and these shares of the synthetic ones too, as settings `real+S@SHARE`"
+    )
+    keep_faithful: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="train also on this share of the synthetic frames, those whose labels a model trained on real "
+        "frames finds best: settings `faithful` and `real+faithful`",
     )
     baselines: dict[str, Baseline] = Field(default_factory=dict, description="other generators, by a name of each")
     downstream: DownstreamChoice
@@ -75,6 +105,11 @@ class Experiment(Frozen):
     downstream_seeds: tuple[int, ...] = Field((0,), min_length=1, description="one training per setting and seed")
     metrics: tuple[MetricChoice, ...] = Field(min_length=1)
     feature_extractor: DownstreamChoice | None = None
+    distances: tuple[MetricChoice, ...] = Field(
+        (MetricChoice(name="frechet"), MetricChoice(name="kid")),
+        min_length=1,
+        description="metrics of the features of two sets of frames",
+    )
     export: EventExport | None = Field(None, description="also write the synthetic frames as event streams")
     realism_reference: DatasetChoice | None = Field(
         None, description="recordings that the experiment's own are compared with, number by number, in the report"
@@ -84,11 +119,18 @@ class Experiment(Frozen):
     @classmethod
     def _names_are_free(cls, baselines: dict[str, Baseline]) -> dict[str, Baseline]:
         for name in baselines:
-            if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in ("real", "synthetic"):
+            if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in RESERVED:
                 raise ValueError(
-                    f"a baseline's name is made of a-z, 0-9 and _, and is not real or synthetic, got {name!r}"
+                    f"a baseline's name is made of a-z, 0-9 and _, and is not {' or '.join(RESERVED)}, got {name!r}"
                 )
         return baselines
+
+    @field_validator("scaling")
+    @classmethod
+    def _shares_are_shares(cls, scaling: tuple[float, ...]) -> tuple[float, ...]:
+        if any(not 0 < share < 1 for share in scaling) or len(set(scaling)) < len(scaling):
+            raise ValueError(f"scaling are different shares between 0 and 1, got {scaling}; all frames are a setting")
+        return scaling
 
     @property
     def sampling_choice(self) -> SamplingChoice:
@@ -99,9 +141,10 @@ class Experiment(Frozen):
     def choices(self) -> list[Any]:
         """Every plug-in the experiment names."""
         chosen = [self.dataset, self.encoding, self.condition, self.generator, self.sampling_choice, self.downstream]
-        optional = [choice for choice in (self.poses, self.feature_extractor, self.realism_reference) if choice]
+        more = None if self.more_real is None else self.more_real.dataset
+        optional = [c for c in (self.poses, self.feature_extractor, self.realism_reference, more) if c]
         others = [c for b in self.baselines.values() for c in (b.condition, b.generator, b.sampling_choice)]
-        return [*chosen, *optional, *others, *self.metrics]
+        return [*chosen, *optional, *others, *self.metrics, *self.distances]
 
     @property
     def generator_names(self) -> list[str]:
@@ -111,5 +154,13 @@ class Experiment(Frozen):
     @property
     def trained_settings(self) -> list[str]:
         """What downstream models are trained on, in the order of the tables."""
-        names = [setting.replace("synthetic", name) for setting in self.settings for name in self.generator_names]
+        makers = list(self.generator_names)
+        makers += ["faithful"] * (self.keep_faithful is not None) + ["more_real"] * (self.more_real is not None)
+        names = [setting.replace("synthetic", name) for setting in self.settings for name in makers]
+        names += [f"real+{share_name(share)}" for share in sorted(self.scaling)]
         return list(dict.fromkeys(names))
+
+
+def share_name(share: float) -> str:
+    """The name of the first part of the synthetic frames in a setting."""
+    return f"synthetic@{share:g}"

@@ -6,9 +6,10 @@ import sys
 from functools import partial
 
 from ctlev_core import plugins
+from ctlev_core.report.refusals import count_refusals
 from data_contracts.config import Frozen
 from data_contracts.experiment import Experiment
-from data_contracts.manifest import ManifestRef
+from data_contracts.manifest import ManifestRef, read_manifest
 from flows.command_line import main
 from flows.prepare_dataset import (
     PreparedDataset,
@@ -19,7 +20,7 @@ from flows.prepare_dataset import (
 from flows.settings import flow
 from tasks.finetune import finetune
 from tasks.sample import sample, simulate
-from tasks.stage import call_flow, call_together
+from tasks.stage import call_flow, call_together, numbered
 
 
 class BaselineFrames(Frozen):
@@ -31,17 +32,19 @@ class BaselineFrames(Frozen):
 
 
 @flow(name="baselines")
-def baselines(experiment: Experiment, dataset: PreparedDataset | None = None) -> dict[str, BaselineFrames]:
-    """Train each baseline that learns, and sample all; the dataset is prepared first unless it is given."""
+def baselines(experiment: Experiment, dataset: PreparedDataset | None = None) -> dict[str, list[BaselineFrames]]:
+    """Train each baseline that learns, as often as the generator, and sample all; the dataset is prepared first."""
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     prepared = dataset
-    calls = [partial(_make, experiment, prepared, name) for name in experiment.baselines]
-    return dict(zip(experiment.baselines, call_together(*calls), strict=True))
+    numbers = range(experiment.num_generators)
+    calls = [partial(_make, experiment, prepared, name, number) for name in experiment.baselines for number in numbers]
+    made = iter(call_together(*calls))
+    return {name: [next(made) for _ in numbers] for name in experiment.baselines}
 
 
-def _make(experiment: Experiment, dataset: PreparedDataset, name: str) -> BaselineFrames:
-    baseline = experiment.baselines[name]
+def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: int) -> BaselineFrames:
+    baseline, seed, label = experiment.baselines[name], experiment.seed + number, numbered(name, number)
     asked = condition_asked_samples(experiment, dataset.poses, dataset.recordings, dataset.frames, baseline.condition)
     if hasattr(plugins.load("generators", baseline.generator.name), "sample_events"):
         synthetic = simulate(
@@ -51,20 +54,20 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str) -> Baseli
             sampling=baseline.sampling_choice,
             encoding=experiment.encoding,
             windows=experiment.windows,
-            seed=experiment.seed,
-            label=name,
+            seed=seed,
+            label=label,
         )
         return BaselineFrames(sample_conditions=asked, checkpoint=None, synthetic=synthetic)
     learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition)
-    checkpoint = finetune(dataset.frames, learnt, generator=baseline.generator, seed=experiment.seed, label=name)
+    checkpoint = finetune(dataset.frames, learnt, generator=baseline.generator, seed=seed, label=label)
     synthetic = sample(
         checkpoint,
         dataset.frames,
         asked,
         sampling=baseline.sampling_choice,
         max_tries=experiment.max_tries,
-        seed=experiment.seed,
-        label=name,
+        seed=seed,
+        label=label,
     )
     return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)
 
@@ -74,7 +77,9 @@ if __name__ == "__main__":
         main(
             baselines,
             lambda made, _: "\n".join(
-                f"{name}: {frames.synthetic.rows} frames in {frames.synthetic.path}" for name, frames in made.items()
+                f"{name}: {count_refusals(read_manifest(frames.synthetic))}, in {frames.synthetic.path}"
+                for name, sets in made.items()
+                for frames in sets
             ),
         )
     )

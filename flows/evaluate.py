@@ -6,7 +6,7 @@ import sys
 from functools import partial
 
 from data_contracts.config import DownstreamChoice, Frozen
-from data_contracts.experiment import Experiment
+from data_contracts.experiment import Experiment, share_name
 from data_contracts.manifest import ManifestRef
 from flows.baselines import BaselineFrames, baselines
 from flows.command_line import main
@@ -14,8 +14,12 @@ from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from flows.synthesize import synthesize
 from tasks.downstream import train_downstream
-from tasks.evaluate import LABELS_OF, score_distance, score_model
-from tasks.stage import call_flow, call_together
+from tasks.evaluate import LABELS_OF, SHUFFLED, score_distance, score_model
+from tasks.stage import call_flow, call_together, numbered
+from tasks.subset import take_faithful, take_share
+
+Generated = dict[str, list[ManifestRef]]
+"""The sets of frames of each generator, one a fine-tuning."""
 
 
 class Evaluation(Frozen):
@@ -31,22 +35,22 @@ class Evaluation(Frozen):
 def evaluate(
     experiment: Experiment,
     dataset: PreparedDataset | None = None,
-    synthetic: ManifestRef | None = None,
-    compared: dict[str, BaselineFrames] | None = None,
+    synthetic: list[ManifestRef] | None = None,
+    compared: dict[str, list[BaselineFrames]] | None = None,
 ) -> Evaluation:
     """Train and score every setting and seed; what is not given is made first."""
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     if synthetic is None:
-        synthetic = call_flow(synthesize, experiment, dataset)
+        synthetic = [call_flow(synthesize, experiment, dataset, number=n) for n in range(experiment.num_generators)]
     if compared is None:
         compared = call_flow(baselines, experiment, dataset)
-    generated = {"synthetic": synthetic} | {name: frames.synthetic for name, frames in compared.items()}
+    generated: Generated = {"synthetic": synthetic}
+    generated |= {name: [frames.synthetic for frames in made] for name, made in compared.items()}
     trained = [(setting, seed) for setting in experiment.trained_settings for seed in experiment.downstream_seeds]
-    frames = dataset.frames
-    calls = [partial(_train_and_score, experiment, frames, generated, setting, seed) for setting, seed in trained]
+    calls = [partial(_train_and_score, experiment, dataset, generated, setting, seed) for setting, seed in trained]
     if experiment.feature_extractor is not None:
-        calls.append(partial(_distances, experiment.feature_extractor, experiment.seed, frames, generated))
+        calls.append(partial(_distances, experiment, experiment.feature_extractor, dataset.frames, generated))
     found = call_together(*calls)
     return Evaluation(
         extractor=found[-1][0] if experiment.feature_extractor is not None else None,
@@ -57,21 +61,26 @@ def evaluate(
 
 
 def _train_and_score(
-    experiment: Experiment, frames: ManifestRef, generated: dict[str, ManifestRef], setting: str, seed: int
+    experiment: Experiment, dataset: PreparedDataset, generated: Generated, setting: str, seed: int
 ) -> tuple[ManifestRef, list[ManifestRef]]:
     """A model of one setting and seed, and its scores."""
-    training_set = [frames if part == "real" else generated[part] for part in setting.split("+")]
+    training_set = [_frames_of(experiment, dataset, generated, part, seed) for part in setting.split("+")]
     label = f"{experiment.downstream.name} on {setting}, seed {seed}"
     model = train_downstream(training_set, downstream=experiment.downstream, seed=seed, label=label)
-    tested = [(frames, "test", setting)]
+    tested = [(dataset.frames, "test", setting, [dataset.sample_conditions])]
     if setting == "real":
-        # Do the synthetic frames show what their labels say? The real row's error is the floor.
-        tested += [(made, "train", f"{LABELS_OF} {name}") for name, made in generated.items()]
+        # Do the synthetic frames show what their labels say? The real row's error is the floor, other frames' labels
+        # are the ceiling.
+        for name, sets in generated.items():
+            made = _of_seed(experiment, sets, seed)
+            tested += [(made, "train", f"{LABELS_OF} {name}", [])]
+            tested += [(made, "train", f"{SHUFFLED} {LABELS_OF} {name}", [])] * (name == "synthetic")
     scores = [
         score_model(
             model,
             data,
             training_set,
+            asked,
             downstream=experiment.downstream,
             metrics=list(experiment.metrics),
             setting=row,
@@ -79,20 +88,63 @@ def _train_and_score(
             seed=seed,
             label=f"{label}: {row}",
         )
-        for data, split, row in tested
+        for data, split, row, asked in tested
     ]
     return model, scores
 
 
+def _frames_of(
+    experiment: Experiment, dataset: PreparedDataset, generated: Generated, part: str, seed: int
+) -> ManifestRef:
+    """The training frames that a part of a setting's name stands for."""
+    if part == "real":
+        return dataset.frames
+    if part == "more_real" and dataset.more_frames is not None:
+        return dataset.more_frames
+    if part in generated:
+        return _of_seed(experiment, generated[part], seed)
+    synthetic = _of_seed(experiment, generated["synthetic"], seed)
+    if part == "faithful":
+        judge = train_downstream([dataset.frames], downstream=experiment.downstream, seed=seed, label="judge of labels")
+        return take_faithful(
+            judge,
+            synthetic,
+            downstream=experiment.downstream,
+            metric=experiment.metrics[0],
+            share=experiment.keep_faithful,
+            label=f"faithful frames, seed {seed}",
+        )
+    share = next(share for share in experiment.scaling if share_name(share) == part)
+    return take_share(synthetic, share=share, label=part)
+
+
+def _of_seed(experiment: Experiment, sets: list[ManifestRef], seed: int) -> ManifestRef:
+    """Downstream seeds take turns with the fine-tunings, so that their spread is that of both."""
+    return sets[experiment.downstream_seeds.index(seed) % len(sets)]
+
+
 def _distances(
-    feature_extractor: DownstreamChoice, seed: int, frames: ManifestRef, generated: dict[str, ManifestRef]
+    experiment: Experiment, feature_extractor: DownstreamChoice, frames: ManifestRef, generated: Generated
 ) -> tuple[ManifestRef, list[ManifestRef]]:
     """The feature extractor, and how far held-out real and generated frames are from the real training frames."""
-    extractor = train_downstream([frames], downstream=feature_extractor, seed=seed, label="feature extractor")
-    compared = [(frames, "test", "held-out real"), *((made, "train", name) for name, made in generated.items())]
+    extractor = train_downstream(
+        [frames], downstream=feature_extractor, seed=experiment.seed, label="feature extractor"
+    )
+    compared = [(frames, "test", "held-out real", 0)]
+    compared += [(made, "train", name, number) for name, sets in generated.items() for number, made in enumerate(sets)]
     scores = [
-        score_distance(extractor, frames, data, downstream=feature_extractor, setting=row, split=split, label=row)
-        for data, split, row in compared
+        score_distance(
+            extractor,
+            frames,
+            data,
+            downstream=feature_extractor,
+            distances=list(experiment.distances),
+            setting=row,
+            split=split,
+            seed=number,
+            label=numbered(row, number),
+        )
+        for data, split, row, number in compared
     ]
     return extractor, scores
 

@@ -6,6 +6,7 @@ python flows/full_experiment.py [--preset NAME] [--set key=value ...] [--dry-run
 from __future__ import annotations
 
 import sys
+from functools import partial
 
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
@@ -28,11 +29,15 @@ from tasks.stage import call_flow, call_together
 def full_experiment(experiment: Experiment) -> ManifestRef:
     """Every stage from recordings to the report; what is in the store already is not computed again."""
     dataset = call_flow(prepare_dataset, experiment)
-    (checkpoint, synthetic), compared = call_together(
-        lambda: _own_frames(experiment, dataset), lambda: call_flow(baselines, experiment, dataset)
+    *own, compared = call_together(
+        *(partial(_own_frames, experiment, dataset, number) for number in range(experiment.num_generators)),
+        lambda: call_flow(baselines, experiment, dataset),
     )
-    evaluation = call_flow(evaluate, experiment, dataset, synthetic, compared)
-    generated = [synthetic, *(frames.synthetic for frames in compared.values())]
+    evaluation = call_flow(evaluate, experiment, dataset, [synthetic for _, synthetic in own], compared)
+    # What is shown are the first set of each generator and the first of several fine-tunings.
+    first = {name: sets[0] for name, sets in compared.items()}
+    checkpoint, synthetic = own[0]
+    generated = [synthetic, *(frames.synthetic for frames in first.values())]
     reference = None
     if experiment.realism_reference is not None:
         reference = ingest(dataset=experiment.realism_reference, label="realism reference")
@@ -62,7 +67,7 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
         dataset.frames,
         dataset.frame_conditions,
         dataset.sample_conditions,
-        [checkpoint, *(frames.checkpoint for frames in compared.values() if frames.checkpoint)],
+        [checkpoint, *(frames.checkpoint for frames in first.values() if frames.checkpoint)],
         generated,
         evaluation.scores,
         evaluation.models,
@@ -72,15 +77,15 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
         notice=experiment.data_notice,
         settings=experiment.trained_settings,
         generator_names=experiment.generator_names,
-        checkpoint_names=["synthetic", *(name for name, frames in compared.items() if frames.checkpoint)],
+        checkpoint_names=["synthetic", *(name for name, frames in first.items() if frames.checkpoint)],
         model_names=evaluation.model_names,
         label=experiment.name,
     )
 
 
-def _own_frames(experiment: Experiment, dataset: PreparedDataset) -> tuple[ManifestRef, ManifestRef]:
-    checkpoint = call_flow(train_generator, experiment, dataset)
-    return checkpoint, call_flow(synthesize, experiment, dataset, checkpoint)
+def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -> tuple[ManifestRef, ManifestRef]:
+    checkpoint = call_flow(train_generator, experiment, dataset, number)
+    return checkpoint, call_flow(synthesize, experiment, dataset, checkpoint, number)
 
 
 if __name__ == "__main__":

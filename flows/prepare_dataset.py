@@ -16,7 +16,9 @@ from tasks.ingest import ingest
 
 
 class PreparedDataset(Frozen):
-    """Manifests of a dataset ready for training and sampling; `poses` are the recordings whose labels are sampled."""
+    """Manifests of a dataset ready for training and sampling; `poses` are the recordings whose labels are sampled,
+    `more_frames` other real frames to train on.
+    """
 
     recordings: ManifestRef
     poses: ManifestRef
@@ -24,6 +26,7 @@ class PreparedDataset(Frozen):
     frame_conditions: ManifestRef
     sample_conditions: ManifestRef
     contact_sheet: ManifestRef
+    more_frames: ManifestRef | None = None
 
 
 @flow(name="prepare-dataset")
@@ -53,7 +56,18 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         frame_conditions=frame_conditions,
         sample_conditions=sample_conditions,
         contact_sheet=sheet,
+        more_frames=_more_frames(experiment),
     )
+
+
+def _more_frames(experiment: Experiment) -> ManifestRef | None:
+    """Other real recordings to train on, where the experiment names some."""
+    more = experiment.more_real
+    if more is None:
+        return None
+    recordings = ingest(dataset=more.dataset, label=f"{more.dataset.name}, more real recordings")
+    windows = more.windows or experiment.windows
+    return encode(recordings, encoding=experiment.encoding, windows=windows, label="more real recordings")
 
 
 def condition_training_frames(

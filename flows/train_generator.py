@@ -10,20 +10,20 @@ from flows.command_line import main
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from tasks.finetune import finetune
-from tasks.stage import call_flow
+from tasks.stage import call_flow, numbered
 
 
 @flow(name="train-generator")
-def train_generator(experiment: Experiment, dataset: PreparedDataset | None = None) -> ManifestRef:
-    """Fine-tune the experiment's generator; the dataset is prepared first unless it is given."""
+def train_generator(experiment: Experiment, dataset: PreparedDataset | None = None, number: int = 0) -> ManifestRef:
+    """Fine-tune the experiment's generator, the `number`-th of several; the dataset is prepared unless it is given."""
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     return finetune(
         dataset.frames,
         dataset.frame_conditions,
         generator=experiment.generator,
-        seed=experiment.seed,
-        label=experiment.generator.name,
+        seed=experiment.seed + number,
+        label=numbered(experiment.generator.name, number),
     )
 
 

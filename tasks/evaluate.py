@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,18 @@ from tasks.stage import Output, stage
 
 LABELS_OF = "labels of"
 """Settings that start so score frames of a generator against the labels they were made from."""
+SHUFFLED = "shuffled"
+"""Settings that start so score the same frames against the labels of others: how bad no faithfulness at all is."""
+SHUFFLE_STREAM = 40
 
 
-@stage(version=5, schema=tables.SCORES)
+@stage(version=6, schema=tables.SCORES)
 def score_model(
     out: Output,
     model: Manifest,
     data: Manifest,
     training_sets: list[Manifest],
+    asked: list[Manifest],
     *,
     downstream: DownstreamChoice,
     metrics: list[MetricChoice],
@@ -36,7 +41,10 @@ def score_model(
 ) -> pa.Table:
     """Every metric on one split, for all rows and for each class, with an interval over recordings.
 
-    Beside the table lie the scores of the single samples, from which two models can be compared in pairs.
+    Classes that real training frames show, those that only the labels to sample from (`asked`) have, and those that
+    neither has are groups of their own: what synthetic data adds is in the second. Beside the table lie the scores of
+    the single samples, from which two models can be compared in pairs. A setting that starts with `SHUFFLED` gives
+    every frame the labels of another.
     """
     plugin = plugins.load_options(downstream)
     rows = data.rows_where(split=split)
@@ -45,6 +53,8 @@ def score_model(
     _refuse_overlap(data, rows, training_sets, split)
     prediction = plugin.module.predict(model.ref.path / "model", np.asarray(data.array("frames")[rows]))
     labels = data.labels.take(rows)
+    if setting.startswith(SHUFFLED):
+        labels = labels.take(_others(len(rows), seed))
     recordings = np.array(data.column("recording_id"))[rows]
     num_train = sum(len(training_set.rows_where(split="train")) for training_set in training_sets)
     same = {
@@ -64,7 +74,7 @@ def score_model(
             values = metric.module.compute_rows(prediction, labels, metric.options)
             columns = {"sample_id": sample_ids, "recording_id": recordings, "metric": [metric.name] * len(rows)}
             sample_scores.append(pa.table({**columns, "value": pa.array(values, pa.float64(), from_pandas=True)}))
-        for group, members in _groups(labels.class_names):
+        for group, members in [*_groups(labels.class_names), *_groups_by_origin(labels.class_names, data, asked)]:
             try:
                 scores, low, high = _score(metric, prediction, labels.take(members), members, recordings[members])
             except ValueError:
@@ -92,6 +102,29 @@ def _groups(class_names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
     names = np.array(class_names)
     classes = [name for name in dict.fromkeys(class_names) if name]
     return [("all", np.arange(len(names))), *((name, np.flatnonzero(names == name)) for name in sorted(classes))]
+
+
+def _groups_by_origin(
+    class_names: Sequence[str], data: Manifest, asked: list[Manifest]
+) -> list[tuple[str, np.ndarray]]:
+    """Rows by where their class was to be learnt from; nothing where one group has them all."""
+    seen = {data.column("class_name")[row] for row in data.rows_where(split="train")}
+    sampled = {name for manifest in asked for name in manifest.column("class_name")} - seen
+    parts = {
+        "classes with real training frames": seen,
+        "classes with synthetic frames only": sampled,
+        "classes without training frames": set(class_names) - seen - sampled,
+    }
+    groups = [(name, np.flatnonzero([c in classes for c in class_names])) for name, classes in parts.items()]
+    return [(name, rows) for name, rows in groups if 0 < len(rows) < len(class_names)]
+
+
+def _others(count: int, seed: int) -> np.ndarray:
+    """For each row another one (but for a single row), all of them once."""
+    order = np.random.default_rng([seed, SHUFFLE_STREAM]).permutation(count)
+    other = np.empty(count, np.int64)
+    other[order] = np.roll(order, 1)
+    return other
 
 
 def _score(
@@ -146,7 +179,7 @@ def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manife
             raise DataError(f"{data.ref.path}: sample {shared[0]!r} is in the training data and in split {split!r}")
 
 
-@stage(version=2, schema=tables.SCORES)
+@stage(version=3, schema=tables.SCORES)
 def score_distance(
     out: Output,
     extractor: Manifest,
@@ -154,42 +187,50 @@ def score_distance(
     other: Manifest,
     *,
     downstream: DownstreamChoice,
+    distances: list[MetricChoice],
     setting: str,
     split: str,
+    seed: int,
 ) -> pa.Table:
-    """Frechet distance between the features of real training frames and of another set of frames.
+    """Distances between the features of real training frames and of another set of frames.
 
-    The features are those of a classifier trained on real events, so the score is named after that classifier and
-    never `fid`. Values depend on the number of samples: compare rows of equal `num_samples` only, and read them
-    against the row of held-out real frames. Intervals come from halves by recording, for a bootstrap is biased.
+    The features are those of a classifier trained on real events, so a score is named after that classifier and never
+    `fid`. Values depend on the number of samples: compare rows of equal `num_samples` only, and read them against the
+    row of held-out real frames. Intervals come from halves by recording, for a bootstrap is biased. `seed` is that of
+    the generator.
     """
     plugin = plugins.load_options(downstream)
-    frechet = plugins.load("metrics", "frechet")
     folder = extractor.ref.path / "model"
     compared, learnt = (other, other.rows_where(split=split)), (real, real.rows_where(split="train"))
     features, groups = [], []
     for data, rows in (compared, learnt):
         features.append(plugin.module.features(folder, np.asarray(data.array("frames")[rows])))
         groups.append(np.array(data.column("recording_id"))[rows])
-    options = frechet.Options()
-    estimate = estimate_distances(
-        lambda first, second: frechet.compute(first, second, options),
-        *features,
-        predicted_groups=groups[0],
-        target_groups=groups[1],
-    )["fd"]
-    row = {
-        "task": "distance",
-        "setting": setting,
-        "seed": 0,
-        "group": "all",
-        "metric": f"fd_event_{plugin.name}_{extractor.ref.digest[:8]}",
-        "value": estimate.value,
-        "low": None if np.isnan(estimate.low) else estimate.low,
-        "high": None if np.isnan(estimate.high) else estimate.high,
-        "num_samples": estimate.num_predicted,
-        "num_train": estimate.num_target,
-        "model_digest": extractor.ref.digest,
-        "data_digest": other.ref.digest,
-    }
-    return pa.Table.from_pylist([row], schema=tables.SCORES.arrow())
+    found = []
+    for choice in distances:
+        metric = plugins.load_options(choice)
+        if metric.module.INPUT != "features":
+            raise DataError(f"distances: {choice.name!r} compares {metric.module.INPUT}, not the features of two sets")
+        estimates = estimate_distances(
+            partial(metric.module.compute, options=metric.options),
+            *features,
+            predicted_groups=groups[0],
+            target_groups=groups[1],
+        )
+        for name, estimate in estimates.items():
+            row = {
+                "task": "distance",
+                "setting": setting,
+                "seed": seed,
+                "group": "all",
+                "metric": f"{name}_event_{plugin.name}_{extractor.ref.digest[:8]}",
+                "value": estimate.value,
+                "low": None if np.isnan(estimate.low) else estimate.low,
+                "high": None if np.isnan(estimate.high) else estimate.high,
+                "num_samples": estimate.num_predicted,
+                "num_train": estimate.num_target,
+                "model_digest": extractor.ref.digest,
+                "data_digest": other.ref.digest,
+            }
+            found.append(row)
+    return pa.Table.from_pylist(found, schema=tables.SCORES.arrow())

@@ -230,6 +230,11 @@ class Stage:
         return store.publish(self.name, key, folder, record)
 
 
+def numbered(label: str, number: int) -> str:
+    """The label of one of several alike; the first has none."""
+    return f"{label}, {number + 1}" if number else label
+
+
 def files_of(folders: Sequence[Path]) -> list[tuple[str, Path]]:
     """Every file of some folders, named by the folder's number and the path inside, for `raw_files`."""
     return [

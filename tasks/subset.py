@@ -1,0 +1,61 @@
+"""Parts of a set of synthetic frames: the first ones, or those that show best what their labels say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core import plugins
+from ctlev_core.report.verdict import lower_is_better
+from data_contracts import tables
+from data_contracts.config import DownstreamChoice, MetricChoice
+from data_contracts.errors import DataError
+from data_contracts.manifest import Manifest
+from tasks.stage import Output, stage
+
+
+@stage(version=1, schema=tables.SYNTHETIC)
+def take_share(out: Output, synthetic: Manifest, *, share: float) -> pa.Table:
+    """The first rows, one at least: classes and recordings took turns when the labels were chosen."""
+    return _take(out, synthetic, np.arange(max(round(share * len(synthetic)), 1)))
+
+
+@stage(version=1, schema=tables.SYNTHETIC)
+def take_faithful(
+    out: Output,
+    model: Manifest,
+    synthetic: Manifest,
+    *,
+    downstream: DownstreamChoice,
+    metric: MetricChoice,
+    share: float,
+) -> pa.Table:
+    """The share of each class whose labels a model trained on real frames finds best.
+
+    It chooses within classes, so that the mixture of classes, and with it what is easy, stays as it was. Rows that the
+    metric has no score for are left out first.
+
+    Raises:
+        DataError: the metric has no score of single rows.
+    """
+    plugin, scorer = plugins.load_options(downstream), plugins.load_options(metric)
+    if not hasattr(scorer.module, "compute_rows"):
+        raise DataError(f"keep_faithful: metric {metric.name!r} has no score of single frames to choose by")
+    prediction: Any = plugin.module.predict(model.ref.path / "model", np.asarray(synthetic.array("frames")))
+    scores = scorer.module.compute_rows(prediction, synthetic.labels, scorer.options)
+    errors = scores if lower_is_better(metric.name) else -scores
+    errors = np.where(np.isnan(errors), np.inf, errors)
+    names = np.array(synthetic.labels.class_names)
+    kept = []
+    for name in np.unique(names):
+        members = np.flatnonzero(names == name)
+        best = members[np.argsort(errors[members], kind="stable")]
+        kept.append(best[: max(round(share * len(members)), 1)])
+    return _take(out, synthetic, np.sort(np.concatenate(kept)))
+
+
+def _take(out: Output, synthetic: Manifest, rows: np.ndarray) -> pa.Table:
+    out.write_array("frames", np.asarray(synthetic.array("frames")[rows]))
+    return synthetic.table.take(rows)
