@@ -1,0 +1,157 @@
+"""The stage that samples frames: the gate before them, tries that are counted, rows that can be made again alone."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from tiny_prior import make_data, shared_prior
+
+from ctlev_core import plugins
+from ctlev_core.diffusion import sampling
+from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.image_gate import find_causes, seed_of_try
+from ctlev_core.row_seeds import row_seeds
+from data_contracts import tables
+from data_contracts.config import SamplingChoice
+from data_contracts.labels import Conditions, Labels
+from data_contracts.manifest import Manifest, conditions_of, label_columns, read_manifest, write_manifest
+from tasks import sample as task
+from tasks.stage import Output
+
+OPTIONS = SamplingOptions(num_inference_steps=2, palette="grey", batch_size=2)
+COUNT, SEED = 6, 3
+
+
+def draw(conditions: Conditions, seeds, work) -> np.ndarray:
+    """Noise of the random prior; where the seed is odd, nothing."""
+    frames = sampling.sample_frames(shared_prior(), conditions, OPTIONS, seeds=seeds, work=work)
+    frames[np.array(seeds) % 2 == 1] = 0
+    return frames
+
+
+@pytest.fixture(autouse=True)
+def generator(monkeypatch):
+    def sample(folder, conditions, options, *, seeds, work):
+        assert folder.name == "checkpoint"
+        return draw(conditions, seeds, work)
+
+    plugin = plugins.Plugin("generators", "tiny", SimpleNamespace(sample=sample, VERSION=1), OPTIONS)
+    monkeypatch.setattr(task.plugins, "load_options", lambda choice: plugin)
+
+
+def write_frames(folder, frames: np.ndarray) -> Manifest:
+    folder.mkdir()
+    count = len(frames)
+    np.save(folder / "frames.npy", frames)
+    table = pa.table(
+        {
+            "sample_id": [f"f{row}" for row in range(count)],
+            "recording_id": [f"r{row}" for row in range(count)],
+            "subject": ["s"] * count,
+            "split": ["train"] * (count - 1) + ["test"],
+            "class_name": ["walk"] * count,
+            **{name: pa.array([1] * count, pa.int64()) for name in ("t_start_us", "t_end_us", "num_events")},
+            **label_columns(Labels(("walk",) * count, np.arange(count))),
+        }
+    )
+    return read_manifest(write_manifest(folder, table.select(tables.FRAMES.arrow().names), tables.FRAMES))
+
+
+def write_conditions(folder) -> Manifest:
+    folder.mkdir()
+    images, conditions = make_data(COUNT)  # whose condition images are the frames
+    np.save(folder / "images.npy", images)
+    names = [f"c{row}" for row in range(COUNT)]
+    joints = np.arange(COUNT * 26, dtype=np.float32).reshape(COUNT, 13, 2)
+    labels = Labels(("walk",) * COUNT, np.arange(COUNT), joints, np.ones((COUNT, 13), bool), "dhp19")
+    table = pa.table(
+        {
+            **{name: names for name in ("sample_id", "source_id", "subject", "class_name")},
+            "prompt": pa.array(conditions.prompts, pa.string()),
+            **{name: pa.array([1] * COUNT, pa.int64()) for name in ("t_start_us", "t_end_us")},
+            **label_columns(labels),
+        }
+    )
+    return read_manifest(write_manifest(folder, table.select(tables.CONDITIONS.arrow().names), tables.CONDITIONS))
+
+
+@pytest.fixture
+def inputs(tmp_path):
+    """A checkpoint, real frames like those the generator draws, and conditions."""
+    _, other = make_data(8, seed=1)
+    real = draw(other, [2 * row for row in range(8)], tmp_path / "real_work")
+    frames = write_frames(tmp_path / "frames", real)
+    return frames, frames, write_conditions(tmp_path / "conditions")
+
+
+def run(tmp_path, inputs, name="out", max_tries=20) -> Manifest:
+    folder, work = tmp_path / name, tmp_path / f"{name}_work"
+    folder.mkdir()
+    work.mkdir(exist_ok=True)
+    table = task.sample.function(
+        Output(folder, work), *inputs, sampling=SamplingChoice(name="tiny"), max_tries=max_tries, seed=SEED
+    )
+    return read_manifest(write_manifest(folder, table, tables.SYNTHETIC))
+
+
+def test_refused_rows_are_sampled_again_and_every_row_can_be_made_alone(tmp_path, inputs):
+    made = run(tmp_path, inputs)
+    first, used, tries = row_seeds(SEED, COUNT), made.column("seed"), made.column("num_tries")
+    assert min(tries) == 1 < max(tries), "some rows must pass at once and others not"
+    assert used == [seed_of_try(seed, number - 1) for seed, number in zip(first, tries, strict=True)]
+    assert made.column("refused") == [""] * COUNT and not any(seed % 2 for seed in used)
+    asked = conditions_of(inputs[2])
+    for row, seed in enumerate(used):
+        alone = draw(asked.take(slice(row, row + 1)), [seed], tmp_path / f"alone_{row}")
+        # Convolutions may round otherwise in batches of another size; by one level at most.
+        assert np.abs(alone[0].astype(int) - made.array("frames")[row]).max() <= 1
+    np.testing.assert_array_equal(made.labels.joints2d, inputs[2].labels.joints2d)
+
+
+def test_rows_that_never_pass_keep_their_last_frame_and_say_why(tmp_path, inputs):
+    made = run(tmp_path, inputs, max_tries=1)
+    refused = np.array([bool(cause) for cause in made.column("refused")])
+    np.testing.assert_array_equal(refused, np.array(row_seeds(SEED, COUNT)) % 2 == 1)
+    assert made.column("num_tries") == [1] * COUNT and made.column("seed") == row_seeds(SEED, COUNT)
+    assert all(cause.startswith("empty: active_share 0, expected") for cause in made.column("refused") if cause)
+    assert not made.array("frames")[refused].any() and made.array("frames")[~refused].any()
+
+
+def test_a_run_killed_in_a_later_try_goes_on_from_what_it_sampled(tmp_path, inputs, monkeypatch):
+    whole = run(tmp_path, inputs, "whole")
+    original, counted = sampling.sample_latents, []
+
+    def until(limit):
+        def sample_latents(*arguments):
+            if len(counted) == limit:
+                raise KeyboardInterrupt
+            counted.append(len(arguments[4]))
+            return original(*arguments)
+
+        return sample_latents
+
+    monkeypatch.setattr(sampling, "sample_latents", until(COUNT // OPTIONS.batch_size))
+    with pytest.raises(KeyboardInterrupt):  # in the second try: the first takes three batches
+        run(tmp_path, inputs, "killed")
+    (tmp_path / "killed").rename(tmp_path / "half")
+    counted.clear()
+    monkeypatch.setattr(sampling, "sample_latents", until(-1))
+    resumed = run(tmp_path, inputs, "killed")
+    assert sum(counted) == sum(whole.column("num_tries")) - COUNT, "the first try was not sampled again"
+    assert resumed.table.equals(whole.table)
+    np.testing.assert_array_equal(resumed.array("frames"), whole.array("frames"))
+
+
+def test_the_gate_is_that_of_the_training_frames(tmp_path):
+    bars, _ = make_data(4)
+    bars[:, 0, 0] = 255
+    grey = task.gate_of(write_frames(tmp_path / "grey", bars))
+    coloured = task.gate_of(write_frames(tmp_path / "coloured", bars * np.array([1, 0, 1], np.uint8)))
+    assert (grey.polarity, coloured.polarity) == (False, True)
+    assert find_causes(bars, grey) == [""] * 4 and find_causes(bars, coloured) != [""] * 4
+    odd = bars.copy()
+    odd[-1] = 255  # of split `test`
+    assert task.gate_of(write_frames(tmp_path / "odd", odd)) == grey
