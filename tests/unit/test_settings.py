@@ -1,0 +1,138 @@
+"""What downstream models are trained on: the names of the settings, and the frames behind them."""
+
+from collections import Counter
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pydantic import ValidationError
+
+from ctlev_core import plugins
+from data_contracts import tables
+from data_contracts.config import DownstreamChoice, MetricChoice
+from data_contracts.errors import DataError
+from data_contracts.experiment import Experiment
+from data_contracts.labels import Labels
+from flows.command_line import PRESETS, load_preset
+from flows.full_experiment import full_experiment
+from tasks.evaluate import _groups_by_origin, _others
+from tasks.stage import Output, call_flow, planning
+from tasks.subset import take_faithful, take_share
+
+COUNT = 12
+
+
+def smoke(*overrides):
+    return load_preset(Experiment, PRESETS, "smoke", list(overrides))
+
+
+def test_settings_are_named_after_what_is_learnt_from():
+    names = smoke("scaling=[0.5,0.25]").trained_settings
+    assert names == [
+        "real", "synthetic", "event_gan", "smpl_esim", "faithful", "more_real", "real+synthetic", "real+event_gan",
+        "real+smpl_esim", "real+faithful", "real+more_real", "real+synthetic@0.25", "real+synthetic@0.5",
+    ]  # fmt: skip
+    plain = smoke("scaling=[]", "keep_faithful=null", "more_real=null", "baselines={}")
+    assert plain.trained_settings == ["real", "synthetic", "real+synthetic"]
+
+
+@pytest.mark.parametrize("override", ["scaling=[1.0]", "scaling=[0.5,0.5]", "scaling=[0]", "keep_faithful=1"])
+def test_shares_that_are_none_are_refused(override):
+    with pytest.raises((DataError, ValidationError, ValueError), match=r"scaling|keep_faithful"):
+        smoke(override)
+
+
+def plan(*overrides):
+    with planning() as rows:
+        call_flow(full_experiment, smoke(*overrides))
+    return Counter({row.stage: len({r.key for r in rows if r.stage == row.stage}) for row in rows})
+
+
+def test_several_generators_are_trained_sampled_and_scored_each(monkeypatch, tmp_path):
+    monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
+    once, twice = plan("downstream_seeds=[0,1]"), plan("downstream_seeds=[0,1]", "num_generators=2")
+    for name in ("finetune", "sample", "simulate"):
+        assert twice[name] == 2 * once[name], name
+    # As many models as before: downstream seeds take turns with the generators.
+    assert twice["train_downstream"] == once["train_downstream"]
+    made = len(smoke().generator_names)
+    assert twice["score_distance"] == once["score_distance"] + made
+
+
+class Synthetic:
+    """A manifest of synthetic frames, held in memory."""
+
+    def __init__(self):
+        self.frames = np.arange(COUNT * 3, dtype=np.uint8).reshape(COUNT, 1, 1, 3)
+        names = ["a", "b", "b"] * 4
+        self.table = pa.table({"sample_id": [f"s{n}" for n in range(COUNT)], "class_name": names})
+        self.labels = Labels(tuple(names), np.arange(COUNT))
+        self.ref = SimpleNamespace(path=".")
+
+    def __len__(self):
+        return COUNT
+
+    def array(self, name):
+        return self.frames
+
+
+def test_a_share_is_the_first_rows(tmp_path):
+    synthetic = Synthetic()
+    for share, expected in ((0.5, 6), (0.01, 1)):
+        folder = tmp_path / str(share)
+        folder.mkdir()
+        table = take_share.function(Output(folder, folder), synthetic, share=share)
+        assert table.equals(synthetic.table[:expected])
+        np.testing.assert_array_equal(np.load(folder / "frames.npy"), synthetic.frames[:expected])
+
+
+def test_faithful_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
+    errors = np.array([3, 9, 1, 1, 8, 2, 2, 7, 3, np.nan, 6, 4.0])
+    model = SimpleNamespace(predict=lambda folder, frames: {})
+    metric = SimpleNamespace(compute_rows=lambda predicted, labels, options: errors)
+    fakes = {"pose2d": model, "mpjpe2d": metric, "pck2d": metric}
+    monkeypatch.setattr(
+        plugins, "load_options", lambda choice: SimpleNamespace(module=fakes[choice.name], options=None)
+    )
+
+    def kept(name):
+        folder = tmp_path / name
+        folder.mkdir()
+        table = take_faithful.function(
+            Output(folder, folder),
+            SimpleNamespace(ref=SimpleNamespace(path=tmp_path)),
+            Synthetic(),
+            downstream=DownstreamChoice(name="pose2d"),
+            metric=MetricChoice(name=name),
+            share=0.5,
+        )
+        return table["sample_id"].to_pylist()
+
+    # a: rows 0, 3, 6, 9 with errors 3, 1, 2, NaN; b: the other eight.
+    assert kept("mpjpe2d") == ["s2", "s3", "s5", "s6", "s8", "s11"]
+    # Of a score that wants to be large the largest are kept.
+    assert kept("pck2d") == ["s0", "s1", "s4", "s6", "s7", "s10"]
+
+
+def test_groups_by_origin_part_the_test_rows():
+    names = ["walk", "jump", "crawl", "walk", "jump"]
+    data = SimpleNamespace(column=lambda name: ["walk", "walk", "sit"], rows_where=lambda split: np.array([0, 2]))
+    asked = SimpleNamespace(column=lambda name: ["jump", "walk"])
+    groups = {name: rows.tolist() for name, rows in _groups_by_origin(names, data, [asked])}
+    assert groups == {
+        "classes with real training frames": [0, 3],
+        "classes with synthetic frames only": [1, 4],
+        "classes without training frames": [2],
+    }
+    assert _groups_by_origin(["walk", "sit"], data, [asked]) == []  # one group would be all
+
+
+@pytest.mark.parametrize("count", [2, 3, 100])
+def test_shuffled_labels_are_those_of_others(count):
+    other = _others(count, seed=1)
+    assert sorted(other) == list(range(count)) and not (other == np.arange(count)).any()
+
+
+def test_subsets_are_tables_of_synthetic_frames():
+    assert take_share.schema is tables.SYNTHETIC and take_faithful.schema is tables.SYNTHETIC
