@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from data_contracts.config import (
     ConditionChoice,
@@ -80,6 +80,10 @@ class Experiment(Frozen):
         ge=1,
         description="samplings of a frame, until it passes ctlev_core.image_gate; 1 = count refusals only",
     )
+    round_to_counts: bool = Field(
+        False,
+        description="sampled frames become renderings of whole event counts, as real ones are; event histograms only",
+    )
     num_generators: int = Field(
         1,
         ge=1,
@@ -132,10 +136,21 @@ class Experiment(Frozen):
             raise ValueError(f"scaling are different shares between 0 and 1, got {scaling}; all frames are a setting")
         return scaling
 
+    @model_validator(mode="after")
+    def _only_histograms_hold_counts(self) -> Experiment:
+        if self.round_to_counts and self.encoding.name != "event_histogram":
+            raise ValueError(f"round_to_counts needs encoding 'event_histogram', got {self.encoding.name!r}")
+        return self
+
     @property
     def sampling_choice(self) -> SamplingChoice:
         """The generator's sampling options as a plug-in choice."""
         return SamplingChoice(name=self.generator.name, options=self.sampling)
+
+    @property
+    def rounding(self) -> EncodingChoice | None:
+        """The encoding whose levels sampled frames are rounded to, if any."""
+        return self.encoding if self.round_to_counts else None
 
     @property
     def choices(self) -> list[Any]:

@@ -66,6 +66,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         asked,
         sampling=baseline.sampling_choice,
         max_tries=experiment.max_tries,
+        rounding=experiment.rounding,
         seed=seed,
         label=label,
     )

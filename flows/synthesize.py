@@ -33,6 +33,7 @@ def synthesize(
         dataset.sample_conditions,
         sampling=experiment.sampling_choice,
         max_tries=experiment.max_tries,
+        rounding=experiment.rounding,
         seed=experiment.seed + number,
         label=numbered(experiment.generator.name, number),
     )

@@ -37,11 +37,13 @@ def sample(
     sampling: SamplingChoice,
     max_tries: int,
     seed: int,
+    rounding: EncodingChoice | None = None,
 ) -> pa.Table:
     """One frame per condition row, each from a seed of its own; the labels come along unchanged.
 
     A row whose frame cannot be an event image, beside the training frames among `frames`, is sampled again, in all
-    `max_tries` times. If the last is refused as well it is kept, and says why.
+    `max_tries` times. If the last is refused as well it is kept, and says why. With `rounding`, the encoding of the
+    training frames, each frame becomes the rendering of the event counts that it most probably shows.
     """
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
     folder = checkpoint.ref.path / "checkpoint"
@@ -50,8 +52,18 @@ def sample(
         return plugin.module.sample(folder, _take(asked, rows), plugin.options, seeds=seeds, work=out.work)
 
     made = sample_until_accepted(sample_rows, row_seeds(seed, len(asked)), gate_of(frames), max_tries=max_tries)
-    out.write_array("frames", made.frames)
+    out.write_array("frames", made.frames if rounding is None else _rounded(made, frames, rounding))
     return _table(conditions, plugin, checkpoint.ref.digest, made)
+
+
+def _rounded(made: GatedImages, frames: Manifest, encoding: EncodingChoice) -> np.ndarray:
+    """The frames as renderings of whole event counts."""
+    from ctlev_core.image_counts import estimate_counts, fit_counts  # here, because a cached run needs no numba
+
+    learnt = frames.rows_where(split="train")
+    learnt = learnt[spread(len(learnt), MAX_GATE_FRAMES)]
+    model = fit_counts(np.asarray(frames.array("histograms")[learnt]), plugins.load_options(encoding).options)
+    return estimate_counts(made.frames, model, seeds=made.seeds).frames
 
 
 def gate_of(frames: Manifest) -> ImageGate:

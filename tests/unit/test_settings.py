@@ -9,14 +9,17 @@ import pytest
 from pydantic import ValidationError
 
 from ctlev_core import plugins
+from ctlev_core.encodings import event_histogram
+from ctlev_core.image_gate import GatedImages
 from data_contracts import tables
-from data_contracts.config import DownstreamChoice, MetricChoice
+from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
 from data_contracts.labels import Labels
 from flows.command_line import PRESETS, load_preset
 from flows.full_experiment import full_experiment
 from tasks.evaluate import _groups_by_origin, _others
+from tasks.sample import _rounded
 from tasks.stage import Output, call_flow, planning
 from tasks.subset import take_faithful, take_share
 
@@ -113,6 +116,28 @@ def test_faithful_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
     assert kept("mpjpe2d") == ["s2", "s3", "s5", "s6", "s8", "s11"]
     # Of a score that wants to be large the largest are kept.
     assert kept("pck2d") == ["s0", "s1", "s4", "s6", "s7", "s10"]
+
+
+def test_rounded_frames_show_whole_counts(monkeypatch):
+    random = np.random.default_rng(0)
+    rate = np.zeros((24, 24))
+    rate[6:18, 8:14] = 1.5
+    counts = random.poisson(rate, (20, 1, 24, 24)).astype(np.uint16)
+    encoding = EncodingChoice(name="event_histogram", options={"polarity": False})
+    real = event_histogram.render_image(counts, event_histogram.Options(polarity=False))
+    frames = SimpleNamespace(array=lambda name: counts, rows_where=lambda split: np.arange(20))
+    noisy = np.clip(real + random.normal(0, 4, real.shape[:3])[..., None], 0, 255).astype(np.uint8)
+    rounded = _rounded(
+        GatedImages(np.concatenate([real, noisy]), list(range(40)), [1] * 40, [""] * 40), frames, encoding
+    )
+    np.testing.assert_array_equal(rounded[:20], real)
+    # Decoders blur values: pixels without events get some, which rounding takes away again.
+    assert ((noisy > 0) == (real > 0)).mean() < 0.8 and ((rounded[20:] > 0) == (real > 0)).mean() > 0.999
+
+
+def test_only_event_histograms_can_be_rounded_to_counts():
+    with pytest.raises((DataError, ValidationError, ValueError), match="round_to_counts needs encoding"):
+        smoke("round_to_counts=true", "encoding={name: voxel_grid}")
 
 
 def test_groups_by_origin_part_the_test_rows():
