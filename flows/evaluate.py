@@ -67,7 +67,7 @@ def _train_and_score(
     training_set = [_frames_of(experiment, dataset, generated, part, seed) for part in setting.split("+")]
     label = f"{experiment.downstream.name} on {setting}, seed {seed}"
     model = train_downstream(training_set, downstream=experiment.downstream, seed=seed, label=label)
-    tested = [(dataset.frames, "test", setting, [dataset.sample_conditions])]
+    tested = [(dataset.frames, "test", setting, [dataset.poses])]
     if setting == "real":
         # Do the synthetic frames show what their labels say? The real row's error is the floor, other frames' labels
         # are the ceiling.
@@ -80,7 +80,7 @@ def _train_and_score(
             model,
             data,
             training_set,
-            asked,
+            poses,
             downstream=experiment.downstream,
             metrics=list(experiment.metrics),
             setting=row,
@@ -88,7 +88,7 @@ def _train_and_score(
             seed=seed,
             label=f"{label}: {row}",
         )
-        for data, split, row, asked in tested
+        for data, split, row, poses in tested
     ]
     return model, scores
 

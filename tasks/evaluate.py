@@ -31,7 +31,7 @@ def score_model(
     model: Manifest,
     data: Manifest,
     training_sets: list[Manifest],
-    asked: list[Manifest],
+    poses: list[Manifest],
     *,
     downstream: DownstreamChoice,
     metrics: list[MetricChoice],
@@ -41,10 +41,10 @@ def score_model(
 ) -> pa.Table:
     """Every metric on one split, for all rows and for each class, with an interval over recordings.
 
-    Classes that real training frames show, those that only the labels to sample from (`asked`) have, and those that
-    neither has are groups of their own: what synthetic data adds is in the second. Beside the table lie the scores of
-    the single samples, from which two models can be compared in pairs. A setting that starts with `SHUFFLED` gives
-    every frame the labels of another.
+    Classes that real training frames show, those that only the label-only recordings of `poses` have, and those
+    that neither has are groups of their own: what synthetic data adds is in the second. Beside the table lie the
+    scores of the single samples, from which two models can be compared in pairs. A setting that starts with `SHUFFLED`
+    gives every frame the labels of another.
     """
     plugin = plugins.load_options(downstream)
     rows = data.rows_where(split=split)
@@ -74,7 +74,7 @@ def score_model(
             values = metric.module.compute_rows(prediction, labels, metric.options)
             columns = {"sample_id": sample_ids, "recording_id": recordings, "metric": [metric.name] * len(rows)}
             sample_scores.append(pa.table({**columns, "value": pa.array(values, pa.float64(), from_pandas=True)}))
-        for group, members in [*_groups(labels.class_names), *_groups_by_origin(labels.class_names, data, asked)]:
+        for group, members in [*_groups(labels.class_names), *_groups_by_origin(labels.class_names, data, poses)]:
             try:
                 scores, low, high = _score(metric, prediction, labels.take(members), members, recordings[members])
             except ValueError:
@@ -105,11 +105,11 @@ def _groups(class_names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
 
 
 def _groups_by_origin(
-    class_names: Sequence[str], data: Manifest, asked: list[Manifest]
+    class_names: Sequence[str], data: Manifest, poses: list[Manifest]
 ) -> list[tuple[str, np.ndarray]]:
     """Rows by where their class was to be learnt from; nothing where one group has them all."""
     seen = {data.column("class_name")[row] for row in data.rows_where(split="train")}
-    sampled = {name for manifest in asked for name in manifest.column("class_name")} - seen
+    sampled = {m.column("class_name")[row] for m in poses for row in m.rows_where(splits="condition")} - seen
     parts = {
         "classes with real training frames": seen,
         "classes with synthetic frames only": sampled,

@@ -24,7 +24,7 @@ from data_contracts.manifest import MANIFEST_FILE, ManifestRef, conditions_of, r
 # The report's digest covers the time each stage took.
 DETERMINISTIC = (
     "ingest", "encode", "condition_frames", "condition_samples", "finetune", "sample", "simulate", "train_downstream",
-    "score_model", "score_distance", "realism", "copy_check",
+    "score_model", "score_distance", "realism", "copy_check", "take_share", "take_faithful",
 )  # fmt: skip
 
 
@@ -161,7 +161,10 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
 @pytest.mark.parametrize(
     ("override", "changed"),
     [
-        ("downstream.options.num_steps=21", {"train_downstream: pose2d", "score_model", "report"}),
+        (
+            "downstream.options.num_steps=21",
+            {"train_downstream: pose2d", "judge of labels", "faithful", "score_model", "report"},
+        ),
         (
             "num_synthetic=9",
             {
@@ -169,6 +172,7 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
                 "sample:",
                 "simulate",
                 "synthetic",
+                "faithful",
                 "on event_gan",
                 "on smpl_esim",
                 "+event_gan",
@@ -197,7 +201,18 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
         ),
         (
             "encoding.options.normalisation=max",
-            {"encode", "condition", "finetune", "sample", "simulate", "train", "score", "copy_check", "report"},
+            {
+                "encode",
+                "condition",
+                "finetune",
+                "sample",
+                "simulate",
+                "train",
+                "take_",
+                "score",
+                "copy_check",
+                "report",
+            },
         ),
         ("name=renamed", {"report", "contact_sheet"}),
     ],
@@ -280,8 +295,8 @@ def test_scores_are_tables(smoke_home):
     assert len(tables) == 1
     scores = pq.read_table(tables[0]).to_pylist()
     trained = {"real"} | {f"{real}{name}" for real in ("", "real+") for name in GENERATORS}
-    assert {row["setting"] for row in scores if row["task"] == "pose2d"} == trained | {
-        f"labels of {name}" for name in GENERATORS
-    }
+    trained |= {"faithful", "real+faithful", "more_real", "real+more_real", "real+synthetic@0.5"}
+    judged = {f"labels of {name}" for name in GENERATORS} | {"shuffled labels of synthetic"}
+    assert {row["setting"] for row in scores if row["task"] == "pose2d"} == trained | judged
     assert {row["setting"] for row in scores if row["task"] == "distance"} == {"held-out real", *GENERATORS}
     assert all(np.isfinite(row["value"]) for row in scores)

@@ -143,14 +143,17 @@ def test_only_event_histograms_can_be_rounded_to_counts():
 def test_groups_by_origin_part_the_test_rows():
     names = ["walk", "jump", "crawl", "walk", "jump"]
     data = SimpleNamespace(column=lambda name: ["walk", "walk", "sit"], rows_where=lambda split: np.array([0, 2]))
-    asked = SimpleNamespace(column=lambda name: ["jump", "walk"])
-    groups = {name: rows.tolist() for name, rows in _groups_by_origin(names, data, [asked])}
+    poses = SimpleNamespace(
+        column=lambda name: ["jump", "walk", "crawl"],
+        rows_where=lambda splits: np.array([0, 1]),
+    )
+    groups = {name: rows.tolist() for name, rows in _groups_by_origin(names, data, [poses])}
     assert groups == {
         "classes with real training frames": [0, 3],
         "classes with synthetic frames only": [1, 4],
         "classes without training frames": [2],
     }
-    assert _groups_by_origin(["walk", "sit"], data, [asked]) == []  # one group would be all
+    assert _groups_by_origin(["walk", "sit"], data, [poses]) == []  # one group would be all
 
 
 @pytest.mark.parametrize("count", [2, 3, 100])
