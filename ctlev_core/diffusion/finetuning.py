@@ -7,112 +7,34 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
-from ctlev_core.diffusion.prior import (
-    Prior,
-    choose_device,
-    conditions_to_tensor,
-    encode_prompts,
-    images_to_tensor,
-    load_prior,
-    save_prior,
-)
+from ctlev_core.diffusion.latent_cache import cache_latents, check_cache, check_training_data, check_weights
+from ctlev_core.diffusion.prior import Prior
+from ctlev_core.diffusion.ranks import ALONE, Ranks
+from ctlev_core.diffusion.sampling import sample_frames
+from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.small_prior import break_zeros
-from ctlev_core.diffusion.training import Trainer, run_training, sample_rows
+from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
+from ctlev_core.diffusion.training import run_training, sample_rows
+from ctlev_core.diffusion.training_log import picture_of_samples
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.config import cache_material
-from data_contracts.errors import DataError
-from data_contracts.labels import Conditions, History
+from data_contracts.labels import Conditions
 
 Tune = Literal["unet", "controlnet", "both"]
-ENCODE_BATCH = 32
+SHOWN, SHOWN_STEPS = 6, 10
+"""Samples in a picture, and evaluations of the network for each."""
 SPLIT_STREAM, LATENT_STREAM, DROPOUT_STREAM, WEIGHT_STREAM = 1, 2, 3, 4  # entropy that keeps random streams apart
-
-
-@dataclass(frozen=True, eq=False)
-class LatentCache:
-    """Everything the loop needs of N frames, computed once.
-
-    Attributes:
-        mean: [N, C, h, w] posterior means, not scaled.
-        std: [N, C, h, w] posterior standard deviations; None for a code without noise.
-        scaling_factor: multiplies sampled latents.
-        embeddings: [P, L, D] of the distinct prompts; the last is the empty prompt.
-        prompt_rows: [N] index into `embeddings`.
-        conditions: [N, H, W, 3] uint8, or None.
-        reversed_condition: the ControlNet expects BGR.
-    """
-
-    mean: Tensor
-    std: Tensor | None
-    scaling_factor: float
-    embeddings: Tensor
-    prompt_rows: Tensor
-    conditions: np.ndarray | None
-    reversed_condition: bool
-
-    def batch(self, rows: np.ndarray, generator: torch.Generator, prompt_dropout: float, device: torch.device) -> Batch:
-        """The given rows, with latents drawn from their posteriors."""
-        index = torch.from_numpy(rows)
-        latents = self.mean[index]
-        if self.std is not None:
-            latents = latents + self.std[index] * torch.randn(latents.shape, generator=generator)
-        prompts = self.prompt_rows[index]
-        dropped = torch.rand(len(rows), generator=generator) < prompt_dropout
-        prompts = torch.where(dropped, len(self.embeddings) - 1, prompts)
-        conditions = None
-        if self.conditions is not None:
-            conditions = conditions_to_tensor(self.conditions[rows], self.reversed_condition).to(device)
-        latents = latents * self.scaling_factor
-        return Batch(latents.to(device), self.embeddings[prompts].to(device), conditions)
-
-
-def cache_latents(prior: Prior, frames: np.ndarray, conditions: Conditions) -> LatentCache:
-    """Run the frozen autoencoder and text encoder, once per frame and once per distinct prompt."""
-    device = prior.vae.device
-    means, deviations = [], []
-    with torch.no_grad():
-        for start in range(0, len(frames), ENCODE_BATCH):
-            images = images_to_tensor(frames[start : start + ENCODE_BATCH]).to(device, prior.vae.dtype)
-            posterior = prior.vae.encode(images).latent_dist
-            means.append(posterior.mean.float().cpu())
-            if hasattr(posterior, "std"):
-                deviations.append(posterior.std.float().cpu())
-    prompts = sorted(set(conditions.prompts))
-    position = {prompt: row for row, prompt in enumerate(prompts)}
-    return LatentCache(
-        mean=torch.cat(means),
-        std=torch.cat(deviations) if deviations else None,
-        scaling_factor=prior.scaling_factor,
-        embeddings=encode_prompts(prior, [*prompts, ""]).float().cpu(),
-        prompt_rows=torch.tensor([position[prompt] for prompt in conditions.prompts]),
-        conditions=conditions.images,
-        reversed_condition=prior.reversed_condition,
-    )
-
-
-def check_training_data(frames: np.ndarray, conditions: Conditions, image_size: tuple[int, int]) -> None:
-    """Raise `DataError` unless frames and conditions are images of the prior's size, one condition a frame."""
-    width, height = image_size
-    arrays = {"frames": frames} if conditions.images is None else {"frames": frames, "conditions": conditions.images}
-    for name, array in arrays.items():
-        if array.ndim != 4 or array.shape[1:] != (height, width, 3) or array.dtype != np.uint8:
-            raise DataError(
-                f"{name} must be [N, {height}, {width}, 3] uint8, the size this prior was trained on, "
-                f"got {list(array.shape)} {array.dtype}; set the image size of the encoding"
-            )
-        if len(array) != len(conditions.prompts):
-            raise DataError(f"{len(array)} {name} do not match {len(conditions.prompts)} prompts")
-    if len(frames) == 0:
-        raise DataError("fine-tuning needs at least one frame, got none")
 
 
 def forget_weights(prior: Prior, seed: int) -> Prior:
@@ -139,7 +61,9 @@ def fine_tune(
     tune: Tune,
     seed: int,
     work: Path,
-) -> History:
+    class_names: Sequence[str] | None = None,
+    ranks: Ranks = ALONE,
+) -> TrainingHistory:
     """Train the networks named by `tune` in place; autoencoder and text encoder stay frozen.
 
     Args:
@@ -150,26 +74,31 @@ def fine_tune(
         tune: which networks learn. The paper: `unet` for text, `controlnet` for skeletons.
         seed: of order, noise and held-back frames.
         work: folder of the resumable state.
+        class_names: N; at every step a frame is shown with a random one of the prompts that occur in its class, as the
+            paper draws a class name per iteration. None = each frame keeps its own prompt.
+        ranks: which of several processes this is.
     Returns:
         Loss curves; `shuffled_loss` is the validation loss with the conditions of other frames.
     Raises:
-        ValueError: frames and conditions do not fit the prior or one another.
+        ValueError: frames and conditions do not fit the prior or one another, weights or latents are not finite, or
+            options do not fit one another.
     """
     check_training_data(frames, conditions, prior.image_size)
+    check_weights(prior)
     device = prior.unet.device
-    cache = cache_latents(prior, frames, conditions)
+    cache = cache_latents(prior, frames, conditions, class_names)
+    check_cache(cache, conditions)
     prior.text_encoder.to("cpu")
     networks = {"unet": (prior.unet,), "controlnet": (prior.controlnet,), "both": (prior.unet, prior.controlnet)}[tune]
     parameters = []
     for network in networks:
         network.train().requires_grad_(True)
         parameters += list(network.parameters())
-    order = np.random.default_rng([seed, SPLIT_STREAM]).permutation(len(frames))
-    held_back = min(options.num_validation, len(frames) // 10)
-    validation_rows, training_rows = order[:held_back], order[held_back:]
+    validation_rows, training_rows = split_rows(len(frames), options, seed)
     denoiser = Denoiser(prior.unet, prior.controlnet)
     schedule = NoiseSchedule(prior.scheduler_config)
-    trainer = Trainer(parameters, options, _identity(frames, conditions, options, tune, seed))
+    identity = _identity(frames, conditions, options, tune, seed, class_names)
+    trainer = Trainer(parameters, options, identity, options.optimizer, keep=options.keep, patience=options.patience)
 
     def fetch(number: int) -> Batch:
         rows = training_rows[sample_rows(seed, number, options.batch_size, len(training_rows))]
@@ -179,6 +108,7 @@ def fine_tune(
         batch = cache.batch(validation_rows, generator_for(seed, DROPOUT_STREAM), 0.0, device)
         return validation_losses(denoiser, schedule, batch, seed=seed, batch_size=options.batch_size)
 
+    shown = np.sort(validation_rows if len(validation_rows) else training_rows)[:SHOWN]
     history = run_training(
         trainer,
         denoiser,
@@ -187,40 +117,60 @@ def fine_tune(
         seed=seed,
         work=work,
         # Two frames at least: one frame has no other's condition to be shuffled with.
-        validate=validate if held_back >= 2 else None,
+        validate=validate if len(validation_rows) >= 2 else None,
+        draw=partial(draw_samples, prior, frames[shown], _rows_of(conditions, shown)),
         description="fine-tuning",
+        ranks=ranks,
     )
     for network in networks:
         network.eval().requires_grad_(False)
     return history
 
 
-def train_checkpoint(
+def split_rows(count: int, options: FineTuningOptions, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows held back for validation and rows to learn from; another `max_frames` changes only where the latter end."""
+    order = np.random.default_rng([seed, SPLIT_STREAM]).permutation(count)
+    held_back = min(options.num_validation, count // 10)
+    return order[:held_back], order[held_back:][: options.max_frames]
+
+
+def draw_samples(prior: Prior, frames: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """A picture of conditions, real frames and samples, from noise that is the same at every call.
+
+    Args:
+        prior: with the weights to sample from.
+        frames: [N, H, W, 3] uint8 real frames.
+        conditions: what the N samples are asked for.
+    Returns:
+        [N * H, 3 * W, 3] uint8; without condition images 2 * W.
+    """
+    if conditions.images is None:
+        prior = replace(prior, controlnet=None)
+    options = SamplingOptions(num_inference_steps=SHOWN_STEPS, batch_size=SHOWN)
+    with TemporaryDirectory() as folder:
+        samples = sample_frames(prior, conditions, options, seeds=range(len(frames)), work=Path(folder))
+    return picture_of_samples([conditions.images, frames, samples])
+
+
+def _rows_of(conditions: Conditions, rows: np.ndarray) -> Conditions:
+    images = None if conditions.images is None else np.asarray(conditions.images[rows])
+    return Conditions(tuple(conditions.prompts[row] for row in rows), images)
+
+
+def _identity(
     frames: np.ndarray,
     conditions: Conditions,
     options: FineTuningOptions,
-    *,
-    tune: Tune,
-    controlnet: Path | None = None,
-    with_controlnet: bool,
+    tune: str,
     seed: int,
-    out: Path,
-    work: Path,
-) -> History:
-    """Load the prior, fine-tune it and write it to `out` as a diffusers folder: `train` of both generators."""
-    prior = load_prior(
-        options.prior, controlnet=controlnet, with_controlnet=with_controlnet, device=choose_device(options.device)
-    )
-    if options.random_init:
-        prior = forget_weights(prior, seed)
-    history = fine_tune(prior, frames, conditions, options, tune=tune, seed=seed, work=work)
-    save_prior(prior, out)
-    return history
-
-
-def _identity(frames: np.ndarray, conditions: Conditions, options: FineTuningOptions, tune: str, seed: int) -> str:
+    class_names: Sequence[str] | None,
+) -> str:
     """Digest of what the saved state depends on, so that a work folder of another run is not resumed by mistake."""
-    digest = hashlib.sha256(json.dumps([cache_material(options), tune, seed, conditions.prompts]).encode())
+    material = {
+        name: value for name, value in cache_material(options).items() if name in FineTuningOptions.model_fields
+    }
+    named = None if class_names is None else list(class_names)
+    digest = hashlib.sha256(json.dumps([material, tune, seed, conditions.prompts, named]).encode())
     for array in (frames, conditions.images):
         if array is not None:
             digest.update(np.ascontiguousarray(array).data)

@@ -40,11 +40,37 @@ class TrainingOptions(Frozen):
     )
     log_every: int = Field(default=20, gt=0, description="steps between two points of the loss curve")
     validation_every: int = Field(default=400, gt=0, description="steps between two points of the validation curve")
-    precision: Literal["float32", "bfloat16"] = Field(
-        default="float32", description="of the forward pass; weights, averages and losses stay float32"
+    precision: Literal["float32", "bfloat16", "float16"] = Field(
+        default="float32",
+        description="of the forward pass; weights, averages and losses stay float32; float16 scales its losses and "
+        "needs a CUDA device",
     )
     checkpoint_every_s: float = Field(
         default=60.0, gt=0, json_schema_extra=RUN_SETTING, description="seconds between two saves of the training state"
+    )
+    gradient_checkpointing: bool = Field(
+        default=False,
+        json_schema_extra=RUN_SETTING,
+        description="compute activations again for the gradients in place of keeping them: less memory, a third slower",
+    )
+    compile_networks: bool = Field(
+        default=False,
+        json_schema_extra=RUN_SETTING,
+        description="torch.compile; takes minutes before the first step, and a compiler: without one training goes on "
+        "uncompiled and says so",
+    )
+    tensorboard: Path | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="folder for TensorBoard: curves, speed, learning rate, gradient norm and samples, each run in a "
+        "subfolder of its own",
+    )
+    sample_every: int = Field(
+        default=0,
+        ge=0,
+        json_schema_extra=RUN_SETTING,
+        description="steps between two pictures of samples beside real frames: in TensorBoard, and as `samples/*.png` "
+        "in the work folder while training lasts; 0 = none",
     )
 
 
@@ -65,4 +91,31 @@ class FineTuningOptions(TrainingOptions):
     num_validation: int = Field(
         default=64, ge=0, description="frames held back for the validation loss, a tenth at most"
     )
+    max_frames: int | None = Field(
+        default=None,
+        gt=0,
+        description="ablation: learn from so many frames at most; fewer are always among those of more, and the frames "
+        "held back are the same; null = all",
+    )
+    optimizer: Literal["adamw", "muon"] = Field(
+        default="adamw",
+        description="`learning_rate` is Adam's with both: muon steps weight matrices 20 times as far, and everything "
+        "else by Adam",
+    )
+    keep: Literal["last", "best"] = Field(
+        default="last",
+        description="the weights that training ends with: of the last step, or of the lowest validation loss",
+    )
+    patience: int | None = Field(
+        default=None,
+        gt=0,
+        description="stop after so many validations in a row that did not lower the validation loss; null = never",
+    )
     device: str = Field(default="auto", json_schema_extra=RUN_SETTING, description="auto, cpu, cuda, cuda:1 ...")
+    num_processes: int | None = Field(
+        default=None,
+        gt=0,
+        json_schema_extra=RUN_SETTING,
+        description="processes, each with a GPU of its own where there are any, that share the `gradient_accumulation` "
+        "batches of a step evenly; null = as many as `accelerate launch` or `torchrun` started, else 1",
+    )

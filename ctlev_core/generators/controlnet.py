@@ -69,7 +69,7 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
     Raises:
         ValueError: frames do not fit the prior or the conditions, or there are no condition images.
     """
-    from ctlev_core.diffusion.finetuning import train_checkpoint
+    from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 
     _check_images(conditions)
     return train_checkpoint(

@@ -58,7 +58,7 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
     Raises:
         ValueError: frames do not fit the prior or the conditions, or the conditions have images.
     """
-    from ctlev_core.diffusion.finetuning import train_checkpoint
+    from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 
     _check_text_only(conditions)
     return train_checkpoint(

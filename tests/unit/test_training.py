@@ -44,7 +44,7 @@ def kill_after(monkeypatch, updates):
         if count[0] == updates:
             raise Killed
         count[0] += 1
-        original(self, progress)
+        return original(self, progress)
 
     monkeypatch.setattr(training.Trainer, "update", update)
 

@@ -1,0 +1,59 @@
+"""What makes a training step faster or smaller, and not what it computes: precision, checkpoints, compiled networks."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+import torch
+
+from ctlev_core.diffusion.denoising import Denoiser
+from ctlev_core.diffusion.training_options import TrainingOptions
+
+logger = logging.getLogger(__name__)
+
+
+def check_precision(options: TrainingOptions, device: torch.device) -> None:
+    """Raise ValueError where a CPU is asked for float16: it has neither the speed nor all of the operations."""
+    if options.precision == "float16" and device.type == "cpu":
+        raise ValueError("precision float16 needs a CUDA device, got the CPU; use float32 or bfloat16 there")
+
+
+def autocast(options: TrainingOptions, device: torch.device) -> AbstractContextManager:
+    """The context of a forward pass: matrix products and convolutions in the precision asked for."""
+    dtype = torch.float16 if options.precision == "float16" else torch.bfloat16
+    return torch.autocast(device.type, dtype, enabled=options.precision != "float32")
+
+
+@contextmanager
+def accelerated(denoiser: Denoiser, options: TrainingOptions, device: torch.device) -> Iterator[None]:
+    """Within the context the networks keep fewer activations or run compiled, as the options ask.
+
+    Frozen networks too: on the way to a ControlNet the gradients pass through the frozen U-Net. Weights keep their
+    names, so that saved states and checkpoints are those of plain networks.
+    """
+    networks = [network for network in (denoiser.unet, denoiser.controlnet) if network is not None]
+    compiled = options.compile_networks and compiler_works(device)
+    for network in networks:
+        if options.gradient_checkpointing:
+            network.enable_gradient_checkpointing()
+        if compiled:
+            network.compile()
+    try:
+        yield
+    finally:
+        for network in networks:
+            if options.gradient_checkpointing:
+                network.disable_gradient_checkpointing()
+            network._compiled_call_impl = None
+
+
+def compiler_works(device: torch.device) -> bool:
+    """Compile one addition: cheaper than to find out within a training that there is no compiler."""
+    try:
+        torch.compile(lambda x: x + 1)(torch.zeros(4, device=device))
+    except Exception as error:  # whatever a missing or broken compiler raises, training can do without
+        logger.warning("torch.compile does not work here, training goes on uncompiled: %s", error)
+        return False
+    return True

@@ -1,0 +1,162 @@
+"""Everything fine-tuning needs of frames, prompts and conditions, computed once, and checked before training starts."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ctlev_core.diffusion.denoising import Batch
+from ctlev_core.diffusion.prior import Prior, conditions_to_tensor, encode_prompts, images_to_tensor
+from data_contracts.errors import DataError
+from data_contracts.labels import Conditions
+
+ENCODE_BATCH = 32
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class LatentCache:
+    """Everything the loop needs of N frames, computed once.
+
+    Attributes:
+        mean: [N, C, h, w] posterior means, not scaled.
+        std: [N, C, h, w] posterior standard deviations; None for a code without noise.
+        scaling_factor: multiplies sampled latents.
+        embeddings: [P, L, D] of the distinct prompts; the last is the empty prompt.
+        prompt_rows: for each of N frames the indices into `embeddings` of the prompts it may be shown with.
+        conditions: [N, H, W, 3] uint8, or None.
+        reversed_condition: the ControlNet expects BGR.
+    """
+
+    mean: Tensor
+    std: Tensor | None
+    scaling_factor: float
+    embeddings: Tensor
+    prompt_rows: tuple[Tensor, ...]
+    conditions: np.ndarray | None
+    reversed_condition: bool
+
+    def batch(self, rows: np.ndarray, generator: torch.Generator, prompt_dropout: float, device: torch.device) -> Batch:
+        """The given rows; latents are drawn from their posteriors, and prompts from those of each frame."""
+        index = torch.from_numpy(rows)
+        latents = self.mean[index]
+        if self.std is not None:
+            latents = latents + self.std[index] * torch.randn(latents.shape, generator=generator)
+        dropped = torch.rand(len(rows), generator=generator) < prompt_dropout
+        choices = [self.prompt_rows[row] for row in rows]
+        drawn = torch.rand(len(rows), generator=generator).tolist()
+        prompts = torch.stack([each[int(value * len(each))] for each, value in zip(choices, drawn, strict=True)])
+        prompts = torch.where(dropped, len(self.embeddings) - 1, prompts)
+        conditions = None
+        if self.conditions is not None:
+            conditions = conditions_to_tensor(self.conditions[rows], self.reversed_condition).to(device)
+        latents = latents * self.scaling_factor
+        return Batch(latents.to(device), self.embeddings[prompts].to(device), conditions)
+
+
+def cache_latents(
+    prior: Prior, frames: np.ndarray, conditions: Conditions, class_names: Sequence[str] | None = None
+) -> LatentCache:
+    """Run the frozen autoencoder and text encoder, once per frame and once per distinct prompt.
+
+    Args:
+        prior: autoencoder and text encoder.
+        frames: [N, H, W, 3] uint8.
+        conditions: N prompts and perhaps condition images.
+        class_names: N; frames of one class may be shown with the prompt of any of them. None = each with its own.
+    """
+    device = prior.vae.device
+    means, deviations = [], []
+    with torch.no_grad():
+        for start in range(0, len(frames), ENCODE_BATCH):
+            images = images_to_tensor(frames[start : start + ENCODE_BATCH]).to(device, prior.vae.dtype)
+            posterior = prior.vae.encode(images).latent_dist
+            means.append(posterior.mean.float().cpu())
+            if hasattr(posterior, "std"):
+                deviations.append(posterior.std.float().cpu())
+    prompts = sorted(set(conditions.prompts))
+    warn_of_long_prompts(prior, prompts)
+    position = {prompt: row for row, prompt in enumerate(prompts)}
+    return LatentCache(
+        mean=torch.cat(means),
+        std=torch.cat(deviations) if deviations else None,
+        scaling_factor=prior.scaling_factor,
+        embeddings=encode_prompts(prior, [*prompts, ""]).float().cpu(),
+        prompt_rows=_prompt_rows([position[prompt] for prompt in conditions.prompts], class_names),
+        conditions=conditions.images,
+        reversed_condition=prior.reversed_condition,
+    )
+
+
+def _prompt_rows(own: Sequence[int], class_names: Sequence[str] | None) -> tuple[Tensor, ...]:
+    if class_names is None:
+        return tuple(torch.tensor([row]) for row in own)
+    of_class: dict[str, set[int]] = {}
+    for name, row in zip(class_names, own, strict=True):
+        of_class.setdefault(name, set()).add(row)
+    choices = {name: torch.tensor(sorted(rows)) for name, rows in of_class.items()}
+    return tuple(choices[name] for name in class_names)
+
+
+def check_training_data(frames: np.ndarray, conditions: Conditions, image_size: tuple[int, int]) -> None:
+    """Raise `DataError` unless frames and conditions are images of the prior's size, one condition a frame."""
+    width, height = image_size
+    arrays = {"frames": frames} if conditions.images is None else {"frames": frames, "conditions": conditions.images}
+    for name, array in arrays.items():
+        if array.ndim != 4 or array.shape[1:] != (height, width, 3) or array.dtype != np.uint8:
+            raise DataError(
+                f"{name} must be [N, {height}, {width}, 3] uint8, the size this prior was trained on, "
+                f"got {list(array.shape)} {array.dtype}; set the image size of the encoding"
+            )
+        if len(array) != len(conditions.prompts):
+            raise DataError(f"{len(array)} {name} do not match {len(conditions.prompts)} prompts")
+    if len(frames) == 0:
+        raise DataError("fine-tuning needs at least one frame, got none")
+
+
+def check_weights(prior: Prior) -> None:
+    """Raise `DataError` naming the first weight of the prior that is not finite: every loss would be NaN."""
+    for name in ("text_encoder", "vae", "unet", "controlnet"):
+        network = getattr(prior, name)
+        for key, value in network.state_dict().items() if network is not None else ():
+            if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+                raise DataError(f"the prior's {name} has weights that are not finite in {key}; fetch or train it anew")
+
+
+def check_cache(cache: LatentCache, conditions: Conditions) -> None:
+    """Raise `DataError` naming the first frame or prompt whose latents or embedding are not finite."""
+    for name, values in (("mean", cache.mean), ("standard deviation", cache.std)):
+        wrong = None if values is None else ~torch.isfinite(values).flatten(1).all(dim=1)
+        if wrong is not None and bool(wrong.any()):
+            row = int(wrong.nonzero()[0])
+            raise DataError(
+                f"frame {row} of {len(cache.mean)}: the {name} of its latents must be finite, which the prior's "
+                "autoencoder did not make it; check that frame and the autoencoder"
+            )
+    wrong = ~torch.isfinite(cache.embeddings).flatten(1).all(dim=1)
+    if bool(wrong.any()):
+        row = int(wrong.nonzero()[0])
+        prompt = [*sorted(set(conditions.prompts)), ""][row]
+        raise DataError(f"prompt {prompt!r}: its embedding is not finite; check the prior's text encoder")
+
+
+def warn_of_long_prompts(prior: Prior, prompts: Sequence[str]) -> None:
+    """Name the prompts that the tokenizer cuts off, as `encode_prompts` and diffusers do: their ends are not heeded."""
+    limit = prior.tokenizer.model_max_length
+    lengths = [len(tokens) for tokens in prior.tokenizer(list(prompts), truncation=False)["input_ids"]]
+    long = [position for position, length in enumerate(lengths) if length > limit]
+    if long:
+        kept = prior.tokenizer.decode(
+            prior.tokenizer(prompts[long[0]], truncation=True, max_length=limit)["input_ids"], skip_special_tokens=True
+        )
+        logger.warning(
+            "%d of %d prompts are longer than the tokenizer's limit of %d tokens and are cut off; the first is %r with "
+            "%d tokens, of which %r is left",
+            len(long), len(prompts), limit, prompts[long[0]], lengths[long[0]], kept,
+        )  # fmt: skip

@@ -1,0 +1,76 @@
+"""One training shared by several processes: who computes what, and how gradients come together.
+
+The batches of a step are numbered, and all that is random in a batch is a function of its number. Which process
+computes a batch therefore changes nothing but the order of a sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """One of `count` processes that train together; number 0 alone writes files and shows progress."""
+
+    rank: int = 0
+    count: int = 1
+
+    def batches(self, gradient_accumulation: int) -> range:
+        """The batches of a step that are this process's.
+
+        Raises:
+            ValueError: they cannot be shared evenly.
+        """
+        if gradient_accumulation % self.count:
+            raise ValueError(
+                f"gradient_accumulation must be a multiple of the {self.count} processes, which share the batches of a "
+                f"step, got {gradient_accumulation}; halve batch_size and double gradient_accumulation, say"
+            )
+        return range(self.rank, gradient_accumulation, self.count)
+
+    def sum_gradients(self, parameters: Sequence[torch.nn.Parameter], loss: float) -> float:
+        """Add up the gradients of all processes, in place, and the losses, which are returned."""
+        if self.count == 1:
+            return loss
+        for parameter in parameters:
+            if parameter.grad is not None:
+                torch.distributed.all_reduce(parameter.grad)
+        total = torch.tensor(loss, dtype=torch.float64, device=parameters[0].device)
+        torch.distributed.all_reduce(total)
+        return total.item()
+
+    def agreed(self, values: tuple[float, float]) -> tuple[float, float]:
+        """The values of process 0: whether to stop must not hang on rounding that differs between devices."""
+        if self.count == 1:
+            return values
+        shared: list[tuple[float, float]] = [values]
+        torch.distributed.broadcast_object_list(shared, src=0)
+        return shared[0]
+
+
+ALONE = Ranks()
+
+
+def start_ranks(device: str) -> tuple[Ranks, torch.device]:
+    """Join the processes that a launcher started together; each with a GPU takes the one of its number.
+
+    Args:
+        device: `auto`, `cuda` or `cpu`.
+    """
+    from accelerate import PartialState
+
+    state = PartialState(cpu=device == "cpu")
+    return Ranks(state.process_index, state.num_processes), torch.device(str(state.device))
+
+
+def stop_ranks() -> None:
+    """Wait for one another, and leave."""
+    from accelerate import PartialState
+
+    state = PartialState()
+    state.wait_for_everyone()
+    state.destroy_process_group()
