@@ -1,4 +1,4 @@
-"""Draw frames from a checkpoint: fast solvers, one random stream an image, resumable shards.
+"""Draw frames from a checkpoint: fast solvers, one random stream an image, resumable shards, one process a device.
 
 Image i depends on (condition i, seed i) alone: its noise comes from a stream of its own, and no layer mixes the rows of
 a batch. Convolution libraries may still sum in another order for another batch size, which moves a pixel by rounding,
@@ -7,10 +7,12 @@ one grey level at most; run with the same batch size for bit-identical frames.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import hashlib
 import json
-import os
-from collections.abc import Iterator, Sequence
+import logging
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,75 +22,20 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ctlev_core.diffusion.controlnet_reuse import EveryKthStep
+from ctlev_core.diffusion.controlnet_reuse import cached_condition_embedding as cached_condition_embedding
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.prior import Prior, choose_device, conditions_to_tensor, encode_prompts, load_prior
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling_devices import device_names, run_on_devices
+from ctlev_core.diffusion.sampling_memory import ShrinkingBatches
+from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions, noise_seeds
+from ctlev_core.diffusion.sampling_shards import Shard, plan_shards
+from ctlev_core.diffusion.schedulers import make_scheduler as make_scheduler
 from data_contracts.config import cache_material
+from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 
-SHARD = 128
-UNIPC_ORDER = 3
-
-
-def make_scheduler(name: str, config: dict[str, Any], num_inference_steps: int) -> Any:
-    """A diffusers scheduler for the noise schedule of a checkpoint, its time steps set.
-
-    Karras sigmas and a last sigma of zero: with evenly spaced steps the last jump starts at sigma 0.2 and more, and
-    blurs exactly what event images consist of, narrow peaks on a black background.
-
-    Args:
-        name: `unipc`, `dpm++`, `ddim` or `ddpm`.
-        config: the checkpoint's scheduler config; never a class's defaults, which clip latents.
-        num_inference_steps: evaluations of the network.
-    Raises:
-        ValueError: unknown name, or more steps than the schedule has.
-    """
-    from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-    from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
-    from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
-    from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
-
-    karras = {"use_karras_sigmas": True, "final_sigmas_type": "zero"}
-    known: dict[str, tuple[Any, dict[str, Any]]] = {
-        "unipc": (UniPCMultistepScheduler, {"solver_order": UNIPC_ORDER, **karras}),
-        "dpm++": (DPMSolverMultistepScheduler, {"algorithm_type": "dpmsolver++", **karras}),
-        "ddim": (DDIMScheduler, {"clip_sample": False}),
-        "ddpm": (DDPMScheduler, {"clip_sample": False}),
-    }
-    if name not in known:
-        raise ValueError(f"unknown scheduler {name!r}; known: {', '.join(known)}")
-    scheduler_class, overrides = known[name]
-    if num_inference_steps >= config.get("num_train_timesteps", 1000):
-        # Stable Diffusion's offset of 1 would ask for time step 1000 of 0 .. 999.
-        overrides = {**overrides, "steps_offset": 0}
-    scheduler: Any = scheduler_class.from_config(config, **overrides)
-    scheduler.set_timesteps(num_inference_steps)
-    return scheduler
-
-
-class _CachedEmbedding(torch.nn.Module):
-    """Stands in for a ControlNet's condition embedding, whose output does not depend on the time step."""
-
-    def __init__(self, value: Tensor) -> None:
-        super().__init__()
-        self.value = value
-
-    def forward(self, conditioning: Tensor) -> Tensor:
-        return self.value
-
-
-@contextmanager
-def cached_condition_embedding(controlnet: Any | None, conditions: Tensor | None) -> Iterator[None]:
-    """Within the context the condition embedding is computed once; exact, and most of a tiny ControlNet's time."""
-    if controlnet is None or conditions is None:
-        yield
-        return
-    original = controlnet.controlnet_cond_embedding
-    controlnet.controlnet_cond_embedding = _CachedEmbedding(original(conditions))
-    try:
-        yield
-    finally:
-        controlnet.controlnet_cond_embedding = original
+logger = logging.getLogger(__name__)
 
 
 @torch.no_grad()
@@ -107,11 +54,13 @@ def sample_latents(
         embeddings: [B, L, D] of the prompts.
         empty_embedding: [1, L, D], for guidance.
         conditions: [B, 3, H, W] in [0, 1], or None.
-        seeds: B non-negative integers.
+        seeds: B non-negative integers, of the images' noise streams; equal seeds give equal noise.
         options: solver, number of steps, guidance.
+    Raises:
+        FloatingPointError: latents are not finite, because the networks' precision does not reach.
     """
     device, dtype = prior.unet.device, prior.unet.dtype
-    scheduler = make_scheduler(options.scheduler, prior.scheduler_config, options.num_inference_steps)
+    scheduler = make_scheduler(options.scheduler, prior.scheduler_config, options.num_inference_steps, options.spacing)
     streams = [torch.Generator().manual_seed(int(seed)) for seed in seeds]
     side = prior.unet.config.sample_size
     shape = (prior.unet.config.in_channels, side, side)
@@ -123,9 +72,9 @@ def sample_latents(
         conditions = None if conditions is None else torch.cat([conditions, conditions])
     embeddings = embeddings.to(device, dtype)
     conditions = None if conditions is None else conditions.to(device, dtype)
-    # Only the ancestral solver draws further noise, from each image's own stream.
-    further = {"generator": streams} if options.scheduler == "ddpm" else {}
-    denoiser = Denoiser(prior.unet, prior.controlnet)
+    further = {"generator": streams} if options.scheduler in STOCHASTIC else {}
+    controlnet = None if prior.controlnet is None else EveryKthStep(prior.controlnet, options.controlnet_every)
+    denoiser = Denoiser(prior.unet, controlnet)
     with cached_condition_embedding(prior.controlnet, conditions):
         for timestep in scheduler.timesteps:
             noisy = scheduler.scale_model_input(state, timestep).to(dtype)
@@ -136,13 +85,22 @@ def sample_latents(
                 plain, prompted = predicted.chunk(2)
                 predicted = plain + options.guidance_scale * (prompted - plain)
             state = scheduler.step(predicted, timestep, state, **further).prev_sample
+    if not bool(torch.isfinite(state).all()):
+        raise FloatingPointError(
+            f"latents sampled with {options.scheduler} and networks in {dtype} are not finite; "
+            "float16 overflows beyond 65504, bfloat16 and float32 do not"
+        )
     return state
 
 
 @torch.no_grad()
 def decode_frames(prior: Prior, latents: Tensor, options: SamplingOptions) -> np.ndarray:
     """Frames [B, H, W, 3] uint8 of scaled latents; dark values become exactly 0."""
-    images = prior.vae.decode((latents / prior.scaling_factor).to(prior.vae.dtype)).sample.float()
+    latents = latents / prior.scaling_factor
+    images = prior.vae.decode(latents.to(prior.vae.dtype)).sample.float()
+    if prior.vae.dtype == torch.float16 and not bool(torch.isfinite(images).all()):
+        logger.warning("the autoencoder overflows in float16; decoding in float32 from here on")
+        images = prior.vae.float().decode(latents).sample
     values = ((images + 1) * 127.5).clamp(0, 255)
     if options.palette == "grey":
         values = values.mean(dim=1, keepdim=True).expand_as(values)
@@ -166,7 +124,7 @@ def sample_frames(
     Args:
         prior: a loaded checkpoint.
         conditions: N prompts, with N condition images where the checkpoint has a ControlNet.
-        options: solver, steps, guidance, output levels.
+        options: solver, steps, guidance, output levels; its device is that of the prior.
         seeds: N non-negative integers.
         work: folder of the finished shards.
         identity: names the checkpoint, so that shards of another one are not reused.
@@ -176,34 +134,49 @@ def sample_frames(
         ValueError: numbers or sizes do not match.
     """
     _check_conditions(prior, conditions, seeds)
-    width, height = prior.image_size
-    frames = np.zeros((len(conditions), height, width, 3), np.uint8)
-    prompts = sorted(set(conditions.prompts))
+    if not len(conditions):
+        width, height = prior.image_size
+        return np.zeros((0, height, width, 3), np.uint8)
+    shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
+    with _progress(shards) as (missing, report):
+        sample_shards(prior, _prompts(conditions), missing, options, report)
+    return _read(shards)
+
+
+def sample_shards(
+    prior: Prior, prompts: list[str], shards: list[Shard], options: SamplingOptions, report: Callable[[int], None]
+) -> None:
+    """Sample shards and write them.
+
+    Args:
+        prior: a loaded checkpoint.
+        prompts: all that any shard of the call has, also those of other processes: they are embedded together.
+        shards: what is to be done.
+        options: solver, steps, guidance, output levels.
+        report: is called with the number of frames done since.
+    """
+    if not shards:
+        return
     table = encode_prompts(prior, [*prompts, ""]).cpu()
-    embeddings = table[[prompts.index(prompt) for prompt in conditions.prompts]]
-    work.mkdir(parents=True, exist_ok=True)
-    settings = json.dumps([identity, cache_material(options)])
-    with tqdm(total=len(frames), desc="sampling", unit="image", leave=False, disable=None) as bar:
-        for start in range(0, len(frames), SHARD):
-            rows = range(start, min(start + SHARD, len(frames)))
-            path = work / f"shard_{_shard_digest(settings, conditions, seeds, rows)}.npy"
-            if path.is_file():
-                frames[rows.start : rows.stop] = np.load(path, allow_pickle=False)
-                bar.update(len(rows))
-                continue
-            for first in range(rows.start, rows.stop, options.batch_size):
-                part = slice(first, min(first + options.batch_size, rows.stop))
-                images = None
-                if conditions.images is not None:
-                    images = conditions_to_tensor(conditions.images[part], prior.reversed_condition)
-                latents = sample_latents(prior, embeddings[part], table[-1:], images, seeds[part], options)
-                frames[part] = decode_frames(prior, latents, options)
-                bar.update(part.stop - part.start)
-            temporary = path.with_suffix(".tmp")
-            with temporary.open("wb") as file:
-                np.save(file, frames[rows.start : rows.stop])
-            os.replace(temporary, path)
-    return frames
+    batches = ShrinkingBatches(options.batch_size)
+    for shard in shards:
+        embeddings = table[[prompts.index(prompt) for prompt in shard.conditions.prompts]]
+        sample = functools.partial(_sample_rows, prior, shard, embeddings, table[-1:], options)
+        parts = []
+        for rows, frames in batches.map(sample, len(shard)):
+            parts.append(frames)
+            report(rows.stop - rows.start)
+        shard.write(np.concatenate(parts))
+
+
+def _sample_rows(
+    prior: Prior, shard: Shard, embeddings: Tensor, empty_embedding: Tensor, options: SamplingOptions, rows: slice
+) -> np.ndarray:
+    images = None
+    if shard.conditions.images is not None:
+        images = conditions_to_tensor(shard.conditions.images[rows], prior.reversed_condition)
+    latents = sample_latents(prior, embeddings[rows], empty_embedding, images, shard.seeds[rows], options)
+    return decode_frames(prior, latents, options)
 
 
 def sample_checkpoint(
@@ -215,25 +188,110 @@ def sample_checkpoint(
     seeds: Sequence[int],
     work: Path,
 ) -> np.ndarray:
-    """Load a checkpoint folder and sample from it: `sample` of both generators."""
-    dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
-    device = choose_device(options.device)
-    prior = load_prior(checkpoint, with_controlnet=with_controlnet, dtype=dtype, device=device)
-    return sample_frames(prior, conditions, options, seeds=seeds, work=work, identity=_weights_digest(checkpoint))
+    """Load a checkpoint folder and sample from it: `sample` of both generators.
+
+    With several devices the shards are dealt out to one process each, batches as with one: the frames are the same.
+    """
+    _check_scheduler(checkpoint, options)
+    devices, identity = device_names(options.device), _checkpoint_digest(checkpoint)
+    if len(devices) == 1 or not len(conditions):
+        prior = _load(checkpoint, options, devices[0], with_controlnet)
+        return sample_frames(prior, conditions, options, seeds=seeds, work=work, identity=identity)
+    _check_seeds(conditions, seeds)
+    shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
+    with _progress(shards) as (missing, report):
+        function = functools.partial(_sample_share, checkpoint, options, with_controlnet, _prompts(conditions))
+        shares = [missing[number :: len(devices)] for number in range(len(devices))]
+        busy = [number for number, share in enumerate(shares) if share]
+        run_on_devices(function, [devices[number] for number in busy], [shares[number] for number in busy], report)
+    return _read(shards)
 
 
-def _weights_digest(checkpoint: Path) -> str:
-    """Digest of the networks' weights: what makes two checkpoints different."""
+def _sample_share(
+    checkpoint: Path,
+    options: SamplingOptions,
+    with_controlnet: bool,
+    prompts: list[str],
+    device: str,
+    shards: list[Shard],
+    report: Callable[[int], None],
+) -> None:
+    """What the process of one device does."""
+    prior = _load(checkpoint, options, device, with_controlnet)
+    for shard in shards:
+        _check_conditions(prior, shard.conditions, shard.seeds)
+    sample_shards(prior, prompts, shards, options, report)
+
+
+def _load(checkpoint: Path, options: SamplingOptions, device: str, with_controlnet: bool) -> Prior:
+    """The networks in the precision asked for. The patch code stays in float32, where it is exact and takes no time."""
+    from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
+
+    place, dtype = choose_device(device), getattr(torch, options.precision)
+    prior = load_prior(checkpoint, with_controlnet=with_controlnet, dtype=dtype, device=place)
+    if not isinstance(prior.vae, PatchAutoencoder) or dtype == torch.float32:
+        return prior
+    exact: Any = PatchAutoencoder.from_config(prior.vae.config)
+    return dataclasses.replace(prior, vae=exact.to(place).eval().requires_grad_(False))
+
+
+def _check_scheduler(checkpoint: Path, options: SamplingOptions) -> None:
+    """Raise before anything is loaded where the checkpoint's noise schedule cannot be sampled with these options."""
+    path = checkpoint / "scheduler" / "scheduler_config.json"
+    try:
+        config = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return  # the checkpoint is broken, and loading it says in what way
+    try:
+        make_scheduler(options.scheduler, config, options.num_inference_steps, options.spacing)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _settings(identity: str, options: SamplingOptions) -> str:
+    return json.dumps([identity, cache_material(options)])
+
+
+def _prompts(conditions: Conditions) -> list[str]:
+    return sorted(set(conditions.prompts))
+
+
+@contextmanager
+def _progress(shards: list[Shard]) -> Iterator[tuple[list[Shard], Callable[[int], Any]]]:
+    """The shards that are still to be sampled, and what to call with the number of frames done."""
+    missing = [shard for shard in shards if not shard.path.is_file()]
+    total, left = sum(map(len, shards)), sum(map(len, missing))
+    with tqdm(total=total, initial=total - left, desc="sampling", unit="image", leave=False, disable=None) as bar:
+        yield missing, bar.update
+
+
+def _read(shards: list[Shard]) -> np.ndarray:
+    """The frames of all shards; only one shard is in memory twice."""
+    first = shards[0].read()
+    frames = np.empty((sum(map(len, shards)), *first.shape[1:]), np.uint8)
+    start = 0
+    for shard in shards:
+        frames[start : start + len(shard)] = shard.read()
+        start += len(shard)
+    return frames
+
+
+def _checkpoint_digest(checkpoint: Path) -> str:
+    """Digest of the weights, and of the configs that say what they mean."""
     digest = hashlib.sha256()
-    for path in sorted(checkpoint.glob("*/*.safetensors")):
+    for path in sorted(path for path in checkpoint.glob("*/*") if path.is_file()):
         with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+            digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
 
 
-def _check_conditions(prior: Prior, conditions: Conditions, seeds: Sequence[int]) -> None:
+def _check_seeds(conditions: Conditions, seeds: Sequence[int]) -> None:
     if len(seeds) != len(conditions):
         raise ValueError(f"one seed a condition is needed, got {len(seeds)} seeds for {len(conditions)} conditions")
+
+
+def _check_conditions(prior: Prior, conditions: Conditions, seeds: Sequence[int]) -> None:
+    _check_seeds(conditions, seeds)
     if (prior.controlnet is None) != (conditions.images is None):
         needs = "no condition images" if prior.controlnet is None else "condition images"
         got = "none" if conditions.images is None else f"images of shape {list(conditions.images.shape)}"
@@ -245,13 +303,3 @@ def _check_conditions(prior: Prior, conditions: Conditions, seeds: Sequence[int]
             f"condition images must be [{len(conditions)}, {height}, {width}, 3] uint8, "
             f"got {list(images.shape)} {images.dtype}"
         )
-
-
-def _shard_digest(settings: str, conditions: Conditions, seeds: Sequence[int], rows: range) -> str:
-    """Names a shard by everything its frames depend on."""
-    part = slice(rows.start, rows.stop)
-    digest = hashlib.sha256(settings.encode())
-    digest.update(json.dumps([list(conditions.prompts[part]), [int(seed) for seed in seeds[part]]]).encode())
-    if conditions.images is not None:
-        digest.update(np.ascontiguousarray(conditions.images[part]).data)
-    return digest.hexdigest()[:24]

@@ -2,23 +2,59 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import re
+from collections.abc import Sequence
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
 from data_contracts.config import RUN_SETTING, Frozen
+
+Scheduler = Literal["unipc", "dpm++", "dpm++_3m", "dpm++_sde", "deis", "sa_solver", "ddim", "ddpm"]
+Spacing = Literal["karras", "lu", "even", "trailing"]
+
+_ANY: tuple[Spacing, ...] = ("karras", "lu", "even", "trailing")
+SPACINGS: dict[str, tuple[Spacing, ...]] = {
+    "unipc": _ANY,
+    "dpm++": _ANY,
+    "dpm++_3m": _ANY,
+    "dpm++_sde": _ANY,
+    "deis": _ANY,
+    "sa_solver": _ANY,
+    "ddim": _ANY,
+    "ddpm": ("even", "trailing"),
+}
+"""The spacings each solver supports; the first is what it gets where none is asked for."""
+
+STOCHASTIC = ("ddpm", "dpm++_sde", "sa_solver")
+"""Solvers that draw noise at every step, from each image's own stream."""
+
+_DEVICE = re.compile(r"auto|all|(cpu|mps|cuda(:\d+)?)(,(cpu|mps|cuda(:\d+)?))*")
 
 
 class SamplingOptions(Frozen):
     """How frames are drawn from a checkpoint."""
 
-    scheduler: Literal["unipc", "dpm++", "ddim", "ddpm"] = Field(
+    scheduler: Scheduler = Field(
         default="unipc", description="solver; the paper's is ddpm with 1000 steps, unipc (Karras) matches it in 20"
     )
     num_inference_steps: int = Field(
         default=20, gt=0, le=1000, description="evaluations of the network an image; paper: 1000"
     )
+    spacing: Spacing = Field(
+        default="karras",
+        description="where the steps lie: karras = dense at little noise, lu = even in log signal-to-noise ratio, "
+        "even and trailing = even in time; ddpm has no karras and takes even where nothing is said",
+    )
     guidance_scale: float = Field(default=1.0, ge=1, description="classifier-free guidance; 1 = none, twice as fast")
+    controlnet_every: int = Field(
+        default=1, gt=0, description="the ControlNet is evaluated at every k-th step, its residuals reused between"
+    )
+    noise: Literal["independent", "shared"] = Field(
+        default="independent",
+        description="independent = each row's own seed; shared = the first row's seed for all rows, so that "
+        "consecutive frames of a motion agree",
+    )
     palette: Literal["rgb", "red_blue", "grey"] = Field(
         default="rgb",
         description="colours event images have: red_blue = no green, grey = channels averaged (no polarity)",
@@ -29,8 +65,62 @@ class SamplingOptions(Frozen):
         le=255,
         description="channel values below become 0: a decoder never gives the exact black of no event",
     )
-    precision: Literal["float32", "bfloat16"] = Field(
+    precision: Literal["float32", "bfloat16", "float16"] = Field(
         default="float32", description="of the networks; the state of the solver stays float32"
     )
-    batch_size: int = Field(default=32, gt=0, json_schema_extra=RUN_SETTING, description="images in memory at a time")
-    device: str = Field(default="auto", json_schema_extra=RUN_SETTING, description="auto, cpu, cuda, cuda:1 ...")
+    batch_size: int = Field(
+        default=32,
+        gt=0,
+        json_schema_extra=RUN_SETTING,
+        description="images in memory at a time; halved where memory runs out",
+    )
+    device: str = Field(
+        default="auto",
+        json_schema_extra=RUN_SETTING,
+        description="auto, cpu, cuda, cuda:1 ...; several, as in cuda:0,cuda:1, or all: one process for each",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_the_spacing_of_the_solver(cls, values: Any) -> Any:
+        if isinstance(values, dict) and "spacing" not in values:
+            supported = SPACINGS.get(values.get("scheduler", ""), ("karras",))
+            return {**values, "spacing": supported[0]}
+        return values
+
+    @model_validator(mode="after")
+    def _check_spacing(self) -> Self:
+        check_spacing(self.scheduler, self.spacing)
+        return self
+
+    @field_validator("device")
+    @classmethod
+    def _check_device(cls, device: str) -> str:
+        if not _DEVICE.fullmatch(device):
+            raise ValueError(f"device must be auto, all, or a list such as cpu or cuda:0,cuda:1; got {device!r}")
+        return device
+
+
+def check_spacing(scheduler: str, spacing: str) -> None:
+    """Raise unless the solver supports the spacing.
+
+    Raises:
+        ValueError: it does not, or there is no such solver.
+    """
+    if scheduler not in SPACINGS:
+        raise ValueError(f"unknown scheduler {scheduler!r}; known: {', '.join(SPACINGS)}")
+    if spacing not in SPACINGS[scheduler]:
+        raise ValueError(
+            f"scheduler {scheduler!r} does not support spacing {spacing!r}; "
+            f"it supports {', '.join(SPACINGS[scheduler])}"
+        )
+
+
+def noise_seeds(seeds: Sequence[int], options: SamplingOptions) -> list[int]:
+    """The seeds that noise is drawn from: the rows' own, or for shared noise the first one for all rows.
+
+    A frame depends on its condition and on this seed alone: sampled again by itself with this seed, a row of a call
+    with shared noise is the same.
+    """
+    own = [int(seed) for seed in seeds]
+    return own[:1] * len(own) if options.noise == "shared" else own

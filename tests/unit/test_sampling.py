@@ -5,11 +5,11 @@ import pytest
 import torch
 from tiny_prior import SIDE, make_data, make_prior, shared_prior
 
-from ctlev_core.diffusion import sampling
+from ctlev_core.diffusion import sampling, sampling_shards
 from ctlev_core.diffusion.denoising import NoiseSchedule
 from ctlev_core.diffusion.prior import load_prior, save_prior
 from ctlev_core.diffusion.sampling import cached_condition_embedding, decode_frames, make_scheduler, sample_frames
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions
 from ctlev_core.generators import controlnet, stable_diffusion
 from data_contracts.labels import Conditions
 
@@ -25,9 +25,9 @@ def take(conditions, rows):
     return Conditions(tuple(conditions.prompts[row] for row in rows), conditions.images[rows])
 
 
-@pytest.mark.parametrize("scheduler", ["unipc", "ddpm"])
+@pytest.mark.parametrize("scheduler", ["unipc", *STOCHASTIC])
 def test_rows_do_not_depend_on_the_batch(tmp_path, scheduler):
-    options = FAST.model_copy(update={"scheduler": scheduler})
+    options = SamplingOptions(scheduler=scheduler, num_inference_steps=3, batch_size=4, dark_level=0)
     conditions = conditions_of()
     together = sample_frames(shared_prior(), conditions, options, seeds=SEEDS, work=tmp_path / "a")
     single = options.model_copy(update={"batch_size": 1})
@@ -48,7 +48,7 @@ def test_seed_and_condition_matter_and_repeat(tmp_path):
 
 
 def test_killed_run_reuses_finished_shards(tmp_path, monkeypatch):
-    monkeypatch.setattr(sampling, "SHARD", 2)
+    monkeypatch.setattr(sampling_shards, "SHARD", 2)
     conditions = conditions_of()
     whole = sample_frames(shared_prior(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
     calls = []
