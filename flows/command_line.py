@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -21,6 +21,7 @@ from data_contracts.experiment import Experiment
 from flows import local_server
 from tasks.stage import PlannedStage, in_one_run, planning
 
+X = TypeVar("X", bound=Experiment)
 PRESETS = Path(__file__).resolve().parent / "presets"
 
 
@@ -29,13 +30,18 @@ def preset_names(folder: Path = PRESETS) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
-def load_experiment(preset: str, overrides: list[str]) -> Experiment:
+def load_experiment(preset: str, overrides: list[str], model: type[X] = Experiment) -> X:
     """The experiment a preset describes, with every plug-in's options validated.
+
+    Args:
+        preset: as `load_preset` takes it.
+        overrides: likewise.
+        model: an experiment, or one with further options.
 
     Raises:
         PluginError: unknown preset, option or plug-in, a wrong value, or parts that do not go together.
     """
-    experiment = load_preset(Experiment, PRESETS, preset, overrides)
+    experiment = load_preset(model, PRESETS, preset, overrides)
     for choice in experiment.choices:
         plugins.load_options(choice)
     _check_intensity(experiment)
@@ -71,16 +77,28 @@ def load_preset(model: type[BaseModel], folder: Path, preset: str, overrides: li
         preset: name of a bundled preset, or path of a YAML file.
         overrides: dotted names, for example `encoding.options.polarity=false`; values are YAML.
     """
-    path = Path(preset) if preset.endswith((".yaml", ".yml")) else folder / f"{preset}.yaml"
-    if not path.is_file():
-        known = ", ".join(preset_names(folder))
-        raise PluginError(f"unknown preset {preset!r}; known: {known}, or the path of a .yaml file")
-    values = yaml.safe_load(path.read_text())
-    if not isinstance(values, dict):
-        raise PluginError(f"{path}: a preset is a mapping of options, got {type(values).__name__}")
+    values = _read_preset(folder, preset, ())
     for override in overrides:
         _apply(values, override)
     return validate_options(model, values, f"preset {preset!r}")
+
+
+def _read_preset(folder: Path, preset: str, heirs: tuple[str, ...]) -> dict[str, Any]:
+    """The options of a preset over those of the one it `extends`; each option at the top replaces the other whole."""
+    path = Path(preset) if preset.endswith((".yaml", ".yml")) else folder / f"{preset}.yaml"
+    if not path.is_file():
+        known = ", ".join(preset_names(folder))
+        of = f"{heirs[-1]} extends an " if heirs else ""
+        raise PluginError(f"{of}unknown preset {preset!r}; known: {known}, or the path of a .yaml file")
+    values = yaml.safe_load(path.read_text())
+    if not isinstance(values, dict):
+        raise PluginError(f"{path}: a preset is a mapping of options, got {type(values).__name__}")
+    extended = values.pop("extends", None)
+    if extended is None:
+        return values
+    if not isinstance(extended, str) or extended in (*heirs, preset):
+        raise PluginError(f"{path}: extends must name another preset, got {extended!r}")
+    return _read_preset(folder, extended, (*heirs, preset)) | values
 
 
 def _apply(values: dict[str, Any], override: str) -> None:

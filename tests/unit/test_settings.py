@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow as pa
 import pytest
+import yaml
 from pydantic import ValidationError
 
 from ctlev_core import plugins
@@ -164,3 +165,19 @@ def test_shuffled_labels_are_those_of_others(count):
 
 def test_subsets_are_tables_of_synthetic_frames():
     assert take_share.schema is tables.SYNTHETIC and take_faithful.schema is tables.SYNTHETIC
+
+
+def test_a_preset_extends_another(tmp_path):
+    (tmp_path / "base.yaml").write_text(yaml.safe_dump(smoke().model_dump(mode="json")))
+    (tmp_path / "heir.yaml").write_text("extends: base\nname: heir\nbaselines: {}\n")
+    (tmp_path / "grandchild.yaml").write_text(f"extends: {tmp_path / 'heir.yaml'}\nscaling: []\n")
+    found = load_preset(Experiment, tmp_path, "grandchild", ["num_synthetic=5"])
+    assert found == smoke("name=heir", "baselines={}", "scaling=[]", "num_synthetic=5")
+    for text, message in (
+        ("extends: loop", "extends must name another preset"),
+        ("extends: [base]", "extends must name another preset"),
+        ("extends: nothing", "loop extends an unknown preset 'nothing'"),
+    ):
+        (tmp_path / "loop.yaml").write_text(text)
+        with pytest.raises(plugins.PluginError, match=message):
+            load_preset(Experiment, tmp_path, "loop", [])
