@@ -40,7 +40,7 @@ def refused(home, *arguments, preset="folder"):
         (("--set", "dataset.options.colour=red"), "datasets 'studio': unknown option 'colour'; known: "),
         (
             ("--set", "dataset.name=dhp91"),
-            "unknown plug-in 'dhp91' in datasets; known: ablations, aist, amass, cdehp, dhp19, event_hpe, folder, ",
+            "unknown plug-in 'dhp91' in datasets; known: aist, amass, cdehp, dhp19, event_hpe, folder, ",
         ),
         (("--set", "generator.options.num_steps=many"), "generators 'controlnet': option 'num_steps'"),
         (("--set", "sampling.num_inference_steps=0"), "option 'num_inference_steps': input should be greater"),
