@@ -119,6 +119,7 @@ def curves_svg(
     *,
     log_x: bool = False,
     log_y: bool = False,
+    spans: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
 ) -> str:
     """Line chart as an `<svg>` element whose text and axes take the colour of the page around it.
 
@@ -129,6 +130,7 @@ def curves_svg(
         y_label: left of it.
         log_x: logarithmic x axis.
         log_y: logarithmic y axis.
+        spans: name -> (low, high) at each x of that series, drawn as a bar; none where an end is not finite.
     Returns:
         The element, without references to anything outside. Equal arguments give equal text.
     Raises:
@@ -154,6 +156,10 @@ def curves_svg(
             colour, style = series_style(index)
             marker = "o" if len(x) < _MARKED_POINTS else None
             axes.plot(x, y, color=colour, linestyle=style, linewidth=1.4, marker=marker, markersize=3)
+            if spans and name in spans:
+                places, low, high = (np.asarray(v, np.float64) for v in (series[name][0], *spans[name]))
+                known = np.isfinite(places + low + high)
+                axes.vlines(places[known], low[known], high[known], color=colour, linewidth=1.1, alpha=0.6)
         axes.set(
             xlabel=x_label, ylabel=y_label, xscale="log" if log_x else "linear", yscale="log" if log_y else "linear"
         )

@@ -7,21 +7,15 @@ from __future__ import annotations
 
 import base64
 import html
-import math
 import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeGuard
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ctlev_core.report import figures
 from ctlev_core.report.style import SCRIPT, STYLE
-
-Cell = str | float | int | bool | None
-NO_VALUE = "–"
-# A number, then perhaps its uncertainty: "6.31", "-1,234", "5.0e-3", "6.31 ± 0.02", "6.313 [6.120, 6.500]", "93 %".
-_NUMBER = re.compile(r"^([-+−]?[\d,]*\.?\d+(?:e[-+]?\d+)?)((?:\s*%)?)(\s*(?:±|\[|\().*)?$", re.IGNORECASE)
+from ctlev_core.report.tables import Table, format_table, split_number
 
 
 @dataclass(frozen=True)
@@ -30,27 +24,6 @@ class Text:
 
     title: str
     text: str
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table the reader can sort by clicking a heading.
-
-    Attributes:
-        title: heading of the section.
-        columns: column headings.
-        rows: cells; numbers are formatted column by column, texts are shown as they are, None and NaN as a dash.
-        caption: what the reader must know to read it.
-        footnotes: one line each, below.
-        bold: (row, column) of cells to emphasise.
-    """
-
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
-    caption: str = ""
-    footnotes: Sequence[str] = ()
-    bold: Collection[tuple[int, int]] = ()
 
 
 @dataclass(frozen=True)
@@ -82,6 +55,7 @@ class Curves:
         log_x: logarithmic x axis.
         log_y: logarithmic y axis.
         caption: what the reader sees.
+        spans: name -> (low, high), the ends of an interval at each x of that series; drawn as bars, NaN = none.
     """
 
     title: str
@@ -91,6 +65,7 @@ class Curves:
     log_x: bool = False
     log_y: bool = False
     caption: str = ""
+    spans: Mapping[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -113,7 +88,47 @@ class Animation:
 Section = Text | Table | ImageGrid | Curves | Animation
 
 
-def render_report(*, title: str, lead: str, verdict: str, sections: Sequence[Section], footer: str = "") -> str:
+@dataclass(frozen=True)
+class Folded:
+    """Sections that stay closed until the reader opens them.
+
+    Attributes:
+        title: what can be seen while it is closed.
+        sections: shown one below the other, with headings of their own where there are several.
+        caption: above them.
+    """
+
+    title: str
+    sections: Sequence[Section]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One picture of the strip that says what was done.
+
+    Attributes:
+        heading: two or three words.
+        picture: [H, W] or [H, W, 3] uint8, or a text that stands in for one, such as a prompt.
+        sentence: for a reader who knows nothing of events.
+        follows: the step before leads to this one: an arrow stands between.
+    """
+
+    heading: str
+    picture: np.ndarray | str
+    sentence: str
+    follows: bool = False
+
+
+def render_report(
+    *,
+    title: str,
+    lead: str,
+    verdict: str,
+    sections: Sequence[Section | Folded],
+    footer: str = "",
+    steps: Sequence[Step] = (),
+) -> str:
     """The page as text, to be written as UTF-8.
 
     Args:
@@ -122,6 +137,7 @@ def render_report(*, title: str, lead: str, verdict: str, sections: Sequence[Sec
         verdict: the answer, in a sentence or two.
         sections: in reading order; empty tables, grids and charts say so.
         footer: where the numbers come from.
+        steps: what was done, in pictures; below the verdict.
     Returns:
         One HTML document. Equal arguments give equal text.
     Raises:
@@ -132,10 +148,7 @@ def render_report(*, title: str, lead: str, verdict: str, sections: Sequence[Sec
         for number, section in enumerate(sections, 1)
     )
     contents = f'<nav aria-label="Contents"><ol>{entries}</ol></nav>' if len(sections) > 2 else ""
-    body = "\n".join(
-        f'<section id="section-{number}"><h2>{_inline(section.title)}</h2>\n{_section(section)}</section>'
-        for number, section in enumerate(sections, 1)
-    )
+    body = "\n".join(_numbered(section, number) for number, section in enumerate(sections, 1))
     foot = f"<footer>{_paragraphs(footer)}</footer>" if footer else ""
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -154,7 +167,7 @@ def render_report(*, title: str, lead: str, verdict: str, sections: Sequence[Sec
 <h1>{_inline(title)}</h1>
 <div class="lead">{_paragraphs(lead)}</div>
 <div class="verdict">{_paragraphs(verdict)}</div>
-{contents}
+{_strip(steps)}{contents}
 </header>
 {body}
 {foot}
@@ -163,6 +176,37 @@ def render_report(*, title: str, lead: str, verdict: str, sections: Sequence[Sec
 </body>
 </html>
 """
+
+
+def _numbered(section: Section | Folded, number: int) -> str:
+    if not isinstance(section, Folded):
+        return f'<section id="section-{number}"><h2>{_inline(section.title)}</h2>\n{_section(section)}</section>'
+    parts = "\n".join(
+        (f"<h3>{_inline(part.title)}</h3>\n" if len(section.sections) > 1 else "") + _section(part)
+        for part in section.sections
+    )
+    return (
+        f'<section id="section-{number}"><details><summary><h2>{_inline(section.title)}</h2></summary>\n'
+        f"{_caption(section.caption)}{parts}</details></section>"
+    )
+
+
+def _strip(steps: Sequence[Step]) -> str:
+    """Pictures with a heading and a sentence below each."""
+    parts = []
+    for step in steps:
+        if isinstance(step.picture, str):
+            picture = f'<p class="words">{_inline(step.picture)}</p>'
+        else:
+            png = base64.b64encode(figures.image_grid_png([[step.picture]], min_cell_px=192)).decode("ascii")
+            picture = f'<img alt="{html.escape(step.heading)}" src="data:image/png;base64,{png}">'
+        follows = ' class="follows"' if step.follows else ""
+        parts.append(
+            f'<li{follows}><figure><div class="picture">{picture}</div>'
+            f"<figcaption><b>{_inline(step.heading)}</b> {_inline(step.sentence)}"
+            "</figcaption></figure></li>"
+        )
+    return f'<ol class="steps">{"".join(parts)}</ol>\n' if parts else ""
 
 
 def _section(section: Section) -> str:
@@ -192,27 +236,16 @@ def _caption(text: str) -> str:
 
 
 def _table(table: Table) -> str:
-    for number, row in enumerate(table.rows):
-        if len(row) != len(table.columns):
-            raise ValueError(
-                f"table {table.title!r}: row {number} has {len(row)} cells for {len(table.columns)} columns"
-            )
-    if not table.rows:
+    shown = format_table(table)
+    if not shown.rows:
         return _caption(table.caption) + '<p class="empty">No rows.</p>'
-    columns = [[row[index] for row in table.rows] for index in range(len(table.columns))]
-    texts = [format_column(column) for column in columns]
-    numeric = [all(_NUMBER.match(text) for text in column if text != NO_VALUE) for column in texts]
     head = "".join(
         f'<th scope="col"{_class("number" if is_number else "")}><button type="button">{_inline(name)}</button></th>'
-        for name, is_number in zip(table.columns, numeric, strict=True)
+        for name, is_number in zip(table.columns, shown.numeric, strict=True)
     )
     body = "\n".join(
-        "<tr>"
-        + "".join(
-            _cell(texts[index][row], numeric[index], (row, index) in table.bold) for index in range(len(table.columns))
-        )
-        + "</tr>"
-        for row in range(len(table.rows))
+        "<tr>" + "".join(_cell(text, shown.numeric[x], (y, x) in table.bold) for x, text in enumerate(row)) + "</tr>"
+        for y, row in enumerate(shown.rows)
     )
     notes = "".join(f"<li>{_inline(note)}</li>" for note in table.footnotes)
     footnotes = f'<ul class="footnotes">{notes}</ul>' if notes else ""
@@ -230,45 +263,15 @@ def _class(names: str) -> str:
 
 def _cell(text: str, numeric: bool, bold: bool) -> str:
     names = " ".join(name for name, on in (("number", numeric), ("bold", bold)) if on)
-    match = _NUMBER.match(text) if numeric else None
-    if match is None:
+    found = split_number(text) if numeric else None
+    if found is None:
         return f"<td{_class(names)}>{_inline(text)}</td>"
-    number, unit, uncertainty = match.group(1), match.group(2), match.group(3) or ""
+    number, unit, uncertainty = found
     sort_key = number.replace(",", "").replace("−", "-")
     shown = html.escape(number + unit)
     if uncertainty:
         shown += f'<span class="uncertainty">{html.escape(uncertainty)}</span>'
     return f'<td{_class(names)} data-sort="{sort_key}">{shown}</td>'
-
-
-def format_column(cells: Sequence[Cell]) -> list[str]:
-    """Texts of the cells of one column; fractions get the same number of decimals, enough for 4 significant digits."""
-    decimals = 0
-    for cell in cells:
-        if _is_fraction(cell) and math.isfinite(cell):
-            shortest = f"{float(cell):.4g}"
-            decimals = max(decimals, len(shortest.partition(".")[2]) if "e" not in shortest else 0)
-    return [_format(cell, decimals) for cell in cells]
-
-
-def _is_fraction(cell: object) -> TypeGuard[float]:
-    return isinstance(cell, float | np.floating)
-
-
-def _format(cell: Cell, decimals: int) -> str:
-    if cell is None or (_is_fraction(cell) and math.isnan(cell)):
-        return NO_VALUE
-    if isinstance(cell, bool | np.bool_):
-        return "yes" if cell else "no"
-    if isinstance(cell, int | np.integer):
-        return f"{int(cell):,}"
-    if not _is_fraction(cell):
-        return str(cell) or NO_VALUE
-    if math.isinf(cell):
-        return "∞" if cell > 0 else "−∞"
-    if cell and not 1e-4 <= abs(cell) < 1e9:
-        return f"{float(cell):.3e}"
-    return f"{float(cell):,.{decimals}f}"
 
 
 def _image_grid(grid: ImageGrid) -> str:
@@ -303,7 +306,9 @@ def _animation(animation: Animation) -> str:
 def _curves(curves: Curves) -> str:
     if not any(len(x) for x, _ in curves.series.values()):
         return _caption(curves.caption) + '<p class="empty">No points.</p>'
-    svg = figures.curves_svg(curves.series, curves.x_label, curves.y_label, log_x=curves.log_x, log_y=curves.log_y)
+    svg = figures.curves_svg(
+        curves.series, curves.x_label, curves.y_label, log_x=curves.log_x, log_y=curves.log_y, spans=curves.spans
+    )
     legend = "".join(
         f'<li><i style="border-top:2px {style} {colour}"></i>{_inline(name)}</li>'
         for name, (colour, style) in ((name, figures.series_style(index)) for index, name in enumerate(curves.series))

@@ -1,4 +1,4 @@
-"""How the report looks, and the few lines of script that sort its tables."""
+"""How the report looks, and the few lines of script that sort its tables and open what a link leads to."""
 
 STYLE = """
 :root { color-scheme: light dark; --page: #fff; --ink: #1c2024; --soft: #5d6670; --line: #dfe3e7; --tint: #f5f7f9;
@@ -12,6 +12,11 @@ body { margin: 0; background: var(--page); color: var(--ink);
 main { max-width: 1060px; margin: 0 auto; padding: 2.2rem 1.25rem 4rem; }
 h1 { font-size: 1.75rem; line-height: 1.25; margin: 0 0 .6rem; letter-spacing: -.01em; }
 h2 { font-size: 1.15rem; line-height: 1.35; margin: 0 0 .4rem; }
+h3 { font-size: 1rem; line-height: 1.35; margin: 1.6rem 0 .4rem; }
+details { border-top: 1px solid var(--line); padding-top: .6rem; }
+summary { cursor: pointer; color: var(--accent); }
+summary h2 { display: inline; color: var(--ink); }
+details[open] > summary { margin-bottom: .6rem; }
 p { margin: 0 0 .7rem; max-width: 75ch; }
 section { margin-top: 2.6rem; }
 code { font: .88em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; background: var(--tint);
@@ -23,6 +28,18 @@ a:hover { text-decoration: underline; }
 .verdict { border-left: 3px solid var(--accent); padding: .1rem 0 .1rem 1rem; margin: 1.1rem 0; font-size: 1.08rem; }
 .verdict p:last-child { margin-bottom: 0; }
 .empty { color: var(--soft); font-style: italic; }
+.steps { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: 1.2rem 2.2rem;
+  margin: 1.6rem 0; padding: 0; list-style: none; max-width: 58rem; }
+.steps .picture { position: relative; }
+.steps figure { margin: 0; }
+.steps img, .steps .words { display: block; width: 100%; aspect-ratio: 1; object-fit: contain; background: #000;
+  border-radius: 4px; image-rendering: pixelated; }
+.steps .words { margin: 0; display: flex; align-items: center; justify-content: center; padding: 1rem;
+  text-align: center; background: var(--tint); border: 1px solid var(--line); font-size: 1.05rem; }
+.steps figcaption { font-size: .85rem; line-height: 1.4; color: var(--soft); margin-top: .45rem; }
+.steps b { display: block; color: var(--ink); }
+.steps .follows .picture::before { content: "→"; position: absolute; left: -2.2rem; width: 2.2rem; text-align: center;
+  top: calc(50% - .5em); font-size: 1.3rem; line-height: 1; color: var(--soft); }
 nav ol { margin: 1.2rem 0 0; padding: 0; list-style: none; font-size: .9rem; columns: 18rem auto; column-gap: 2rem; }
 nav li { break-inside: avoid; padding: .1rem 0; }
 .scroll { overflow-x: auto; }
@@ -65,6 +82,8 @@ footer { margin-top: 3rem; padding-top: .8rem; border-top: 1px solid var(--line)
   main { padding: 1.3rem 1rem 3rem; }
   h1 { font-size: 1.4rem; }
   th, td { padding: .34rem .55rem; }
+  .steps { grid-template-columns: 1fr 1fr; gap: 1rem 1.9rem; }
+  .steps .follows .picture::before { left: -1.9rem; width: 1.9rem; }
 }
 @media print { .scroll { overflow: visible; } section { break-inside: avoid; } nav { display: none; } }
 """
@@ -86,4 +105,10 @@ for (const button of document.querySelectorAll("th button")) {
     body.append(...rows);
   });
 }
+const unfold = () => {
+  const target = location.hash && document.getElementById(location.hash.slice(1));
+  for (const folded of target ? target.querySelectorAll("details") : []) folded.open = true;
+};
+addEventListener("hashchange", unfold);
+unfold();
 """

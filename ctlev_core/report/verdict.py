@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ctlev_core.paired_differences import Difference
+
+__all__ = ["Difference", "lower_is_better", "verdict"]
+
 _LOWER = ("mpjpe", "pve", "fd_", "kid", "error", "calibration_error")
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Mean difference of two models on the same samples, and the ends of its 95 % interval (NaN = unknown)."""
-
-    value: float
-    low: float
-    high: float
 
 
 def lower_is_better(metric: str) -> bool:
@@ -31,6 +25,7 @@ def verdict(
     settings: Sequence[str],
     difference: Difference | None = None,
     beside: Mapping[str, Difference | None] | None = None,
+    ceiling: tuple[Difference, Difference | None] | None = None,
 ) -> str:
     """Compare training on real data with training on real and synthetic data, and synthetic data with baselines.
 
@@ -39,52 +34,78 @@ def verdict(
         settings: the settings that were trained; the first metric found is the one compared.
         difference: real + synthetic minus real in that metric, paired by sample.
         beside: for each baseline, real + synthetic minus real + baseline, paired by sample.
+        ceiling: real + more real minus real, and the share of that gain which synthetic data reached (None where the
+            gain is not certain).
     Returns:
-        A few sentences. A change counts as shown only where the interval of the difference excludes zero; it covers
-        the choice of test recordings, not of seeds.
+        A few sentences. A change counts as shown only where the interval of the difference excludes zero.
     """
     scored = [row for row in rows if row["group"] == "all" and row["setting"] in settings]
     if not scored:
         return "No downstream model was scored."
     metric = scored[0]["metric"]
-    values = {
-        setting: float(np.mean(found))
-        for setting in settings
-        if (found := [row["value"] for row in scored if row["setting"] == setting and row["metric"] == metric])
-    }
+    values = _means(rows, metric)
     beside = beside or {}
-    own = {name: value for name, value in values.items() if name.removeprefix("real+") not in beside}
+    own = {name: values[name] for name in ("real", "synthetic", "real+synthetic") if name in values}
+    if not own:
+        own = {name: values[name] for name in settings if name in values}
     summary = f"{metric} on held-out real data ({'lower' if lower_is_better(metric) else 'higher'} is better): "
     summary += ", ".join(f"{setting} {value:.3f}" for setting, value in own.items()) + "."
     if difference is None or "real" not in values or "real+synthetic" not in values:
         return summary
-    sentences = [summary, _what_it_did(difference, metric)]
+    sentences = [summary, _what_it_did(difference, metric, values["real"])]
+    if ceiling is not None and "real+more_real" in values:
+        sentences.append(_ceiling(*ceiling))
     for name, compared in beside.items():
         if compared is not None and f"real+{name}" in values:
             sentences.append(_beside(name, values[f"real+{name}"], compared, metric))
-    return " ".join(sentences)
+    sentences.append(_labels(values))
+    return " ".join(sentence for sentence in sentences if sentence)
 
 
-def _what_it_did(difference: Difference, metric: str) -> str:
+def _means(rows: list[dict[str, Any]], metric: str) -> dict[str, float]:
+    """Mean over trainings of each setting's score on all rows."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        if row["group"] == "all" and row["metric"] == metric:
+            found.setdefault(row["setting"], []).append(row["value"])
+    return {setting: float(np.mean(values)) for setting, values in found.items()}
+
+
+def _what_it_did(difference: Difference, metric: str, real: float) -> str:
     if math.isnan(difference.low):
         return "There are too few test recordings to say whether adding synthetic data helped."
     if difference.low == difference.high == 0:
         return "Adding synthetic data changed nothing."
-    if difference.low <= 0 <= difference.high:
-        return f"Whether adding synthetic data helped is undecided: paired difference {_text(difference)}."
+    text = f"paired difference {difference.text()}"
+    if not difference.is_certain:
+        return f"Whether adding synthetic data helped is undecided: {text}."
     better = (difference.value < 0) == lower_is_better(metric)
-    return f"Adding synthetic data made it {'better' if better else 'worse'}: paired difference {_text(difference)}."
+    share = f", {abs(difference.value / real):.0%} of what real data alone gives" if real else ""
+    return f"Adding synthetic data made it {'better' if better else 'worse'}: {text}{share}."
+
+
+def _ceiling(gain: Difference, share: Difference | None) -> str:
+    beginning = f"Real frames of the same poses in the place of synthetic ones change it by {gain.text()}"
+    if share is None:
+        return f"{beginning}."
+    interval = "" if math.isnan(share.low) else f" [{share.low:.0%}, {share.high:.0%}]"
+    return f"{beginning}; synthetic ones give {share.value:.0%}{interval} of that."
 
 
 def _beside(name: str, value: float, difference: Difference, metric: str) -> str:
     sentence = f"With frames of {name} in the place of its own, real+{name} is {value:.3f}"
     if math.isnan(difference.low):
         return f"{sentence}."
-    if difference.low <= 0 <= difference.high:
-        return f"{sentence}; which is better is undecided: {_text(difference)}."
+    if not difference.is_certain:
+        return f"{sentence}; which is better is undecided: {difference.text()}."
     better = (difference.value < 0) == lower_is_better(metric)
-    return f"{sentence}; its own are {'better' if better else 'worse'}: {_text(difference)}."
+    return f"{sentence}; its own are {'better' if better else 'worse'}: {difference.text()}."
 
 
-def _text(difference: Difference) -> str:
-    return f"{difference.value:+.3f} [{difference.low:+.3f}, {difference.high:+.3f}]"
+def _labels(values: Mapping[str, float]) -> str:
+    """Whether synthetic frames show their labels, as the model trained on real frames sees them."""
+    own, shuffled = values.get("labels of synthetic"), values.get("shuffled labels of synthetic")
+    if own is None:
+        return ""
+    control = "" if shuffled is None else f", and {shuffled:.3f} on them with shuffled labels"
+    return f"The model trained on real frames scores {own:.3f} on synthetic frames against their labels{control}."

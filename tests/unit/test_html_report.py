@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctlev_core.report.figures import animation_webp, curves_svg, image_grid_png, series_style
-from ctlev_core.report.html import Animation, Curves, ImageGrid, Table, Text, format_column, render_report
+from ctlev_core.report.html import Animation, Curves, ImageGrid, Table, Text, render_report
+from ctlev_core.report.tables import format_column
 
 HOSTILE = "<script>alert(\"1\")</script> & 'x' http://example.org"
 VOID = {"meta", "img", "br"}

@@ -1,0 +1,176 @@
+"""How much better is one training setting than another, and how sure is that? Both are scored on the same samples.
+
+Recordings are drawn, the same for both settings, and so are the trainings of each setting, independently: an interval
+covers the choice of test recordings and what varies between trainings with other seeds. Trainings are few: drawing R of
+R with replacement makes the variance of their mean (R - 1)/R of what it is, so that deviations are stretched by
+sqrt(R/(R - 1)) (Rao & Wu, Resampling Inference with Complex Survey Data, JASA 1988). Of a setting with one training
+nothing is known about that spread, and the interval covers recordings alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core.intervals import MIN_RECORDINGS
+
+NUM_RESAMPLES = 4000
+_CHUNK_NUMBERS = 4_000_000
+_UNKNOWN = (float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A difference, or a share, and the ends of its 95 % interval (NaN = unknown)."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Does the interval exclude zero?"""
+        return self.low > 0 or self.high < 0
+
+    def text(self, digits: int = 3) -> str:
+        """For a table cell: `-0.412 [-0.533, -0.291]`, or the value alone."""
+        shown = f"{self.value:+.{digits}f}"
+        return shown if math.isnan(self.low) else f"{shown} [{self.low:+.{digits}f}, {self.high:+.{digits}f}]"
+
+
+@dataclass(frozen=True, eq=False)
+class Trainings:
+    """Scores of N samples by each of R trainings of one setting.
+
+    Attributes:
+        values: [R, N] float64; NaN = no score.
+        sample_ids: [N] names of the samples.
+        recordings: [N] the recording of each.
+        samples_digest: of the samples' images and labels.
+    """
+
+    values: np.ndarray
+    sample_ids: tuple[str, ...]
+    recordings: tuple[str, ...]
+    samples_digest: str = ""
+
+    def scores_the_same_as(self, other: Trainings) -> bool:
+        """Are both about the same samples, in the same order?"""
+        return (self.samples_digest, self.sample_ids, self.recordings) == (
+            other.samples_digest,
+            other.sample_ids,
+            other.recordings,
+        )
+
+
+def read_trainings(samples: pa.Table) -> dict[tuple[str, str], Trainings]:
+    """The trainings by setting and score, from a table of the schema `PAIRED_SAMPLES`.
+
+    Settings whose trainings were scored on different samples are left out.
+    """
+    found: dict[tuple[str, str], dict[int, list]] = {}
+    columns = [samples[name].to_pylist() for name in ("setting", "metric", "training", "sample_id", "recording_id")]
+    values = samples["value"].to_numpy(zero_copy_only=False).astype(np.float64)
+    digests = samples["samples_digest"].to_pylist()
+    for row, (setting, metric, training, sample_id, recording) in enumerate(zip(*columns, strict=True)):
+        same = found.setdefault((setting, metric), {}).setdefault(training, [[], [], [], digests[row]])
+        for column, value in zip(same, (sample_id, recording, values[row]), strict=False):
+            column.append(value)
+    trainings = {}
+    for key, of_key in found.items():
+        first, *others = of_key.values()
+        if all((other[0], other[1], other[3]) == (first[0], first[1], first[3]) for other in others):
+            stacked = np.array([one[2] for one in of_key.values()], np.float64)
+            trainings[key] = Trainings(stacked, tuple(first[0]), tuple(first[1]), first[3])
+    return trainings
+
+
+def paired_difference(before: Trainings, after: Trainings, seed: int = 0) -> Difference:
+    """Mean score after minus mean score before.
+
+    Raises:
+        ValueError: they are not about the same samples, or no sample is scored by all trainings.
+    """
+    value, draws = _means([before, after], seed)
+    return Difference(float(value[1] - value[0]), *_ends(draws[:, 1] - draws[:, 0]))
+
+
+def share_of_gain(start: Trainings, reached: Trainings, ceiling: Trainings, seed: int = 0) -> Difference | None:
+    """How much of the way from the start to the ceiling was gone: 1 = all of it.
+
+    Returns:
+        The share and its interval; None where it is not certain that the ceiling differs from the start.
+
+    Raises:
+        ValueError: as `paired_difference`.
+    """
+    value, draws = _means([start, reached, ceiling], seed)
+    low, high = _ends(draws[:, 2] - draws[:, 0])
+    if not (low > 0 or high < 0):
+        return None
+    shares = (draws[:, 1] - draws[:, 0]) / (draws[:, 2] - draws[:, 0])
+    return Difference(float((value[1] - value[0]) / (value[2] - value[0])), *_ends(shares))
+
+
+def unpaired_difference(before: Trainings, after: Trainings, seed: int = 0) -> Difference:
+    """The same for other samples: recordings are drawn independently, too.
+
+    Raises:
+        ValueError: no sample is scored by all trainings of a setting.
+    """
+    (value_before,), draws_before = _means([before], seed)
+    (value_after,), draws_after = _means([after], seed + 1)
+    return Difference(float(value_after - value_before), *_ends(draws_after[:, 0] - draws_before[:, 0]))
+
+
+def _means(settings: Sequence[Trainings], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean score of each setting [S], and of its replicates [NUM_RESAMPLES, S]; NaN with too few recordings."""
+    first = settings[0]
+    if not all(first.scores_the_same_as(other) for other in settings):
+        raise ValueError("paired scores must be about the same samples in the same order")
+    scored = ~np.any([np.isnan(setting.values).any(axis=0) for setting in settings], axis=0)
+    if not scored.any():
+        raise ValueError(f"none of the {len(scored)} samples is scored by every training")
+    names, index = np.unique(np.asarray(first.recordings)[scored], return_inverse=True)
+    counts = np.bincount(index).astype(np.float64)
+    sums = [
+        np.stack([np.bincount(index, weights=values) for values in setting.values[:, scored]]) for setting in settings
+    ]
+    found = np.array([of_setting.sum() / (len(of_setting) * counts.sum()) for of_setting in sums])
+    if len(names) < MIN_RECORDINGS:
+        return found, np.full((1, len(settings)), np.nan)
+    generator = np.random.default_rng(seed)
+    drawn = [
+        [(times @ of_setting.T) / (times @ counts)[:, None] for of_setting in sums]
+        for times in _draw_recordings(len(names), generator)
+    ]
+    of_trainings = [np.concatenate(parts) for parts in zip(*drawn, strict=True)]
+    return found, np.stack([_draw_trainings(means, generator) for means in of_trainings], axis=1)
+
+
+def _draw_recordings(count: int, generator: np.random.Generator) -> Iterator[np.ndarray]:
+    """How often each recording is drawn in each replicate, in pieces that fit into memory."""
+    chunk = max(1, _CHUNK_NUMBERS // count)
+    for start in range(0, NUM_RESAMPLES, chunk):
+        yield generator.multinomial(count, np.full(count, 1 / count), size=min(chunk, NUM_RESAMPLES - start))
+
+
+def _draw_trainings(means: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """The mean over trainings [B] of replicates [B, R], with trainings drawn as well."""
+    count = means.shape[1]
+    centre = means.mean(axis=1)
+    if count < 2:
+        return centre
+    weights = generator.multinomial(count, np.full(count, 1 / count), size=len(means)) / count
+    return centre + math.sqrt(count / (count - 1)) * ((weights * means).sum(axis=1) - centre)
+
+
+def _ends(draws: np.ndarray) -> tuple[float, float]:
+    if np.isnan(draws).any():
+        return _UNKNOWN
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return float(low), float(high)

@@ -1,0 +1,179 @@
+"""Pictures of the report made from manifests: what was done in four of them, grids, and frames in motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ctlev_core.report.html import Animation, ImageGrid, Section, Step
+from ctlev_core.windows import spread
+from data_contracts.manifest import Manifest
+
+GRID_COLUMNS = 10
+FEWEST_MOVING = 8
+"""Frames in the order of time that are worth an animation."""
+MAX_CLIPS = 6
+MAX_CANDIDATES = 200
+"""Frames among which the one of median activity is looked for."""
+_KINDS = {
+    "skeleton": "a skeleton: where the joints of a body are",
+    "normals": "a body: which way each part of its surface faces",
+    "body_motion": "a body that moves",
+    "intensity_pair": "two ordinary pictures, one after the other",
+}
+
+
+def steps(frames: Manifest, frame_conditions: Manifest, conditions: Manifest, made: Manifest, kind: str) -> list[Step]:
+    """What was done, in four pictures: a real label and its event image, a new label and its synthetic one.
+
+    Frames are those of median activity (active pixels), not chosen by eye.
+
+    Args:
+        frames: real ones.
+        frame_conditions: what they were learnt with.
+        conditions: what was asked for.
+        made: the synthetic frames, row by row those of `conditions`.
+        kind: name of the condition plug-in.
+    """
+    rows = {name: row for row, name in enumerate(frames.column("sample_id"))}
+    learnt = np.array([rows[name] for name in frame_conditions.column("sample_id")], np.int64)
+    if not len(learnt) or not len(made):
+        return []
+    first = _of_median_activity(frames, learnt)
+    second = _of_median_activity(made, np.arange(len(made)))
+    asked = {name: row for row, name in enumerate(conditions.column("sample_id"))}
+    real, fake = np.asarray(frames.array("frames")[learnt[first]]), np.asarray(made.array("frames")[second])
+    t_start_us, t_end_us = (frames.column(name)[learnt[first]] for name in ("t_start_us", "t_end_us"))
+    colours = "white where there were any" if (real == real[..., :1]).all() else "red where it got brighter, else blue"
+    label = _KINDS.get(kind, "words, as the generator reads them" if kind == "text" else f"a condition, `{kind}`")
+    return [
+        Step("1. A label", _condition(frame_conditions, first), f"What is known of a recorded moment, {label}."),
+        Step(
+            "2. A real event image",
+            real,
+            "The camera takes no pictures: each pixel reports when its brightness changes. These are the reports, "
+            f"events, of {(t_end_us - t_start_us) / 1000:.3g} ms, {colours}.",
+            follows=True,
+        ),
+        Step(
+            "3. A new label",
+            _condition(conditions, asked[made.column("condition_id")[second]]),
+            "One for which there is no event image to learn from.",
+        ),
+        Step(
+            "4. A synthetic event image",
+            fake,
+            "Made for it by a generator that learnt from pairs like the first. Its label is known, so that other "
+            "models can be trained on it.",
+            follows=True,
+        ),
+    ]
+
+
+def _condition(conditions: Manifest, row: int) -> np.ndarray | str:
+    if "images.npy" in conditions.files:
+        return np.asarray(conditions.array("images")[row])
+    return f"“{conditions.column('prompt')[row]}”"
+
+
+def _of_median_activity(manifest: Manifest, rows: np.ndarray) -> int:
+    """Index into `rows` of the frame whose number of active pixels is the median one."""
+    candidates = spread(len(rows), MAX_CANDIDATES)
+    frames = manifest.array("frames")
+    active = [np.count_nonzero(np.asarray(frames[row]).any(axis=-1)) for row in rows[candidates]]
+    return int(candidates[np.argsort(active, kind="stable")[(len(active) - 1) // 2]])
+
+
+def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest]) -> ImageGrid:
+    """Condition, real frame of the same moment where there is one, and the frame of each generator.
+
+    Args:
+        conditions: what was asked for.
+        generated: frames by generator; all were asked for the same.
+        real: sets of real frames to look for the same moments in.
+    """
+    synthetic = next(iter(generated.values()))
+    matches = _same_moments(synthetic.column("source_id"), real)
+    matched = np.flatnonzero([match is not None for match in matches])
+    rows_of = matched if len(matched) >= GRID_COLUMNS else np.arange(len(synthetic))
+    chosen = rows_of[spread(len(rows_of), GRID_COLUMNS)]
+    rows: list[tuple[str, list[np.ndarray]]] = []
+    if "images.npy" in conditions.files:
+        asked = {name: row for row, name in enumerate(conditions.column("sample_id"))}
+        members = [asked[synthetic.column("condition_id")[row]] for row in chosen]
+        rows.append(("condition", [np.asarray(conditions.array("images")[row]) for row in members]))
+    found = [matches[row] for row in chosen]
+    if any(match is not None for match in found):
+        blank = np.zeros_like(synthetic.array("frames")[0])
+        rows.append(("real, same moment", [blank if match is None else match for match in found]))
+    for name, frames in generated.items():
+        rows.append((name, [np.asarray(frames.array("frames")[row]) for row in chosen if row < len(frames)]))
+    captions = [synthetic.column("class_name")[row] for row in chosen]
+    caption = "One column a sample, evenly spread, none chosen by eye."
+    return ImageGrid("Asked for, and sampled", rows, column_labels=captions, caption=caption)
+
+
+def _same_moments(source_ids: list[str], real: list[Manifest]) -> list[np.ndarray | None]:
+    """For each `RECORDING:TIME`, or name of a frame, the real frame of it; None where there is none."""
+    found: list[np.ndarray | None] = [None] * len(source_ids)
+    for manifest in real:
+        names = {name: row for row, name in enumerate(manifest.column("sample_id"))}
+        members: dict[str, list[int]] = {}
+        for row, name in enumerate(manifest.column("recording_id")):
+            members.setdefault(name, []).append(row)
+        starts, ends = (np.array(manifest.column(name), np.int64) for name in ("t_start_us", "t_end_us"))
+        for index, source_id in enumerate(source_ids):
+            name, t_us = _moment(source_id)
+            row = names.get(source_id)
+            if row is None and t_us >= 0:
+                around = [r for r in members.get(name, ()) if starts[r] <= t_us <= ends[r]]
+                row = min(around, key=lambda r: abs(starts[r] + ends[r] - 2 * t_us), default=None)
+            if row is not None and found[index] is None:
+                found[index] = np.asarray(manifest.array("frames")[row])
+    return found
+
+
+def _moment(source_id: str) -> tuple[str, int]:
+    """Recording and time in us of a source; -1 where it names no time."""
+    name, _, time = source_id.rpartition(":")
+    return name, int(time) if time.isdecimal() else -1
+
+
+def real_grid(frames: Manifest) -> ImageGrid:
+    """Some real frames of training and of test, evenly spread."""
+    rows: list[tuple[str, list[np.ndarray]]] = []
+    for split in ("train", "test"):
+        members = frames.rows_where(split=split)
+        chosen = members[spread(len(members), GRID_COLUMNS)]
+        rows.append((f"real, {split}", [np.asarray(frames.array("frames")[row]) for row in chosen]))
+    return ImageGrid("Real frames", rows, caption="The data the generator was tuned on, and the data tested on.")
+
+
+def motion(conditions: Manifest, synthetic: Manifest) -> list[Section]:
+    """Conditions beside the frames sampled for them, as they follow in time, where they do."""
+    if "images.npy" not in conditions.files:
+        return []
+    found = [run for run in runs(synthetic.column("source_id")) if len(run[1]) >= FEWEST_MOVING][:MAX_CLIPS]
+    if not found:
+        return []
+    clips = []
+    for _, rows, _ in found:
+        pictures = [np.asarray(array[rows]) for array in (conditions.array("images"), synthetic.array("frames"))]
+        clips.append((synthetic.column("class_name")[rows[0]], np.concatenate(pictures, axis=2)))
+    step_us = float(np.median([step for _, _, step in found]))
+    caption = "Left the condition, right the frame sampled for it; every frame is sampled on its own."
+    return [Animation("In motion", clips, 1e6 / step_us, caption)]
+
+
+def runs(source_ids: list[str]) -> list[tuple[str, np.ndarray, float]]:
+    """Rows that follow one another in the time of one recording: its name, the rows, the median step in us."""
+    found: list[tuple[str, list[int], list[int]]] = []
+    for row, source_id in enumerate(source_ids):
+        name, t_us = _moment(source_id)
+        if found and found[-1][0] == name and 0 <= found[-1][2][-1] < t_us:
+            found[-1][1].append(row)
+            found[-1][2].append(t_us)
+        else:
+            found.append((name, [row], [t_us]))
+    return [(name, np.array(rows), float(np.median(np.diff(times)))) for name, rows, times in found if len(rows) > 1]

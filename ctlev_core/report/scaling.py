@@ -1,0 +1,72 @@
+"""How a score changes with the amount of synthetic data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ctlev_core.report.html import Curves
+from ctlev_core.report.score_tables import interval_over_trainings, trained_rows
+
+
+@dataclass(frozen=True)
+class ScalePoint:
+    """A score with a certain amount of synthetic data beside the same real data.
+
+    Attributes:
+        series: which frames were added.
+        ratio: of added frames to real ones; 0 = real alone.
+        value: the score.
+        low: lower end of its 95 % interval; NaN = unknown.
+        high: upper end.
+    """
+
+    series: str
+    ratio: float
+    value: float
+    low: float = float("nan")
+    high: float = float("nan")
+
+
+def scaling_points(rows: Sequence[dict[str, Any]], metric: str) -> list[ScalePoint]:
+    """The points of every generator of which several amounts were added to real data.
+
+    Args:
+        rows: of the table `scores`; settings `real`, `real+NAME` (all frames) and `real+NAME@SHARE`.
+        metric: which score.
+    """
+    of_setting: dict[str, list[dict[str, Any]]] = {}
+    for row in trained_rows(rows):
+        if row["group"] == "all" and row["metric"] == metric:
+            of_setting.setdefault(row["setting"], []).append(row)
+    real = of_setting.get("real")
+    if not real or not real[0]["num_train"]:
+        return []
+    names = {setting.partition("@")[0] for setting in of_setting if "@" in setting}
+    points = []
+    for name in sorted(name for name in names if name.startswith("real+")):
+        for setting, found in of_setting.items():
+            if setting in ("real", name) or setting.startswith(f"{name}@"):
+                ratio = found[0]["num_train"] / real[0]["num_train"] - 1
+                points.append(ScalePoint(name.removeprefix("real+"), ratio, *interval_over_trainings(found)))
+    return points
+
+
+def scaling_figure(points: Sequence[ScalePoint], metric: str = "score") -> Curves:
+    """Scores over amounts, one line a series, with the 95 % interval of each point."""
+    series: dict[str, tuple[list[float], list[float]]] = {}
+    spans: dict[str, tuple[list[float], list[float]]] = {}
+    for point in sorted(points, key=lambda point: (point.series, point.ratio)):
+        for where, values in (
+            (series, (point.ratio, point.value)),
+            (spans, (point.low, point.high)),
+        ):
+            for column, value in zip(where.setdefault(point.series, ([], [])), values, strict=True):
+                column.append(value)
+    caption = (
+        "Held-out real test data after training on all real frames and more and more synthetic ones, in equal numbers "
+        "of optimiser steps; bars are 95 % intervals. At 0 there is no synthetic data."
+    )
+    title = f"{metric} by the amount of synthetic data"
+    return Curves(title, series, "synthetic frames for each real one", metric, caption=caption, spans=spans)

@@ -1,0 +1,262 @@
+"""The tables of scores: what training on synthetic data is worth, whether frames show their labels, and distances.
+
+Rows are those of the table `scores`; whatever settings, tasks and metrics occur are shown. Bold cells are only those
+whose paired interval says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core.paired_differences import Difference, Trainings, paired_difference, read_trainings
+from ctlev_core.report.tables import Cell, Table
+from ctlev_core.report.verdict import lower_is_better
+
+Row = dict[str, Any]
+LABELS_OF, SHUFFLED = "labels of ", "shuffled "
+"""Settings that begin so score frames of a generator against their own labels, or against those of other frames."""
+ORIGINS = "classes with"
+"""Groups that begin so are classes by where they were to be learnt from."""
+_METRICS = {
+    "mpjpe2d": "mean distance between predicted and true joints in the image, in pixels",
+    "mpjpe3d": "mean distance between predicted and true joints in space, in millimetres",
+    "pve": "mean distance between predicted and true points of the body's surface, in millimetres",
+    "pck": "share of joints predicted within the limit it names",
+    "auc": "share of joints within a limit, averaged over limits",
+    "oks_ap": "share of poses whose similarity to the truth reaches the limit it names",
+    "accuracy": "share of frames whose class is told right",
+    "binary_accuracy": "the same for one class against the others",
+}
+_CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
+_ENOUGH = 5
+"""Trainings of a setting from which their spread is known well enough to say no more about it."""
+_SETTINGS = {
+    "more_real": "real frames of the very poses that synthetic frames are sampled from: the most they can give",
+    "faithful": "the synthetic frames whose labels a model trained on real frames finds best",
+    "synthetic": "frames of the experiment's own generator",
+    "real": "the labelled real frames that every generator learnt from",
+}
+
+
+class PairedScores:
+    """The scores of single samples, by setting and score, of all trainings."""
+
+    def __init__(self, samples: pa.Table) -> None:
+        """Args: a table of the schema `PAIRED_SAMPLES`."""
+        self._trainings = read_trainings(samples)
+
+    def of(self, setting: str, metric: str) -> Trainings | None:
+        """The trainings of a setting, where they have scores of single samples, all of the same ones."""
+        return self._trainings.get((setting, metric))
+
+    def difference(self, before: str, after: str, metric: str) -> Difference | None:
+        """The second setting minus the first; None where they were not both scored on the same samples."""
+        first, second = self.of(before, metric), self.of(after, metric)
+        if first is None or second is None or not first.scores_the_same_as(second):
+            return None
+        return paired_difference(first, second)
+
+
+def is_about_labels(row: Row) -> bool:
+    """Does the row score synthetic frames against labels, rather than a model on real test data?"""
+    return row["setting"].removeprefix(SHUFFLED).startswith(LABELS_OF)
+
+
+def trained_rows(rows: Iterable[Row]) -> list[Row]:
+    """The rows that score models on held-out real data, all groups."""
+    return [row for row in rows if row["task"] != "distance" and not is_about_labels(row)]
+
+
+def score_tables(rows: list[Row], settings: Sequence[str], paired: PairedScores) -> list[Table]:
+    """The headline tables first, one a task; then labels and distances.
+
+    Args:
+        rows: of the table `scores`, of all trainings.
+        settings: what was trained on, in the order of the tables; others follow as they come.
+        paired: for the differences.
+    """
+    trained = [row for row in trained_rows(rows) if row["group"] == "all"]
+    order = {setting: number for number, setting in enumerate(settings)}
+    trained.sort(key=lambda row: order.get(row["setting"], len(order)))
+    tasks = list(dict.fromkeys(row["task"] for row in trained))
+    found = []
+    for task in tasks:
+        of_task = [row for row in trained if row["task"] == task]
+        found.append(_headline(of_task, "" if len(tasks) == 1 else f"{task}: ", paired))
+        found += _one_against_rest(of_task, list(dict.fromkeys(row["setting"] for row in of_task)))
+    labels = [row for row in rows if row["task"] != "distance" and is_about_labels(row) and row["group"] == "all"]
+    if labels:
+        floor = [{**row, "setting": "held-out real (floor)"} for row in trained if row["setting"] == "real"]
+        caption = (
+            "The model trained on real frames, scored on synthetic frames against the labels they were sampled from, "
+            "beside its score on held-out real frames. Shuffled: the same frames against labels of others, which is "
+            "what frames that show nothing of their labels would score."
+        )
+        found.append(_pivot("Do the synthetic frames show their labels?", floor + labels, "frames", caption))
+    distances = [row for row in rows if row["task"] == "distance"]
+    if distances:
+        caption = (
+            "Distances to the real training frames in the features of a classifier trained on real events (fd: "
+            "Frechet distance, which is not FID). They depend on the number of frames, so read them against the row "
+            "of held-out real frames; alone they do not tell whether labels are right. In brackets 95 %, from halves "
+            "by recording."
+        )
+        found.append(_pivot("How far from real frames?", distances, "frames", caption))
+    return found
+
+
+def group_tables(rows: list[Row], settings: Sequence[str]) -> tuple[list[Table], list[Table]]:
+    """The first score by group: classes by where they were to be learnt from, and class by class."""
+    groups = [row for row in trained_rows(rows) if row["group"] != "all"]
+    if not groups:
+        return [], []
+    metric = groups[0]["metric"]
+    groups = [row for row in groups if row["metric"] == metric]
+    names = list(dict.fromkeys([*settings, *(row["setting"] for row in groups)]))
+    by_origin = [row for row in groups if row["group"].startswith(ORIGINS)]
+    by_class = [row for row in groups if not row["group"].startswith(ORIGINS)]
+    caption = (
+        "Held-out real frames by class. What synthetic frames add is seen in classes that no real training frame shows."
+    )
+    origins = [_by_group(f"{metric}: where does it help?", by_origin, names, caption)] if by_origin else []
+    classes = [_by_group(f"{metric}, class by class", by_class, names)] if by_class else []
+    return origins, classes
+
+
+def baseline_tables(names: Sequence[str], metric: str, paired: PairedScores) -> list[Table]:
+    """What the frames of the first generator are worth beside those of each other; nothing without others."""
+    own, *others = names
+    body: list[list[Cell]] = []
+    bold: set[tuple[int, int]] = set()
+    for other in others:
+        row: list[Cell] = [other]
+        for before, after in ((other, own), (f"real+{other}", f"real+{own}"), ("real", f"real+{other}")):
+            difference = paired.difference(before, after, metric)
+            if difference is not None and difference.is_certain:
+                bold.add((len(body), len(row)))
+            row.append("" if difference is None else difference.text())
+        body.append(row)
+    if not body:
+        return []
+    columns = ["baseline", f"{own} - baseline", f"real+{own} - real+baseline", "real+baseline - real"]
+    caption = (
+        f"Differences in `{metric}` ({_direction(metric)} is better), sample by sample on the same held-out frames; in "
+        "brackets the 95 % interval over test recordings and trainings. Bold: the interval excludes 0. All generators "
+        "were asked for the same labels; those that learn, learnt from the same frames."
+    )
+    return [Table("Beside the baselines", columns, body, caption=caption, bold=bold)]
+
+
+def _direction(metric: str) -> str:
+    return "lower" if lower_is_better(metric) else "higher"
+
+
+def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
+    chance = [row for row in rows if row["metric"].startswith(_CHANCE)]
+    rows = [row for row in rows if not row["metric"].startswith((_CHANCE, _ONE_CLASS)) or _is_mean(row["metric"])]
+    metrics = list(dict.fromkeys(row["metric"] for row in rows))
+    settings = list(dict.fromkeys(row["setting"] for row in rows))
+    body: list[list[Cell]] = []
+    bold: set[tuple[int, int]] = set()
+    for setting in settings:
+        of_setting = [row for row in rows if row["setting"] == setting]
+        differences = [paired.difference("real", setting, metric) for metric in metrics]
+        for column, (metric, difference) in enumerate(zip(metrics, differences, strict=True), 1):
+            if difference is not None and difference.is_certain:
+                better = (difference.value < 0) == lower_is_better(metric)
+                bold |= {(len(body), column)} if better else set()
+        first = differences[0] if setting != "real" else None
+        if first is not None and first.is_certain:
+            bold.add((len(body), len(metrics) + 1))
+        cells: list[Cell] = [cell_text([row for row in of_setting if row["metric"] == metric]) for metric in metrics]
+        counts = [len({_training(row) for row in of_setting}), of_setting[0]["num_train"], of_setting[0]["num_samples"]]
+        body.append([setting, *cells, "" if first is None else first.text(), *counts])
+    columns = ["trained on", *map(_heading, metrics), f"{metrics[0]}: minus real"]
+    columns += ["trainings", "frames trained on", "frames scored"]
+    caption = (
+        "Scores on held-out real test data; equal optimiser steps for every row. Each number is the mean over the "
+        "row's trainings, which differ in their seeds; in brackets the 95 % interval over test recordings and "
+        "trainings. Bold: better than `real`, or a difference from it that is not 0, as the interval of the difference "
+        "says that compares sample by sample."
+    )
+    notes = [f"`{name}`: {text}" for name, text in _SETTINGS.items() if any(name in s.split("+") for s in settings)]
+    explained = {text: name for name in metrics for start, text in _METRICS.items() if name.startswith(start)}
+    notes += [f"`{name}`: {text}" for text, name in explained.items()]
+    if any("@" in setting for setting in settings):
+        notes.append("`synthetic@SHARE`: the first part of the synthetic frames")
+    notes += [f"`{name}`: {value:.3f}" for name, value in {row["metric"]: row["value"] for row in chance}.items()]
+    if min(len({_training(row) for row in rows if row["setting"] == setting}) for setting in settings) < _ENOUGH:
+        notes.append(
+            "Intervals cannot cover the spread between trainings where there is one, and cover it poorly where there "
+            "are two or three."
+        )
+    return Table(f"{prefix}Does synthetic data help?", columns, body, caption=caption, footnotes=notes, bold=bold)
+
+
+def _is_mean(metric: str) -> bool:
+    return metric.endswith("_mean")
+
+
+def _one_against_rest(rows: list[Row], settings: Sequence[str]) -> list[Table]:
+    """Classes down, settings across: the layout of the paper's Table 5."""
+    binary = [row for row in rows if row["metric"].startswith(_ONE_CLASS) and not _is_mean(row["metric"])]
+    rows = [{**row, "group": row["metric"].removeprefix(_ONE_CLASS)} for row in binary]
+    caption = "Accuracy of telling a class from the others with as many negatives as positives; 0.5 is chance."
+    return [_by_group("One class against the others", rows, settings, caption)] if rows else []
+
+
+def _training(row: Row) -> tuple:
+    return row["seed"], row.get("model_digest")
+
+
+def _heading(metric: str) -> str:
+    return f"{metric} {'↓' if lower_is_better(metric) else '↑'}"
+
+
+def _pivot(title: str, rows: list[Row], first: str, caption: str) -> Table:
+    """Settings down, metrics across."""
+    metrics = list(dict.fromkeys(row["metric"] for row in rows))
+    body: list[list[Cell]] = []
+    for setting in dict.fromkeys(row["setting"] for row in rows):
+        of_setting = [row for row in rows if row["setting"] == setting]
+        cells: list[Cell] = [cell_text([row for row in of_setting if row["metric"] == metric]) for metric in metrics]
+        body.append([setting, *cells, of_setting[0]["num_train"], of_setting[0]["num_samples"]])
+    columns = [first, *map(_heading, metrics), "frames trained on", "frames scored"]
+    return Table(title, columns, body, caption=caption)
+
+
+def _by_group(title: str, rows: list[Row], settings: Sequence[str], caption: str = "") -> Table:
+    body: list[list[Cell]] = []
+    for group in dict.fromkeys(row["group"] for row in rows):
+        of_group = [row for row in rows if row["group"] == group]
+        cells: list[Cell] = [cell_text([row for row in of_group if row["setting"] == setting]) for setting in settings]
+        body.append([group, *cells, of_group[0]["num_samples"]])
+    return Table(title, ["classes", *settings, "frames scored"], body, caption=caption)
+
+
+def cell_text(rows: Sequence[Row]) -> str:
+    """Mean over trainings with its 95 % interval; empty without rows.
+
+    The interval joins that over recordings (its ends averaged over trainings, which share the test recordings) and the
+    spread of the mean over trainings, 1.96 standard errors, as independent: half widths add up in squares.
+    """
+    if not rows:
+        return ""
+    value, low, high = interval_over_trainings(rows)
+    return f"{value:.3f}" if math.isnan(low) else f"{value:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def interval_over_trainings(rows: Sequence[Row]) -> tuple[float, float, float]:
+    """Mean of the rows' values and the ends of its interval as `cell_text` shows it; NaN without intervals."""
+    values = np.array([row["value"] for row in rows], np.float64)
+    value = float(values.mean())
+    if any(row["low"] is None or row["high"] is None for row in rows):
+        return value, float("nan"), float("nan")
+    below, above = (float(np.mean([abs(row["value"] - row[end]) for row in rows])) for end in ("low", "high"))
+    spread = 1.96 * float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
+    return value, value - math.hypot(below, spread), value + math.hypot(above, spread)
