@@ -1,20 +1,26 @@
-"""Load pre-trained weights: any local diffusers folder, Stable Diffusion v1.4 or the bundled small prior alike.
+"""Load pre-trained weights: any local diffusers folder or Stable Diffusion v1 file, or the bundled small prior alike.
 
-Nothing is downloaded. Only safetensors are read: a pickled `.bin` or `.ckpt` can run code while it loads.
+Nothing is downloaded, and no pickle is run: `docs/weights.md` says what is read and what is checked.
 """
 
 from __future__ import annotations
 
 import copy
 import json
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder, find_controlnet
+from ctlev_core.diffusion.model_building import build_model
+from ctlev_core.diffusion.prior_checks import complete_schedule
+from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, read_prior_files
+from ctlev_core.diffusion.prior_parts import read_json
 from data_contracts.errors import DataError
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,59 +76,43 @@ def load_prior(
     """Load a prior, or a checkpoint written by a generator, from local files.
 
     Args:
-        path: a diffusers pipeline folder; the bundled small prior when None.
-        controlnet: name of a subfolder of the prior, or a separate ControlNet folder; otherwise the subfolder
-            `controlnet` where there is one.
+        path: a diffusers pipeline folder, or a Stable Diffusion v1 checkpoint in one file with the tokenizer's folder
+            beside it; the bundled small prior when None.
+        controlnet: name of a subfolder of the prior, or a separate ControlNet folder or file; otherwise the prior's
+            own where there is one.
         with_controlnet: False leaves the ControlNet on disk.
         dtype: of all weights in memory.
         device: where the weights go.
     Raises:
         DataError: a folder or file is missing or does not fit; the message names it.
     """
-    from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
-    from diffusers.models.controlnets.controlnet import ControlNetModel
-    from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
-    from transformers import CLIPTextModel, CLIPTokenizer
-
-    from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
-
-    folder = check_prior_folder(BUNDLED_PRIOR if path is None else Path(path), controlnet=controlnet)
-    vae_class = _read_json(folder / "vae" / "config.json").get("_class_name", "AutoencoderKL")
-    known = {"AutoencoderKL": AutoencoderKL, "PatchAutoencoder": PatchAutoencoder}
-    if vae_class not in known:
-        raise DataError(f"{folder / 'vae'}: autoencoder must be one of {', '.join(known)}, got {vae_class!r}")
-
-    def load_model(model_class: Any, place: Path) -> Any:
-        try:
-            model = model_class.from_pretrained(
-                str(place), local_files_only=True, use_safetensors=True, torch_dtype=dtype
-            )
-        except (OSError, ValueError, RuntimeError) as error:
-            raise DataError(f"{place}: cannot be loaded as {model_class.__name__}: {error}") from error
-        return model.to(device).eval().requires_grad_(False)
-
-    control_folder = find_controlnet(folder, controlnet) if with_controlnet else None
-    unet = load_model(UNet2DConditionModel, folder / "unet")
-    vae = load_model(known[vae_class], folder / "vae")
-    if vae.config.latent_channels != unet.config.in_channels:
-        raise DataError(
-            f"{folder}: the U-Net takes {unet.config.in_channels} latent channels, "
-            f"the autoencoder makes {vae.config.latent_channels}"
-        )
-    try:
-        tokenizer = CLIPTokenizer.from_pretrained(str(folder / "tokenizer"), local_files_only=True)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{folder / 'tokenizer'}: cannot be loaded as a CLIP tokenizer: {error}") from error
+    files = read_prior_files(
+        BUNDLED_PRIOR if path is None else Path(path), controlnet=controlnet, with_controlnet=with_controlnet
+    )
+    models = {name: build_model(part, dtype).to(device) for name, part in files.parts.items()}
+    unet, vae = models["unet"], models["vae"]
     side = unet.config.sample_size * 2 ** (len(vae.config.block_out_channels) - 1)
     return Prior(
-        tokenizer=tokenizer,
-        text_encoder=load_model(CLIPTextModel, folder / "text_encoder"),
+        tokenizer=_load_tokenizer(files.tokenizer, models["text_encoder"].config.max_position_embeddings),
+        text_encoder=models["text_encoder"],
         vae=vae,
         unet=unet,
-        controlnet=load_model(ControlNetModel, control_folder) if control_folder else None,
-        scheduler_config=_read_json(folder / "scheduler" / "scheduler_config.json"),
+        controlnet=models.get("controlnet"),
+        scheduler_config=complete_schedule(files),
         image_size=(side, side),
     )
+
+
+def _load_tokenizer(folder: Path, max_length: int) -> Any:
+    from transformers import CLIPTokenizer
+
+    try:
+        tokenizer = CLIPTokenizer.from_pretrained(str(folder), local_files_only=True)
+    except Exception as error:  # the tokenizer's own parser raises bare exceptions
+        raise DataError(f"{folder}: cannot be loaded as a CLIP tokenizer: {error}") from error
+    # A folder of vocab.json and merges.txt alone does not say how long prompts may be.
+    tokenizer.model_max_length = min(tokenizer.model_max_length, max_length)
+    return tokenizer
 
 
 def save_prior(prior: Prior, folder: Path, dtype: torch.dtype | None = None) -> None:
@@ -162,7 +152,7 @@ def save_prior(prior: Prior, folder: Path, dtype: torch.dtype | None = None) -> 
     (folder / "model_index.json").write_text(json.dumps(index, indent=2) + "\n")
     for config_file in folder.glob("*/config.json"):
         # Where the weights were loaded from is nobody's business, and would give equal checkpoints unequal digests.
-        config = _read_json(config_file)
+        config = read_json(config_file)
         config.pop("_name_or_path", None)
         config_file.write_text(json.dumps(config, indent=2) + "\n")
 
@@ -174,24 +164,47 @@ def _library(model: Any) -> str:
     return top if top in ("diffusers", "transformers") else module
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {error}") from error
-
-
 def encode_prompts(prior: Prior, prompts: list[str]) -> torch.Tensor:
-    """Prompt embeddings [N, L, D]; L is the length every prompt is padded or cut to."""
+    """Prompt embeddings [N, L, D]; L is the length every prompt is padded or cut to. A cut prompt is logged."""
+    limit = prior.tokenizer.model_max_length
     tokens = prior.tokenizer(
-        prompts,
-        padding="max_length",
-        max_length=prior.tokenizer.model_max_length,
-        truncation=True,
-        return_tensors="pt",
+        prompts, padding="max_length", max_length=limit, truncation=True, return_tensors="pt", verbose=False
     )
+    for row in tokens.attention_mask.all(dim=1).nonzero().flatten().tolist():  # no padding: perhaps it did not fit
+        length = len(prior.tokenizer(prompts[row], verbose=False).input_ids)
+        if length > limit:
+            logger.warning("prompt of %d tokens is cut to %d, its end is not heeded: %r", length, limit, prompts[row])
     with torch.no_grad():
         return prior.text_encoder(tokens.input_ids.to(prior.text_encoder.device))[0]
+
+
+@torch.no_grad()
+def decode_latents(prior: Prior, latents: torch.Tensor) -> torch.Tensor:
+    """Images [B, 3, H, W] float32 of scaled latents [B, C, h, w], not clipped.
+
+    Autoencoders of Stable Diffusion can overflow in half precision. Images that are not finite are decoded again in
+    single precision, each by itself, so that no image depends on the others of its batch; this is logged.
+
+    Raises:
+        DataError: they are not finite in single precision either.
+    """
+    vae = prior.vae
+    latents, dtype = latents.float() / prior.scaling_factor, vae.dtype
+    images = vae.decode(latents.to(dtype)).sample.float()
+    broken = [row for row, image in enumerate(images) if not bool(torch.isfinite(image).all())]
+    if broken and dtype != torch.float32:
+        logger.warning(
+            "%d of %d images were not finite in %s; the autoencoder decodes them again in float32",
+            len(broken), len(images), str(dtype).removeprefix("torch."),
+        )  # fmt: skip
+        vae.float()
+        for row in broken:
+            images[row] = vae.decode(latents[row : row + 1]).sample[0]
+        vae.to(dtype)  # float32 holds every half: the weights are again what they were
+    if broken and not bool(torch.isfinite(images).all()):
+        where = "the latents" if not bool(torch.isfinite(latents).all()) else "the decoded images"
+        raise DataError(f"{where} of {len(broken)} of {len(images)} samples hold values that are not finite")
+    return images
 
 
 def images_to_tensor(images: Any) -> torch.Tensor:

@@ -1,45 +1,89 @@
-"""Where the pre-trained weights lie, and whether they are all there. Imports nothing heavy: the plan calls it."""
+"""Where the pre-trained weights lie, and whether they are there and fit. Imports nothing heavy: the plan calls it."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
+from ctlev_core.diffusion.prior_checks import check_parts
+from ctlev_core.diffusion.prior_parts import PriorFiles, PriorPart, read_json, read_part
+from ctlev_core.diffusion.single_file import (
+    ENDINGS,
+    files_beside,
+    is_single_file,
+    read_single_controlnet,
+    read_single_prior,
+)
+from ctlev_core.safe_files.tensor_files import check_finite
 from data_contracts.errors import DataError
 
 BUNDLED_PRIOR = Path(__file__).resolve().parents[1] / "priors" / "small"
 COMPONENTS = ("tokenizer", "text_encoder", "vae", "unet", "scheduler")
 
 
-def check_prior_folder(folder: Path, *, controlnet: Path | None = None, needs_controlnet: bool = False) -> Path:
-    """Raise unless `folder` looks like a diffusers pipeline whose weights can be read.
+def read_prior_files(path: Path, *, controlnet: Path | None = None, with_controlnet: bool = True) -> PriorFiles:
+    """Configs and tensor tables of a prior, checked: all there, of one architecture, without NaN.
 
     Args:
-        folder: with the subfolders of `COMPONENTS`, and perhaps `controlnet`.
+        path: a diffusers folder with the subfolders of `COMPONENTS` and perhaps `controlnet`, or a Stable Diffusion v1
+            checkpoint in one file, with the tokenizer's folder beside it.
         controlnet: as for `find_controlnet`.
-        needs_controlnet: raise where there is neither the subfolder nor the separate folder.
-    Returns:
-        The folder.
+        with_controlnet: False leaves the ControlNet out.
     Raises:
-        DataError: what is missing, and where it was looked for.
+        DataError: what is missing or does not fit, what was expected, and where.
     """
-    if not folder.is_dir():
-        raise DataError(f"{folder}: the prior must be a diffusers folder, but there is no such folder")
-    missing = [name for name in COMPONENTS if not (folder / name).is_dir()]
-    if missing:
-        found = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    if not path.exists():
         raise DataError(
-            f"{folder}: a diffusers folder has the subfolders {', '.join(COMPONENTS)}; "
-            f"missing: {', '.join(missing)}; found: {', '.join(found) or 'none'}"
+            f"{path}: the prior must be a diffusers folder, or a checkpoint in one file ({', '.join(ENDINGS)}), "
+            "but there is no such folder or file"
         )
-    control = find_controlnet(folder, controlnet)
-    if needs_controlnet and control is None:
-        raise DataError(f"{folder}: no subfolder 'controlnet', and no separate ControlNet folder was given")
-    for part in [folder / name for name in ("text_encoder", "vae", "unet")] + ([control] if control else []):
-        if not (part / "config.json").is_file():
-            raise DataError(f"{part}: config.json is missing")
-        if not list(part.glob("*.safetensors")):
-            raise DataError(f"{part}: no .safetensors file; pickled weights (.bin, .ckpt) are not read")
+    files = read_single_prior(path) if is_single_file(path) else _read_folder(path)
+    parts = dict(files.parts)
+    control = find_controlnet(path, controlnet) if with_controlnet else None
+    if control is not None:
+        parts["controlnet"] = read_controlnet(control)
+    elif not with_controlnet:
+        parts.pop("controlnet", None)
+    files = dataclasses.replace(files, parts=parts)
+    check_parts(files)
+    for part in files.parts.values():
+        check_finite(part.tensors.items())
+    return files
+
+
+def check_prior_folder(folder: Path, *, controlnet: Path | None = None, needs_controlnet: bool = False) -> Path:
+    """Raise unless there is a prior whose weights can be read; see `read_prior_files`.
+
+    Args:
+        folder: or a single file.
+        controlnet: as for `find_controlnet`.
+        needs_controlnet: raise where the prior has none and none is given.
+    Returns:
+        The folder or file.
+    Raises:
+        DataError: what is missing or does not fit, and where it was looked for.
+    """
+    files = read_prior_files(folder, controlnet=controlnet)
+    if needs_controlnet and "controlnet" not in files.parts:
+        raise DataError(f"{folder}: no subfolder 'controlnet', and no separate ControlNet folder or file was given")
     return folder
+
+
+def prior_places(prior: Path | None, *, controlnet: Path | None = None, needs_controlnet: bool = False) -> list[Path]:
+    """The folders and files that a prior consists of, after `check_prior_folder`: what a cache key must contain.
+
+    Args:
+        prior: None for the bundled one.
+        controlnet: as for `find_controlnet`; None also stands for the prior's own.
+        needs_controlnet: as for `check_prior_folder`.
+    """
+    path = check_prior_folder(prior or BUNDLED_PRIOR, controlnet=controlnet, needs_controlnet=needs_controlnet)
+    chosen = [path] if controlnet is None else [path, find_controlnet(path, controlnet)]
+    places = []
+    for place in chosen:
+        if place is not None:
+            places += [place, *files_beside(place)] if place.is_file() else [place]
+    return list(dict.fromkeys(places))
 
 
 def find_controlnet(folder: Path, controlnet: Path | None) -> Path | None:
@@ -47,19 +91,40 @@ def find_controlnet(folder: Path, controlnet: Path | None) -> Path | None:
 
     Args:
         folder: the prior.
-        controlnet: name of a subfolder of the prior, such as `controlnet_normals`, or a folder elsewhere.
+        controlnet: name of a subfolder of the prior, such as `controlnet_normals`, or a diffusers folder or single file
+            elsewhere.
     Raises:
-        DataError: there is no such folder.
+        DataError: there is no such folder or file.
     """
-    if controlnet is not None and len(controlnet.parts) == 1 and (folder / controlnet).is_dir():
+    if controlnet is None:
+        inside = folder / "controlnet"
+        return inside if inside.is_dir() else None
+    if len(controlnet.parts) == 1 and (folder / controlnet).is_dir():
         return folder / controlnet
-    if controlnet is not None:
-        if not controlnet.is_dir():
-            inside = ", ".join(sorted(path.name for path in folder.glob("controlnet*")))
-            raise DataError(
-                f"{controlnet}: the ControlNet must be a diffusers folder, but there is no such folder; "
-                f"those of the prior: {inside or 'none'}"
-            )
+    if controlnet.exists():
         return controlnet
-    inside = folder / "controlnet"
-    return inside if inside.is_dir() else None
+    inside = ", ".join(sorted(path.name for path in folder.glob("controlnet*"))) if folder.is_dir() else ""
+    raise DataError(
+        f"{controlnet}: the ControlNet must be a diffusers folder or a single file, but there is no such folder or "
+        f"file; those of the prior: {inside or 'none'}"
+    )
+
+
+def read_controlnet(path: Path) -> PriorPart:
+    """Config and tensor table of a ControlNet's folder or file."""
+    return read_single_controlnet(path) if path.is_file() else read_part("controlnet", path)
+
+
+def _read_folder(folder: Path) -> PriorFiles:
+    missing = [name for name in COMPONENTS if not (folder / name).is_dir()]
+    if missing:
+        found = sorted(path.name for path in folder.iterdir() if path.is_dir())
+        raise DataError(
+            f"{folder}: a diffusers folder has the subfolders {', '.join(COMPONENTS)}; "
+            f"missing: {', '.join(missing)}; found: {', '.join(found) or 'none'}"
+        )
+    if (folder / "text_encoder_2").is_dir():
+        raise DataError(f"{folder}: expected Stable Diffusion v1, got Stable Diffusion XL (it has text_encoder_2)")
+    parts = {name: read_part(name, folder / name) for name in ("text_encoder", "vae", "unet")}
+    schedule = read_json(folder / "scheduler" / "scheduler_config.json")
+    return PriorFiles(folder, parts, folder / "tokenizer", schedule)

@@ -6,10 +6,10 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.pipelines.controlnet.pipeline_controlnet import StableDiffusionControlNetPipeline
 from diffusers.pipelines.stable_diffusion.pipeline_stable_diffusion import StableDiffusionPipeline
 from tiny_prior import SIDE, make_prior, shared_prior
+from tiny_stable_diffusion import make_models, tiny_changes, write_folder
 
 from ctlev_core.diffusion.prior import encode_prompts, load_prior, save_prior
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder
@@ -68,28 +68,17 @@ def test_text_checkpoint_is_a_stable_diffusion_folder(folder, tmp_path):
     assert pipeline.unet.config.in_channels == 48
 
 
-def test_stable_diffusion_layout_loads(folder, tmp_path):
+def test_stable_diffusion_layout_loads(tmp_path):
     """AutoencoderKL with its own factor and scale, weights without ControlNet, ControlNet in a folder of its own."""
-    path = shutil.copytree(folder, tmp_path / "sd")
-    shutil.move(path / "controlnet", tmp_path / "control")
-    shutil.rmtree(path / "vae")
-    vae = AutoencoderKL(
-        block_out_channels=(8, 8, 8, 8),
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        latent_channels=48,
-        norm_num_groups=4,
-        scaling_factor=0.18215,
-    )
-    vae.save_pretrained(path / "vae")
-    config = json.loads((tmp_path / "control" / "config.json").read_text())
+    path = write_folder(make_models(tiny_changes()), tmp_path / "sd")
+    config = json.loads((tmp_path / "sd-controlnet" / "config.json").read_text())
     config["controlnet_conditioning_channel_order"] = "bgr"
-    (tmp_path / "control" / "config.json").write_text(json.dumps(config))
+    (tmp_path / "sd-controlnet" / "config.json").write_text(json.dumps(config))
     plain = load_prior(path)
     assert plain.controlnet is None and not plain.reversed_condition
-    prior = load_prior(path, controlnet=tmp_path / "control")
-    assert prior.scaling_factor == 0.18215 and prior.reversed_condition
-    assert prior.image_size == (8 * SIDE // 4, 8 * SIDE // 4)
+    prior = load_prior(path, controlnet=tmp_path / "sd-controlnet")
+    assert prior.scaling_factor == 0.25 and prior.reversed_condition
+    assert prior.image_size == (32, 32)
 
 
 def test_missing_parts_are_named(broken, tmp_path):
@@ -99,24 +88,6 @@ def test_missing_parts_are_named(broken, tmp_path):
         load_prior(broken, controlnet=tmp_path / "nowhere")
     shutil.rmtree(broken / "tokenizer")
     with pytest.raises(DataError, match="missing: tokenizer; found: controlnet, scheduler"):
-        load_prior(broken)
-
-
-def test_pickled_weights_are_not_read(broken):
-    next((broken / "unet").glob("*.safetensors")).rename(broken / "unet" / "diffusion_pytorch_model.bin")
-    with pytest.raises(DataError, match=r"unet: no \.safetensors file"):
-        load_prior(broken)
-
-
-def test_truncated_weights_and_foreign_autoencoders_are_refused(broken):
-    config = broken / "vae" / "config.json"
-    config.write_text(config.read_text().replace("PatchAutoencoder", "AsymmetricAutoencoderKL"))
-    with pytest.raises(DataError, match="must be one of AutoencoderKL, PatchAutoencoder, got 'Asymmetric"):
-        load_prior(broken)
-    config.write_text(config.read_text().replace("AsymmetricAutoencoderKL", "PatchAutoencoder"))
-    weights = next((broken / "unet").glob("*.safetensors"))
-    weights.write_bytes(weights.read_bytes()[:1000])
-    with pytest.raises(DataError, match="unet: cannot be loaded as UNet2DConditionModel"):
         load_prior(broken)
 
 

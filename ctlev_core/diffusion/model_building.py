@@ -1,0 +1,91 @@
+"""Networks from their configs and stored tensors: strict, of any precision, and never through a pickle or the network.
+
+The libraries' own `from_pretrained` gives weights that a file lacks at random and leaves unknown ones unused, with a
+warning; here both are errors. Nothing is looked up outside the files given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ctlev_core.diffusion.prior_parts import PriorPart
+from ctlev_core.safe_files.tensor_files import StoredTensor, read_items
+from data_contracts.errors import DataError
+
+_UNUSED = (".position_ids", "position_ids")
+
+
+def build_model(part: PriorPart, dtype: torch.dtype) -> Any:
+    """The network of a part, in evaluation mode, on the CPU.
+
+    Args:
+        part: config and stored tensors.
+        dtype: of all floating-point weights in memory.
+    Raises:
+        DataError: the config does not make a network, or the weights are not exactly its own.
+    """
+    from accelerate import init_empty_weights
+
+    try:
+        with init_empty_weights():  # no memory and no time for random weights that are replaced at once
+            model = _make_model(part)
+    except Exception as error:  # a wrong config can raise nearly any error
+        raise DataError(f"{part.place}: its config does not make a {part.name}: {error}") from error
+    expected = model.state_dict()
+    stored = _match_names(part, expected)
+    for name, tensor in stored.items():
+        if tensor.shape != tuple(expected[name].shape):
+            raise DataError(
+                f"{part.place}: {part.name} by its config has {name} of shape {list(expected[name].shape)}, "
+                f"the weights file {list(tensor.shape)}"
+            )
+    model.load_state_dict({name: load_tensor(tensor, dtype) for name, tensor in stored.items()}, assign=True)
+    return model.eval().requires_grad_(False)
+
+
+def _make_model(part: PriorPart) -> Any:
+    from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+    from diffusers.models.controlnets.controlnet import ControlNetModel
+    from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
+
+    from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
+
+    if part.name == "text_encoder":
+        from transformers import CLIPTextConfig, CLIPTextModel
+
+        return CLIPTextModel(CLIPTextConfig.from_dict(part.config))
+    classes: dict[str, Any] = {
+        "unet": UNet2DConditionModel,
+        "controlnet": ControlNetModel,
+        "vae": PatchAutoencoder if part.config.get("_class_name") == "PatchAutoencoder" else AutoencoderKL,
+    }
+    return classes[part.name].from_config(part.config)
+
+
+def _match_names(part: PriorPart, expected: Mapping[str, Tensor]) -> dict[str, StoredTensor]:
+    """The stored tensors by the names of this version of the libraries; the same set as the network's."""
+    stored = {name: tensor for name, tensor in part.tensors.items() if not name.endswith(_UNUSED)}
+    if part.name == "text_encoder":  # transformers gave up the prefix in 5.6
+        prefix = "text_model." if any(name.startswith("text_model.") for name in expected) else ""
+        stored = {prefix + name.removeprefix("text_model."): tensor for name, tensor in stored.items()}
+    missing, unknown = sorted(expected.keys() - stored.keys()), sorted(stored.keys() - expected.keys())
+    for problem, names in (("missing", missing), ("unknown", unknown)):
+        if names:
+            raise DataError(
+                f"{part.place}: of the {len(expected)} weights of this {part.name}, {len(missing)} are missing and "
+                f"{len(unknown)} others are there; {problem}: {', '.join(names[:3])}{' ...' if len(names) > 3 else ''}"
+            )
+    return stored
+
+
+def load_tensor(stored: StoredTensor, dtype: torch.dtype) -> Tensor:
+    """A copy of a stored tensor in memory; integers keep their type, floats become `dtype`."""
+    items = torch.from_numpy(read_items(stored).copy())
+    if stored.dtype in ("F16", "BF16"):
+        items = items.view(torch.int16).view(torch.float16 if stored.dtype == "F16" else torch.bfloat16)
+    tensor = items.as_strided(stored.shape, stored.strides)
+    return tensor.to(dtype if tensor.is_floating_point() else tensor.dtype).contiguous()

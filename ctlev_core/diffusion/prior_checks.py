@@ -1,0 +1,182 @@
+"""Do the parts of a prior make one latent-diffusion model? Told by configs and shapes, before a weight is loaded."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from ctlev_core.diffusion.prior_parts import PriorFiles, PriorPart, read_json
+from data_contracts.errors import DataError
+
+CLASSES = {
+    "unet": ("UNet2DConditionModel",),
+    "controlnet": ("ControlNetModel",),
+    "vae": ("AutoencoderKL", "PatchAutoencoder"),
+    "text_encoder": ("CLIPTextModel",),
+}
+PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
+_EXTRA_CHANNELS = {
+    9: "a U-Net for inpainting: latents, masked image and mask",
+    8: "a U-Net that edits images: latents and those of another image",
+    7: "a U-Net that enlarges images",
+    5: "a U-Net with depth maps",
+}
+_TEXT_WIDTHS = {768: "Stable Diffusion v1", 1024: "Stable Diffusion 2", 1280: "SDXL's refiner", 2048: "SDXL"}
+_COPIED = ("conv_in.", "time_embedding.", "down_blocks.", "mid_block.")
+
+logger = logging.getLogger(__name__)
+
+
+def check_parts(files: PriorFiles) -> None:
+    """Raise unless U-Net, autoencoder, text encoder, tokenizer, schedule and ControlNet fit one another.
+
+    Raises:
+        DataError: what does not fit, expected and got.
+    """
+    for part in files.parts.values():
+        _check_class(part)
+    unet, vae, text = (files.parts[name] for name in ("unet", "vae", "text_encoder"))
+    _check_latents(unet, vae)
+    _check_prompts(unet, text)
+    _check_tokenizer(files, text)
+    check_schedule(files)
+    if "controlnet" in files.parts:
+        _check_controlnet(files.parts["controlnet"], unet, vae)
+
+
+def _check_class(part: PriorPart) -> None:
+    known = CLASSES[part.name]
+    named = part.config.get("_class_name") or (part.config.get("architectures") or [None])[0]
+    if named is not None and named not in known:
+        what = "autoencoder" if part.name == "vae" else part.name
+        raise DataError(f"{part.place}: {what} must be one of {', '.join(known)}, got {named!r}")
+    if part.config.get("addition_embed_type") == "text_time":
+        raise DataError(f"{part.place}: expected Stable Diffusion v1, got the {part.name} of Stable Diffusion XL")
+
+
+def _shape(part: PriorPart, name: str) -> tuple[int, ...]:
+    """Of the weight of that name, with or without the prefix that transformers gave up."""
+    for candidate in (name, f"text_model.{name}"):
+        if candidate in part.tensors:
+            return part.tensors[candidate].shape
+    raise DataError(f"{part.place}: {part.name} has no weight {name!r}; it holds {len(part.tensors)} others")
+
+
+def _entry(part: PriorPart, name: str) -> Any:
+    if name not in part.config:
+        raise DataError(f"{part.place}: the config of {part.name} has no entry {name!r}")
+    return part.config[name]
+
+
+def _channels(part: PriorPart, name: str, entry: str, axis: int) -> int:
+    """A width as its weights have it; the config must agree."""
+    shape, told = _shape(part, name), _entry(part, entry)
+    told = told[0] if isinstance(told, list) else told
+    if len(shape) <= axis or shape[axis] != told:
+        raise DataError(f"{part.place}: config.json says {entry} {told}, weight {name} has shape {list(shape)}")
+    return shape[axis]
+
+
+def _check_latents(unet: PriorPart, vae: PriorPart) -> None:
+    makes, takes = int(_entry(vae, "latent_channels")), _shape(unet, "conv_in.weight")[1]
+    if takes != makes:
+        what = f" ({_EXTRA_CHANNELS[takes]})" if makes == 4 and takes in _EXTRA_CHANNELS else ""
+        raise DataError(
+            f"{unet.place}: the U-Net takes {takes} latent channels{what}, the autoencoder of {vae.place} makes {makes}"
+        )
+    _channels(unet, "conv_in.weight", "in_channels", 1)
+    _channels(unet, "conv_in.weight", "block_out_channels", 0)
+    side = unet.config.get("sample_size")
+    if not isinstance(side, int) or side <= 0:
+        raise DataError(f"{unet.place}: sample_size in its config must be the side of square latents, got {side!r}")
+
+
+def _check_prompts(unet: PriorPart, text: PriorPart) -> None:
+    makes = _channels(text, "embeddings.token_embedding.weight", "hidden_size", 1)
+    for part_name, tensor in unet.tensors.items():
+        if part_name.endswith(".attn2.to_k.weight") and tensor.shape[-1] != makes:
+            takes = tensor.shape[-1]
+            raise DataError(
+                f"{unet.place}: the U-Net takes prompt embeddings {takes} wide"
+                f"{_known_width(takes)}, the text encoder of {text.place} makes {makes}{_known_width(makes)}"
+            )
+
+
+def _known_width(width: int) -> str:
+    return f" ({_TEXT_WIDTHS[width]})" if width in _TEXT_WIDTHS else ""
+
+
+def _check_tokenizer(files: PriorFiles, text: PriorPart) -> None:
+    folder = files.tokenizer
+    whole, vocabulary = folder / "tokenizer.json", folder / "vocab.json"
+    if vocabulary.is_file() and (folder / "merges.txt").is_file():
+        ids = read_json(vocabulary).values()
+    elif whole.is_file():
+        content = read_json(whole)
+        model, added = content.get("model"), content.get("added_tokens")
+        vocabulary_of_model = model.get("vocab") if isinstance(model, dict) else None
+        ids = list(vocabulary_of_model.values()) if isinstance(vocabulary_of_model, dict) else []
+        ids += [token.get("id") for token in added if isinstance(token, dict)] if isinstance(added, list) else []
+    else:
+        raise DataError(f"{folder}: no tokenizer; expected vocab.json and merges.txt, or tokenizer.json")
+    highest = max((number for number in ids if isinstance(number, int)), default=-1)
+    rows = _shape(text, "embeddings.token_embedding.weight")[0]
+    if not 0 <= highest < rows:
+        raise DataError(f"{folder}: token ids reach {highest}, the text encoder of {text.place} has {rows} embeddings")
+
+
+def check_schedule(files: PriorFiles) -> None:
+    """Raise unless the scheduler config says how much noise there is at each step and what the U-Net predicts."""
+    config = files.scheduler_config
+    missing = [name for name in ("beta_start", "beta_end", "beta_schedule") if config.get(name) is None]
+    if missing and not config.get("trained_betas"):
+        raise DataError(
+            f"{files.place}: its scheduler config ({config.get('_class_name')}) lacks {', '.join(missing)}; "
+            "expected the noise schedule of a DDPM"
+        )
+    prediction = config.get("prediction_type", "epsilon")
+    if prediction not in PREDICTION_TYPES:
+        raise DataError(
+            f"{files.place}: prediction_type must be one of {', '.join(PREDICTION_TYPES)}, got {prediction!r}"
+        )
+
+
+def complete_schedule(files: PriorFiles) -> dict[str, Any]:
+    """The scheduler config with what old ones leave unsaid, in place of the defaults of diffusers' classes.
+
+    Early Stable Diffusion configs do not say what the network predicts: the noise. Several classes clip the images they
+    predict to [-1, 1] unless told not to, which is wrong for latents.
+    """
+    config = {"prediction_type": "epsilon", **files.scheduler_config, "clip_sample": False, "thresholding": False}
+    if files.scheduler_config.get("clip_sample"):
+        logger.warning("%s: clip_sample of its scheduler config is ignored: latents go beyond [-1, 1]", files.place)
+    return config
+
+
+def _check_controlnet(controlnet: PriorPart, unet: PriorPart, vae: PriorPart) -> None:
+    """A ControlNet is a copy of the U-Net's encoder: every weight they share has one shape."""
+    copied = {name for name in unet.tensors if name.startswith(_COPIED)}
+    theirs = {name for name in controlnet.tensors if name.startswith(_COPIED)}
+    for name in sorted(copied & theirs):
+        ours, other = unet.tensors[name].shape, controlnet.tensors[name].shape
+        if ours != other:
+            raise DataError(
+                f"{controlnet.place}: this ControlNet is made for another U-Net: {name} is {list(other)}, "
+                f"in the U-Net of {unet.place} {list(ours)}"
+            )
+    if copied != theirs:
+        different = sorted(copied ^ theirs)
+        raise DataError(
+            f"{controlnet.place}: this ControlNet is made for another U-Net, or a part of it is missing: "
+            f"{len(different)} weights are only in one of them, such as {different[0]}"
+        )
+    stages = len(_entry(controlnet, "conditioning_embedding_out_channels"))
+    levels = len(_entry(vae, "block_out_channels"))
+    if stages != levels:
+        raise DataError(
+            f"{controlnet.place}: the ControlNet reduces condition images {2 ** (stages - 1)} times, "
+            f"the autoencoder of {vae.place} reduces images {2 ** (levels - 1)} times"
+        )
+    order = controlnet.config.get("controlnet_conditioning_channel_order", "rgb")
+    if order not in ("rgb", "bgr"):
+        raise DataError(f"{controlnet.place}: channel order must be 'rgb' or 'bgr', got {order!r}")
