@@ -257,12 +257,43 @@ class Downstream(Protocol):
     VERSION: int
     Options: type[Frozen]
 
-    def train(self, frames: np.ndarray, labels: Labels, options: Any, *, seed: int, out: Path, work: Path) -> History:
-        """Write a model folder to `out`; keep resumable state in `work`."""
+    def train(
+        self,
+        frames: np.ndarray,
+        labels: Labels,
+        options: Any,
+        *,
+        seed: int,
+        out: Path,
+        work: Path,
+        parts: Sequence[int] = (),
+        groups: Sequence[str] = (),
+    ) -> History:
+        """Write a model folder to `out`; keep resumable state in `work`.
+
+        `parts` are the rows of each training set, in order (empty: there is one set), and `groups` the subject or
+        recording of each row (empty: each row is its own): what mixing and validation go by.
+        """
         ...
 
     def predict(self, model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
         """Named predictions, one row a frame."""
+        ...
+
+
+class DownstreamWithFiles(Downstream, Protocol):
+    """A model that starts from weights of its own from outside the store."""
+
+    def input_files(self, options: Any) -> list[Path]:
+        """The files it reads, checked to be there; their content enters the cache key."""
+        ...
+
+
+class FeatureExtractor(Downstream, Protocol):
+    """A model in whose features images are compared."""
+
+    def features(self, model: Path, frames: np.ndarray) -> np.ndarray:
+        """Features [N, D] float32 of frames [N, H, W, 3] uint8."""
         ...
 
 

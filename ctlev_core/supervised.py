@@ -1,37 +1,24 @@
-"""The training loop that all downstream models share: a fixed number of optimiser steps, resumable bit for bit.
-
-Models are compared at equal numbers of steps, whatever the size of their training set, so the budget is counted in
-steps and not in epochs. Everything a step does is a function of (seed, step, data) alone.
-"""
+"""What downstream models share beside their training loop: devices, checks, seeded weights and model folders."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
-import os
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
-from tqdm import tqdm
 
 from ctlev_core.supervised_options import SupervisedOptions
-from data_contracts.errors import DataError, TrainingError
-from data_contracts.labels import History
+from ctlev_core.training_rows import batch_rows as batch_rows
+from data_contracts.errors import DataError
+from data_contracts.manifest import file_digest
 
-CHECKPOINT_NAME = "training.pt"
 MODEL_NAME = "model.safetensors"
 CONFIG_NAME = "config.json"
-# Random streams of one seed; a stream never depends on how often another was used.
-_STREAM_ORDER, _STREAM_STEP = 0, 1
-
-LossFunction = Callable[[np.ndarray, np.random.Generator], torch.Tensor]
-"""Rows [B] of the training set and the random stream of this step -> scalar loss with a graph."""
 
 
 def resolve_device(name: str) -> torch.device:
@@ -59,24 +46,14 @@ def digest(*parts: Any) -> str:
     return total.hexdigest()
 
 
-def batch_rows(count: int, batch_size: int, seed: int, step: int) -> np.ndarray:
-    """Rows [batch_size] of step `step`: consecutive pieces of an endless row of permutations of the training set."""
-    first = step * batch_size
-    rows = np.empty(batch_size, dtype=np.int64)
-    filled = 0
-    while filled < batch_size:
-        epoch, offset = divmod(first + filled, count)
-        order = np.random.default_rng([seed, _STREAM_ORDER, epoch]).permutation(count)
-        piece = order[offset : offset + batch_size - filled]
-        rows[filled : filled + len(piece)] = piece
-        filled += len(piece)
-    return rows
+def file_digests(files: Sequence[Path]) -> dict[str, str]:
+    """SHA-256 of files, by their names."""
+    return {path.name: file_digest(path) for path in files}
 
 
-def learning_rate_at(step: int, options: SupervisedOptions) -> float:
-    """Linear warm-up times linear decay; positive at every step."""
-    warmup = min(1.0, (step + 1) / options.warmup_steps) if options.warmup_steps else 1.0
-    return options.learning_rate * warmup * (1 - step / options.num_steps)
+def mixed_precision(options: SupervisedOptions, device: torch.device) -> torch.autocast:
+    """The context of a network's forward pass in training; losses belong outside it, in float32."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=options.precision == "bfloat16")
 
 
 def build_seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:
@@ -84,106 +61,6 @@ def build_seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return build()
-
-
-def train_model(
-    model: nn.Module,
-    compute_loss: LossFunction,
-    count: int,
-    options: SupervisedOptions,
-    *,
-    seed: int,
-    work: Path,
-    run_digest: str,
-    description: str,
-) -> History:
-    """Train `model` in place, from the checkpoint in `work` where it belongs to this run.
-
-    Args:
-        model: on its device, freshly initialised.
-        compute_loss: the loss of given rows; it must draw random numbers from the generator it is given only.
-        count: rows of the training set, at least 1.
-        options: budget and step sizes.
-        seed: of the order of the rows and of the augmentation.
-        work: folder of the resumable state. A checkpoint with another `run_digest` is ignored and overwritten.
-        run_digest: identity of data, options and seed.
-        description: of the progress bar.
-    Returns:
-        One row each `log_every` steps, and one for the last step.
-    Raises:
-        TrainingError: the loss is not finite; the message names the step.
-    """
-    work.mkdir(parents=True, exist_ok=True)
-    optimizer = torch.optim.AdamW(model.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay)
-    history, pending, first_step = _resume(work / CHECKPOINT_NAME, model, optimizer, run_digest)
-    model.train()
-    progress = tqdm(
-        total=options.num_steps, initial=first_step, desc=description, unit="step", leave=False, disable=None
-    )
-    with progress:
-        for step in range(first_step, options.num_steps):
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate_at(step, options)
-            rows = batch_rows(count, options.batch_size, seed, step)
-            loss = compute_loss(rows, np.random.default_rng([seed, _STREAM_STEP, step]))
-            value = loss.item()
-            if not math.isfinite(value):
-                raise TrainingError(
-                    f"{description}: the loss is {value} at step {step} of {options.num_steps}; "
-                    f"lower learning_rate (now {options.learning_rate:g})"
-                )
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
-            pending.append(value)
-            done = step + 1
-            if done % options.log_every == 0 or done == options.num_steps:
-                history.step.append(done)
-                history.loss.append(sum(pending) / len(pending))
-                pending.clear()
-                progress.set_postfix(loss=f"{history.loss[-1]:.4g}", refresh=False)
-            if done % options.checkpoint_every == 0 and done < options.num_steps:
-                _write_checkpoint(work / CHECKPOINT_NAME, model, optimizer, history, pending, done, run_digest)
-            progress.update()
-    return history
-
-
-def _write_checkpoint(
-    path: Path,
-    model: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    history: History,
-    pending: list[float],
-    step: int,
-    run_digest: str,
-) -> None:
-    state = {
-        "run_digest": run_digest,
-        "step": step,
-        "model": model.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "history": asdict(history),
-        "pending": list(pending),
-    }
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def _resume(
-    path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, run_digest: str
-) -> tuple[History, list[float], int]:
-    if not path.exists():
-        return History(), [], 0
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    if state["run_digest"] != run_digest:
-        return History(), [], 0
-    model.load_state_dict(state["model"])
-    optimizer.load_state_dict(state["optimizer"])
-    return History(**state["history"]), state["pending"], state["step"]
 
 
 def write_model(folder: Path, model: nn.Module, config: dict[str, Any]) -> None:

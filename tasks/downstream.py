@@ -8,11 +8,12 @@ import pyarrow as pa
 from ctlev_core import plugins
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
+from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest, concat_labels, history_table
-from tasks.stage import Output, stage
+from tasks.stage import Output, input_files_of, stage
 
 
-@stage(version=1, schema=tables.TRAINING)
+@stage(version=1, schema=tables.TRAINING, raw_files=input_files_of("downstream"))
 def train_downstream(
     out: Output, training_sets: list[Manifest], *, downstream: DownstreamChoice, seed: int
 ) -> pa.Table:
@@ -22,8 +23,32 @@ def train_downstream(
     """
     plugin = plugins.load_options(downstream)
     rows = [manifest.rows_where(split="train") for manifest in training_sets]
+    if not any(len(chosen) for chosen in rows):
+        folders = ", ".join(str(manifest.ref.path) for manifest in training_sets)
+        raise DataError(f"{folders}: no rows in split 'train' to learn from")
     frames = np.concatenate([m.array("frames")[r] for m, r in zip(training_sets, rows, strict=True)])
     # Bodies of another dataset may carry more labels than the frames do.
     labels = concat_labels([m.labels.take(r) for m, r in zip(training_sets, rows, strict=True)], common=True)
-    history = plugin.module.train(frames, labels, plugin.options, seed=seed, out=out.folder / "model", work=out.work)
+    history = plugin.module.train(
+        frames,
+        labels,
+        plugin.options,
+        seed=seed,
+        out=out.folder / "model",
+        work=out.work,
+        parts=[len(chosen) for chosen in rows],
+        groups=_groups(training_sets, rows),
+    )
     return history_table(history)
+
+
+def _groups(training_sets: list[Manifest], rows: list[np.ndarray]) -> list[str]:
+    """Who is on each row, or, where the first set with rows shows one subject alone, in what recording.
+
+    Frames of one recording resemble one another: held back one by one they would show nothing.
+    """
+    first = next(number for number, chosen in enumerate(rows) if len(chosen))
+    subjects = np.array(training_sets[first].column("subject"))[rows[first]]
+    column = "subject" if len(set(subjects.tolist())) > 1 else "recording_id"
+    columns = [np.array(manifest.column(column)) for manifest in training_sets]
+    return [name for names, chosen in zip(columns, rows, strict=True) for name in names[chosen].tolist()]

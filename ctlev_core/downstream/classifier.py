@@ -2,13 +2,13 @@
 
 The paper trains a pre-trained ResNet-34 with a randomly initialised MLP head (N-ImageNet, its Table 1). The default
 here is a ResNet-10 of a quarter of the width from random weights, which two CPU cores train in a minute;
-`architecture="resnet34"`, a `head_width` and a `pretrained` folder give the paper's model.
+`architecture="resnet34"`, a `head_width` and a folder of `weights` (microsoft/resnet-34) give the paper's model.
 The class list is the sorted list of the classes in the training labels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.supervised_options import SupervisedOptions
-from data_contracts.config import cache_material
+from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import History, Labels
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 VERSION = 1
 NAME = "classifier"
+_STRIDE = 32
+"""Image px a pixel of a ResNet's last feature map."""
 
 
 class Options(SupervisedOptions):
@@ -36,14 +38,38 @@ class Options(SupervisedOptions):
     head_width: int = Field(
         default=0, ge=0, description="hidden units of the head, 0 = linear; the paper gives no width"
     )
-    pretrained: str = Field(
-        default="", description="folder of a published ResNet (transformers layout, same architecture) to start from"
+    weights: Path | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="local folder (config.json, model.safetensors) of a published ResNet of this architecture to start "
+        "from, such as microsoft/resnet-34; null = random weights",
     )
     learning_rate: float = Field(default=2e-3, gt=0, description="peak of AdamW's learning rate")
     flip: bool = Field(default=False, description="mirror half of the training images")
 
 
-def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, out: Path, work: Path) -> History:
+def input_files(options: Options) -> list[Path]:
+    """The files of the published ResNet to start from, if any.
+
+    Raises:
+        DataError: one is missing, or they are of another network.
+    """
+    from ctlev_core.networks.resnet_files import check_resnet_folder
+
+    return check_resnet_folder(options.weights, options.architecture) if options.weights else []
+
+
+def train(
+    frames: np.ndarray,
+    labels: Labels,
+    options: Options,
+    *,
+    seed: int,
+    out: Path,
+    work: Path,
+    parts: Sequence[int] = (),
+    groups: Sequence[str] = (),
+) -> History:
     """Train on frames with class names and write `model.safetensors` and `config.json` to `out`.
 
     Args:
@@ -53,35 +79,42 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
         seed: of the initial weights, the order of the samples and the augmentation.
         out: model folder.
         work: folder of the resumable state.
+        parts: rows of each training set, in order; empty = one set.
+        groups: N subjects or recordings, held back whole for validation; empty = each row is its own.
     Returns:
-        The training loss per logged step.
+        The training loss per logged step, and the loss of rows held back.
     Raises:
-        DataError: numbers of rows disagree, a class name is empty, or there is one class only.
+        DataError: numbers of rows disagree, a class name is empty, there is one class only, or the weights do not fit.
     """
     import torch
 
     from ctlev_core import supervised
+    from ctlev_core.supervised_training import train_model
+    from ctlev_core.training_rows import plan_rows
 
-    classes, targets = _check_training_set(frames, labels)
+    classes, targets = _check_training_set(frames, labels, options)
+    rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups, classes=targets)
+    weights = supervised.file_digests(input_files(options))
     device = supervised.resolve_device(options.device)
     model = supervised.build_seeded(lambda: _build_from_options(len(classes), options), seed).to(device)
 
-    def compute_loss(rows: np.ndarray, generator: np.random.Generator) -> torch.Tensor:
+    def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
         batch = frames[rows]
-        if options.flip:
+        if options.flip and generator is not None:
             mirror = generator.random(len(rows)) < 0.5
             batch = np.where(mirror[:, None, None, None], batch[:, :, ::-1], batch)
-        logits = model(_to_input(torch.from_numpy(batch).to(device)))
-        return torch.nn.functional.cross_entropy(logits, torch.from_numpy(targets[rows]).to(device))
+        with supervised.mixed_precision(options, device):
+            logits = model(_to_input(torch.from_numpy(batch).to(device)))
+        return torch.nn.functional.cross_entropy(logits.float(), torch.from_numpy(targets[rows]).to(device))
 
-    history = supervised.train_model(
+    history, record = train_model(
         model,
         compute_loss,
-        len(frames),
+        rows,
         options,
         seed=seed,
         work=work,
-        run_digest=supervised.digest(NAME, VERSION, cache_material(options), seed, frames, targets),
+        run_digest=supervised.digest(NAME, VERSION, cache_material(options), weights, seed, frames, targets),
         description="train classifier",
     )
     config = {
@@ -90,6 +123,8 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
         "classes": list(classes),
         "shape": _shape(options),
         "options": cache_material(options),
+        "weights": weights,
+        "training": record,
     }
     supervised.write_model(out, model, config)
     return history
@@ -116,7 +151,7 @@ def features(model: Path, frames: np.ndarray) -> np.ndarray:
     return _run(network, network.features, frames).reshape(len(frames), config["shape"]["hidden_sizes"][-1])
 
 
-def _check_training_set(frames: np.ndarray, labels: Labels) -> tuple[tuple[str, ...], np.ndarray]:
+def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) -> tuple[tuple[str, ...], np.ndarray]:
     from ctlev_core.supervised import check_frames
 
     where = "train classifier"
@@ -128,12 +163,17 @@ def _check_training_set(frames: np.ndarray, labels: Labels) -> tuple[tuple[str, 
     classes = tuple(sorted(set(labels.class_names)))
     if len(classes) < 2:
         raise DataError(f"{where}: needs at least two classes, got {', '.join(classes) or 'no rows'}")
+    if options.batch_size == 1 and max(frames.shape[1:3]) <= _STRIDE:
+        raise DataError(
+            f"{where}: images of {frames.shape[2]} x {frames.shape[1]} px leave one value a channel, which batch "
+            "normalisation cannot spread; expected a batch_size of 2 or more"
+        )
     columns = {name: column for column, name in enumerate(classes)}
     return classes, np.array([columns[name] for name in labels.class_names], dtype=np.int64)
 
 
 def _shape(options: Options) -> dict[str, Any]:
-    from ctlev_core.networks.resnet import ARCHITECTURES
+    from ctlev_core.networks.resnet_files import ARCHITECTURES
 
     return ARCHITECTURES[options.architecture]
 
@@ -142,8 +182,8 @@ def _build_from_options(num_classes: int, options: Options) -> Any:
     from ctlev_core.networks.resnet import ResNetClassifier, load_backbone
 
     network = ResNetClassifier(_shape(options), num_classes, options.head_width)
-    if options.pretrained:
-        load_backbone(network, Path(options.pretrained))
+    if options.weights:
+        load_backbone(network, options.weights)
     return network
 
 

@@ -8,7 +8,7 @@ from scratch; AdamW takes the place of RMSprop, and targets sit at the joint rat
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -58,7 +58,17 @@ class Options(SupervisedOptions):
     )
 
 
-def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, out: Path, work: Path) -> History:
+def train(
+    frames: np.ndarray,
+    labels: Labels,
+    options: Options,
+    *,
+    seed: int,
+    out: Path,
+    work: Path,
+    parts: Sequence[int] = (),
+    groups: Sequence[str] = (),
+) -> History:
     """Train on labelled frames and write `model.safetensors` and `config.json` to `out`.
 
     Args:
@@ -68,35 +78,42 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
         seed: of the initial weights, the order of the samples and the augmentation.
         out: model folder.
         work: folder of the resumable state.
+        parts: rows of each training set, in order; empty = one set.
+        groups: N subjects or recordings, held back whole for validation; empty = each row is its own.
     Returns:
-        The training loss per logged step.
+        The training loss per logged step, and the loss of rows held back.
     Raises:
         DataError: shapes disagree, or no joint of any row is visible inside the image.
     """
     from ctlev_core import supervised
+    from ctlev_core.supervised_training import train_model
+    from ctlev_core.training_rows import plan_rows
 
     joints2d, visible = _check_training_set(frames, labels, options)
+    rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
     grey = _grey(frames)
     device = supervised.resolve_device(options.device)
     model = supervised.build_seeded(lambda: _build(joints2d.shape[1], options), seed).to(device)
     mirror = JOINT_SETS[labels.joint_set].mirror if options.flip else None
 
-    def compute_loss(rows: np.ndarray, generator: np.random.Generator) -> torch.Tensor:
+    def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
         import torch
 
-        images, points = _shift(grey[rows], joints2d[rows], options.shift_px, generator)
-        seen = visible[rows]
-        if mirror is not None:
-            images, points, seen = _flip_half(images, points, seen, mirror, generator)
+        images, points, seen = grey[rows], joints2d[rows], visible[rows]
+        if generator is not None:
+            images, points = _shift(images, points, options.shift_px, generator)
+            if mirror is not None:
+                images, points, seen = _flip_half(images, points, seen, mirror, generator)
         inside = seen & _inside(points, grey.shape[1:])
-        heatmaps = model(_to_input(torch.from_numpy(images).to(device)))
+        with supervised.mixed_precision(options, device):
+            heatmaps = model(_to_input(torch.from_numpy(images).to(device)))
         points_tensor = torch.from_numpy(np.where(inside[..., None], points, 0).astype(np.float32)).to(device)
-        return _heatmap_loss(heatmaps, points_tensor, torch.from_numpy(inside).to(device), options)
+        return _heatmap_loss(heatmaps.float(), points_tensor, torch.from_numpy(inside).to(device), options)
 
-    history = supervised.train_model(
+    history, record = train_model(
         model,
         compute_loss,
-        len(grey),
+        rows,
         options,
         seed=seed,
         work=work,
@@ -112,6 +129,7 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
             "joint_set": labels.joint_set,
             "num_joints": joints2d.shape[1],
             "options": cache_material(options),
+            "training": record,
         },
     )
     return history

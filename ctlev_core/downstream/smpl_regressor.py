@@ -7,7 +7,7 @@ and the shape is predicted rather than given. The default is a small network tha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -58,7 +58,17 @@ class _TrainingSet(NamedTuple):
     intrinsics: np.ndarray
 
 
-def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, out: Path, work: Path) -> History:
+def train(
+    frames: np.ndarray,
+    labels: Labels,
+    options: Options,
+    *,
+    seed: int,
+    out: Path,
+    work: Path,
+    parts: Sequence[int] = (),
+    groups: Sequence[str] = (),
+) -> History:
     """Train on frames with SMPL labels and write `model.safetensors` and `config.json` to `out`.
 
     Args:
@@ -68,8 +78,10 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
         seed: of the initial weights, the order of the samples and the augmentation.
         out: model folder.
         work: folder of the resumable state.
+        parts: rows of each training set, in order; empty = one set.
+        groups: N subjects or recordings, held back whole for validation; empty = each row is its own.
     Returns:
-        The training loss per logged step.
+        The training loss per logged step, and the loss of rows held back.
     Raises:
         DataError: numbers of rows disagree, or the labels have no SMPL parameters or no intrinsics.
     """
@@ -78,27 +90,33 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
     from ctlev_core import supervised
     from ctlev_core.body.layer import load_body
     from ctlev_core.body.torch_layer import BodyLayer
+    from ctlev_core.supervised_training import train_model
+    from ctlev_core.training_rows import plan_rows
 
     data = _check_training_set(frames, labels)
+    rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
     device = supervised.resolve_device(options.device)
     model: Any = supervised.build_seeded(lambda: _build(options), seed)
     model.start_from(*(torch.from_numpy(array).float() for array in (data.rotations, data.betas, data.transl)))
     model.to(device)
     body = BodyLayer(load_body()).to(device)
 
-    def compute_loss(rows: np.ndarray, generator: np.random.Generator) -> torch.Tensor:
+    def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
         batch = _TrainingSet(*(array[rows] for array in data))
-        batch = _shift(batch, options.shift_px, generator)
-        if options.flip:
-            batch = _flip_half(batch, generator)
+        if generator is not None:
+            batch = _shift(batch, options.shift_px, generator)
+            if options.flip:
+                batch = _flip_half(batch, generator)
         images = _to_input(torch.from_numpy(np.ascontiguousarray(batch.frames)).to(device))
         wanted = [torch.from_numpy(array).float().to(device) for array in batch[1:]]
-        return _loss(model(images), wanted, body, frames.shape[2], options)
+        with supervised.mixed_precision(options, device):
+            found = model(images)
+        return _loss(found, wanted, body, frames.shape[2], options)
 
-    history = supervised.train_model(
+    history, record = train_model(
         model,
         compute_loss,
-        len(frames),
+        rows,
         options,
         seed=seed,
         work=work,
@@ -111,6 +129,7 @@ def train(frames: np.ndarray, labels: Labels, options: Options, *, seed: int, ou
         "joint_set": labels.joint_set or "smpl",
         "intrinsics_px": np.mean(data.intrinsics, axis=0, dtype=np.float64).tolist(),
         "options": cache_material(options),
+        "training": record,
     }
     supervised.write_model(out, model, config)
     return history
@@ -181,7 +200,7 @@ def _check_training_set(frames: np.ndarray, labels: Labels) -> _TrainingSet:
 
 
 def _build(options: Options) -> Any:
-    from ctlev_core.networks.resnet import ARCHITECTURES
+    from ctlev_core.networks.resnet_files import ARCHITECTURES
     from ctlev_core.networks.smpl_regressor import SmplRegressor
 
     return SmplRegressor(ARCHITECTURES[options.architecture], options.pool_grid, options.head_width)

@@ -11,15 +11,9 @@ from typing import Any
 import torch
 from torch import nn
 
+from ctlev_core.networks.resnet_files import WEIGHTS_NAME
 from data_contracts.errors import DataError
 
-# Name -> blocks per stage, channels per stage, channels of the first convolution; basic (two-convolution) blocks.
-ARCHITECTURES: dict[str, dict[str, Any]] = {
-    "resnet10-quarter": {"depths": [1, 1, 1, 1], "hidden_sizes": [16, 32, 64, 128], "embedding_size": 16},
-    "resnet10-half": {"depths": [1, 1, 1, 1], "hidden_sizes": [32, 64, 128, 256], "embedding_size": 32},
-    "resnet18": {"depths": [2, 2, 2, 2], "hidden_sizes": [64, 128, 256, 512], "embedding_size": 64},
-    "resnet34": {"depths": [3, 4, 6, 3], "hidden_sizes": [64, 128, 256, 512], "embedding_size": 64},
-}
 # ImageNet's channel statistics, so that published ResNets see the input they were trained with.
 CHANNEL_MEAN = (0.485, 0.456, 0.406)
 CHANNEL_STD = (0.229, 0.224, 0.225)
@@ -29,7 +23,7 @@ class ResNetClassifier(nn.Module):
     """A ResNet without its own head, global average pooling, and a linear or one-hidden-layer head.
 
     Args:
-        shape: `depths`, `hidden_sizes`, `embedding_size` as in `ARCHITECTURES`.
+        shape: `depths`, `hidden_sizes`, `embedding_size` as in `ctlev_core.networks.resnet_files.ARCHITECTURES`.
         num_classes: logits.
         head_width: hidden units of the head; 0 makes the head linear.
     """
@@ -63,20 +57,36 @@ class ResNetClassifier(nn.Module):
 
 
 def load_backbone(network: ResNetClassifier, folder: Path) -> None:
-    """Take over the weights of a ResNet saved by transformers; its own classification head is not used.
+    """Take over the weights of a ResNet saved by transformers; a classification head, if there, is not used.
 
+    Args:
+        network: what to put them into.
+        folder: as `ctlev_core.networks.resnet_files.check_resnet_folder` accepts it.
     Raises:
-        DataError: the folder holds no ResNet, or one of another shape.
+        DataError: the file cannot be read, or lacks a tensor of the network, or has one of another shape.
     """
-    from transformers import ResNetConfig, ResNetModel
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
 
-    if not (folder / "config.json").is_file():
-        raise DataError(f"pretrained ResNet {folder}: expected a folder with config.json, found none")
-    config = ResNetConfig.from_pretrained(folder, local_files_only=True)
-    expected = network.backbone.config
-    for name in ("layer_type", "depths", "hidden_sizes", "embedding_size"):
-        if getattr(config, name) != getattr(expected, name):
+    path = folder / WEIGHTS_NAME
+    try:
+        saved = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"{path}: cannot be read as safetensors: {error}") from error
+    saved = {name.removeprefix("resnet."): tensor for name, tensor in saved.items()}
+    expected = network.backbone.state_dict()
+    # Files written before PyTorch 0.4.1 do not count batches; the count changes nothing.
+    missing = [name for name in expected if name not in saved and not name.endswith("num_batches_tracked")]
+    if missing:
+        raise DataError(f"{path}: lacks {len(missing)} of {len(expected)} tensors, the first {missing[0]}")
+    found = expected | {name: saved[name] for name in expected if name in saved}
+    for name, tensor in found.items():
+        wanted = expected[name].shape
+        if tensor.shape != wanted:
             raise DataError(
-                f"pretrained ResNet {folder}: expected {name} {getattr(expected, name)}, got {getattr(config, name)}"
+                f"{path}: {name} must be of shape {list(wanted)}, got {list(tensor.shape)}; "
+                "is it of another architecture than its config.json says?"
             )
-    network.backbone.load_state_dict(ResNetModel.from_pretrained(folder, local_files_only=True).state_dict())
+        if not torch.isfinite(tensor).all():
+            raise DataError(f"{path}: {name} has values that are not finite")
+    network.backbone.load_state_dict(found)

@@ -86,7 +86,7 @@ def test_no_frames_give_no_bodies(trained):
 def test_a_run_goes_on_where_it_stopped(trained, tmp_path):
     labels = people()
     frames = pictures(labels)
-    stopped = TINY.model_copy(update={"checkpoint_every": 20})
+    stopped = TINY.model_copy(update={"checkpoint_every_s": 0.0})
 
     class Killed(Exception):
         pass
