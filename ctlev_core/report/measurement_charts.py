@@ -1,0 +1,73 @@
+"""Rows of the table `speed_vs_error` as lines over the number of evaluations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ctlev_core.report.html import Curves
+
+REFERENCE_LINE, CONVERGED_LINE = "reference", "converged"
+"""Names of the settings that others are compared with."""
+_BAND_BARS = 90
+"""Bars that a band is hatched with."""
+_LOG_RANGE = 5.0
+"""From this ratio of its largest to its smallest value on, a chart's y axis is logarithmic."""
+
+Row = Mapping[str, Any]
+Series = dict[str, tuple[list[float], list[float]]]
+
+
+def rows_of(rows: Sequence[Row], metric: str, against: str, study: str = "generator") -> list[Row]:
+    """The rows of one measurement, all settings."""
+    return [row for row in rows if (row["study"], row["metric"], row["against"]) == (study, metric, against)]
+
+
+def find_row(
+    rows: Sequence[Row], line: str, steps: int | None, metric: str, against: str, study: str = "generator"
+) -> Row | None:
+    """The measurement at one point of a line, or (`steps` None) at its first; None where it was not made."""
+    of_line = (row for row in rows_of(rows, metric, against, study) if row["line"] == line)
+    return next((row for row in of_line if steps in (None, row["num_inference_steps"])), None)
+
+
+def lines_of(rows: Sequence[Row], metric: str, against: str, study: str = "generator") -> Series:
+    """Each line's values over its evaluations; the reference and what has converged are no lines."""
+    points = [row for row in rows_of(rows, metric, against, study) if row["evaluations"] > 0]
+    points = [row for row in points if row["line"] not in (REFERENCE_LINE, CONVERGED_LINE)]
+    series = {}
+    for line in dict.fromkeys(row["line"] for row in points):
+        of_line = sorted((row for row in points if row["line"] == line), key=lambda row: row["evaluations"])
+        series[line] = ([row["evaluations"] for row in of_line], [row["value"] for row in of_line])
+    return series
+
+
+def chart(
+    title: str,
+    series: Series,
+    band: Row | None,
+    band_name: str,
+    y_label: str,
+    caption: str,
+) -> Curves:
+    """Errors over evaluations, with the hatched interval of `band` across the chart."""
+    values = [value for _, y in series.values() for value in y]
+    spans: dict[str, tuple[list[float], list[float]]] = {}
+    if band is not None and band["high"] is not None:
+        x = [value for x, _ in series.values() for value in x]
+        across = np.geomspace(min(x), max(x), _BAND_BARS).tolist()
+        series = series | {band_name: (across, [band["value"]] * _BAND_BARS)}
+        spans = {band_name: ([band["low"]] * _BAND_BARS, [band["high"]] * _BAND_BARS)}
+        values += [band["low"], band["high"]]
+    return Curves(
+        title,
+        series,
+        "evaluations of the network an image",
+        y_label,
+        log_x=True,
+        log_y=min(values) > 0 and max(values) / min(values) >= _LOG_RANGE,
+        caption=caption,
+        spans=spans,
+    )

@@ -1,0 +1,268 @@
+"""The page that says how many steps of which sampler are enough."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ctlev_core.report.html import ImageGrid, Section, Table
+from ctlev_core.report.measurement_charts import (
+    CONVERGED_LINE,
+    REFERENCE_LINE,
+    Row,
+    chart,
+    find_row,
+    lines_of,
+    rows_of,
+)
+from ctlev_core.report.solver_studies import exact_score_sections, precision_sections
+from ctlev_core.sampling_errors import (
+    CONTROLNET,
+    CONVERGED,
+    CPU,
+    FD,
+    HELD_OUT,
+    KID,
+    LABELS,
+    OF_HALVES,
+    PIXEL_RMS,
+    REFERENCE,
+    WALL,
+)
+from ctlev_core.windows import spread
+
+QUICK = (5, 10)
+"""Evaluations of the network in which a quick setting is looked for."""
+GRID_COLUMNS = 10
+
+Point = tuple[str, int]
+"""A line and its number of steps."""
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """Settings as rows of the distance to held-out real frames; None where there is none.
+
+    Attributes:
+        default: with the fewest evaluations from which on its line stays within the reference's interval.
+        quick: the nearest to real frames of those with 5 to 10 evaluations.
+    """
+
+    default: Row | None
+    quick: Row | None
+
+
+def recommend(rows: Sequence[Row]) -> Recommendation:
+    """What to use, from rows of the table `speed_vs_error`.
+
+    A single point within the interval may be there by luck, so all points of its line with more evaluations must be
+    too. Below the interval is not worse than the reference, and counts as within.
+    """
+    points = [row for row in rows_of(rows, FD, HELD_OUT) if row["line"] not in (REFERENCE_LINE, CONVERGED_LINE)]
+    upper = next((row["high"] for row in rows_of(rows, FD, HELD_OUT) if row["line"] == REFERENCE_LINE), None)
+    enough: list[Row] = []
+    for line in dict.fromkeys(row["line"] for row in points):
+        of_line = sorted((row for row in points if row["line"] == line), key=lambda row: -row["evaluations"])
+        beyond = [number for number, row in enumerate(of_line) if upper is None or row["value"] > upper]
+        within = of_line[: beyond[0]] if beyond else of_line
+        enough += within[-1:]
+    quick = [row for row in points if QUICK[0] <= row["evaluations"] <= QUICK[1]]
+    return Recommendation(
+        default=min(enough, key=lambda row: (row["evaluations"], row["value"]), default=None),
+        quick=min(quick, key=lambda row: row["value"], default=None),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SpeedPage:
+    """What the page shows.
+
+    Attributes:
+        rows: of the table `speed_vs_error`.
+        pictures: frames [N, H, W, 3] uint8 of each point, of the same conditions and seeds.
+        reference_pictures: those of the reference.
+        condition_pictures: what was asked for, or None.
+        reference_name: sampler and steps of the reference.
+        converged_name: of what counts as converged.
+        own: the point the experiment samples with, if it was measured.
+        features: what the distances are computed from.
+    """
+
+    rows: Sequence[Row]
+    pictures: Mapping[Point, np.ndarray]
+    reference_pictures: np.ndarray
+    condition_pictures: np.ndarray | None
+    reference_name: str
+    converged_name: str
+    own: Point | None
+    features: str
+
+    def verdict(self) -> str:
+        """The recommendation, in a few sentences."""
+        reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
+        found = recommend(self.rows)
+        if reference is None or reference["high"] is None:
+            return "There are too few conditions or recordings for intervals, so nothing can be recommended."
+        band = f"the reference, {self.reference_name}, has {_text(reference)}"
+        sentences = [f"No setting stays within the interval of {band}, Frechet distance to {HELD_OUT}."]
+        if found.default is not None:
+            fewer = reference["evaluations"] / found.default["evaluations"]
+            sentences = [
+                f"Recommended: {_named(found.default)}, {fewer:.0f} times fewer than the reference's. Frechet distance "
+                f"to {HELD_OUT} {found.default['value']:.3g}; {band}."
+            ]
+        if found.quick is not None:
+            sentences.append(
+                f"Of {QUICK[0]} to {QUICK[1]} evaluations: {_named(found.quick)}, {found.quick['value']:.3g}, "
+                f"{_where(found.quick, reference)}."
+            )
+        own = None if self.own is None else self._row(self.own[0], FD, HELD_OUT, self.own[1])
+        if own is not None:
+            sentences.append(
+                f"The experiment's own setting, {_named(own)}: {own['value']:.3g}, {_where(own, reference)}."
+            )
+        return " ".join(sentences)
+
+    def sections(self) -> list[Section]:
+        """Charts, tables and pictures, the generator's first."""
+        return [
+            *self._charts(),
+            self._settings(),
+            self._grid(),
+            *exact_score_sections(self.rows),
+            *precision_sections(self.rows),
+        ]
+
+    def _charts(self) -> list[Section]:
+        reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
+        floor = self._row(REFERENCE_LINE, FD + OF_HALVES, REFERENCE)
+        count = 0 if reference is None else reference["num_samples"]
+        shown = {
+            "Distance to held-out real frames": (
+                lines_of(self.rows, FD, HELD_OUT),
+                reference,
+                f"{self.reference_name}: 95 %",
+                "Frechet distance",
+                f"In features of {self.features}, from {count} samples a setting, so that values compare with one "
+                "another only. Hatched: not to be told from the reference. All settings share conditions "
+                "and seeds.",
+            ),
+            "Distance to the reference's samples": (
+                lines_of(self.rows, FD + OF_HALVES, REFERENCE),
+                floor,
+                "halves of the reference's own",
+                "Frechet distance of halves",
+                "Between halves of the samples, because halves of the reference's own samples show what a perfect "
+                "copy of its distribution would get: hatched, 95 % of random halves.",
+            ),
+            "Difference from the converged solution": (
+                lines_of(self.rows, PIXEL_RMS, CONVERGED),
+                None,
+                "",
+                "RMS, grey levels of 255",
+                f"Image by image from the same noise, against {self.converged_name}. Only solvers that draw no noise "
+                "of their own approach it; it says how exactly they solve, not how good the image is.",
+            ),
+        }
+        return [chart(title, *parts) for title, parts in shown.items() if parts[0]]
+
+    def _settings(self) -> Table:
+        """Every setting with its costs and errors."""
+        of_generator = [row for row in self.rows if row["study"] == "generator"]
+        label = next((row["metric"] for row in of_generator if row["against"] == LABELS), "")
+        found = recommend(self.rows)
+        bold: set[tuple[int, int]] = set()
+        body: list[list[Any]] = []
+        for point in dict.fromkeys((row["line"], row["num_inference_steps"]) for row in of_generator):
+            if point in (_point(found.default), _point(found.quick)):
+                bold.add((len(body), 0))
+            evaluations = next(row["evaluations"] for row in of_generator if _point(row) == point)
+            distance = self._at(point, FD, HELD_OUT)
+            numbers = [
+                self._at(point, *what)
+                for what in ((KID, HELD_OUT), (FD + OF_HALVES, REFERENCE), (KID, REFERENCE), (PIXEL_RMS, CONVERGED))
+            ]
+            scales = (1000, 1, 1000, 1)
+            cells = [_digits(row, scale) for row, scale in zip(numbers, scales, strict=True)]
+            cells += [_digits(self._at(point, label, LABELS))] if label else []
+            networks = [f"{evaluations:g}", _digits(self._at(point, CONTROLNET, ""))]
+            times = [_digits(self._at(point, seconds, ""), 1000) for seconds in (WALL, CPU)]
+            interval = "" if distance is None else _text(distance)
+            body.append([self._name(point[0]), *networks, *times, interval, *cells])
+        columns = [
+            "sampler", "U-Net", "Control Net", "ms", "CPU ms", f"{FD}: real", f"{KID}: real", f"{FD}: ref.",
+            f"{KID}: ref.", "RMS",
+        ]  # fmt: skip
+        columns += [label.replace("_", " ")] if label else []
+        caption = (
+            "U-Net, ControlNet: evaluations an image, counted. ms: median time an image, batch by batch in one process "
+            f"with the networks loaded and warm, on the machine as busy as it was. {FD}: Frechet distance, to "
+            f"{HELD_OUT} with its 95 % interval, and between halves to the reference's samples. {KID}: kernel distance "
+            "times 1,000, which has no bias. RMS: grey levels from the converged solution."
+        )
+        caption += f" {label}: of a model trained on real frames, against the labels asked for." if label else ""
+        return Table("Every setting", columns, body, caption=f"{caption} Bold: recommended.", bold=bold)
+
+    def _at(self, point: Point, metric: str, against: str) -> Row | None:
+        return find_row(self.rows, *point, metric, against)
+
+    def _grid(self) -> ImageGrid:
+        """Reference and recommended settings, the same conditions below one another."""
+        chosen = spread(len(self.reference_pictures), GRID_COLUMNS)
+        rows: list[tuple[str, list[np.ndarray]]] = []
+        if self.condition_pictures is not None:
+            rows.append(("condition", [self.condition_pictures[row] for row in chosen]))
+        rows.append((self.reference_name, [self.reference_pictures[row] for row in chosen]))
+        found = recommend(self.rows)
+        points: dict[Point, str] = {}
+        for row, what in ((found.default, "recommended"), (found.quick, "quick"), (self._worst(), "farthest")):
+            point = _point(row)
+            if row is not None and point is not None:
+                points.setdefault(point, f"{what}: {_named(row)}")
+        for point, name in points.items():
+            if point in self.pictures:
+                rows.append((name, [self.pictures[point][row] for row in chosen]))
+        return ImageGrid("The same conditions and seeds", rows, caption="One column a condition, none chosen by eye.")
+
+    def _worst(self) -> Row | None:
+        points = [
+            row for row in rows_of(self.rows, FD, HELD_OUT) if row["line"] not in (REFERENCE_LINE, CONVERGED_LINE)
+        ]
+        return max(points, key=lambda row: row["value"], default=None)
+
+    def _name(self, line: str) -> str:
+        return {
+            REFERENCE_LINE: f"{self.reference_name} (reference)",
+            CONVERGED_LINE: f"{self.converged_name} (converged)",
+        }.get(line, line)
+
+    def _row(self, line: str, metric: str, against: str, steps: int | None = None) -> Row | None:
+        return find_row(self.rows, line, steps, metric, against)
+
+
+def _point(row: Row | None) -> Point | None:
+    return None if row is None else (row["line"], row["num_inference_steps"])
+
+
+def _named(row: Row) -> str:
+    return f"{row['line']} in {row['evaluations']:g} evaluations"
+
+
+def _where(row: Row, reference: Row) -> str:
+    return "within the interval" if row["value"] <= reference["high"] else "above the interval"
+
+
+def _digits(row: Row | None, scale: float = 1) -> str:
+    """Three significant digits, and no powers of ten for large values."""
+    if row is None:
+        return ""
+    value = row["value"] * scale
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _text(row: Row) -> str:
+    known = row["low"] is not None and row["high"] is not None
+    return _digits(row) + (f" [{row['low']:.3g}, {row['high']:.3g}]" if known else "")
