@@ -297,6 +297,14 @@ class FeatureExtractor(Downstream, Protocol):
         ...
 
 
+class NamedFeatureExtractor(FeatureExtractor, Protocol):
+    """An extractor that learns nothing; by its checksum it knows what scores in its features may be called."""
+
+    def name_score(self, model: Path, score: str) -> str:
+        """Of a metric's score, such as `fd`: `fid` where the features are those it is defined with."""
+        ...
+
+
 class Metric(Protocol):
     """A score. `INPUT` names what it compares: `joints2d`, `joints3d`, `smpl`, `classes` or `features`."""
 

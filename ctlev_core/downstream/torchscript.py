@@ -1,0 +1,142 @@
+"""Features of a TorchScript file, such as the Inception network that the Frechet inception distance is defined with.
+
+Nothing is trained: the file is kept with its checksum. Distances in its features are called `fid` and `kid` only where
+the checksum is that of `inception-2015-12-05.pt`; that file takes images in 0..255 and resizes them itself.
+
+Source: Karras et al., StyleGAN2-ADA, 2020 (the file, and its argument `return_features`); Heusel et al., GANs Trained
+by a Two Time-Scale Update Rule, NeurIPS 2017 (FID).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ctlev_core import feature_files
+from data_contracts.config import RUN_SETTING, Frozen, cache_material
+from data_contracts.errors import DataError
+from data_contracts.labels import History, Labels
+from data_contracts.manifest import file_digest
+
+VERSION = 1
+NAME = "torchscript"
+_FILE = "network.pt"
+_CHANNELS = {"0..1": ((0.0,) * 3, (1.0,) * 3), "imagenet": ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))}
+
+
+class Options(Frozen):
+    """Which file, and what it wants to see."""
+
+    file: Path | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="local TorchScript file: images [N, 3, H, W] to features [N, D]; needed",
+    )
+    architecture: str = Field(
+        default="torchscript", pattern=r"^[a-z0-9]+$", description="what scores call it: fd_event_ARCHITECTURE_SHA8"
+    )
+    values: Literal["0..255", "0..1", "imagenet"] = Field(
+        default="0..255", description="range of its input; imagenet = ImageNet's mean and standard deviation taken off"
+    )
+    image_size: int = Field(
+        default=0, ge=0, description="images are squeezed to so many px a side (bicubic, antialiased); 0 = as they are"
+    )
+    device: str = Field(
+        default="auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING
+    )
+
+
+def input_files(options: Options) -> list[Path]:
+    """The file.
+
+    Raises:
+        DataError: none is named, it is missing, or it is the published Inception with a preprocessing not its own.
+    """
+    if options.file is None or not options.file.is_file():
+        raise DataError(f"torchscript: expected option `file` to be a TorchScript file, got {options.file}")
+    if (options.values, options.image_size) != ("0..255", 0) and _is_inception(options.file):
+        raise DataError(
+            f"{options.file} is the Inception network of FID, which takes 0..255 and resizes by itself; "
+            f"expected values 0..255 and image_size 0, got {options.values} and {options.image_size}"
+        )
+    return [options.file]
+
+
+def train(
+    frames: np.ndarray,
+    labels: Labels,
+    options: Options,
+    *,
+    seed: int,
+    out: Path,
+    work: Path,
+    parts: Sequence[int] = (),
+    groups: Sequence[str] = (),
+) -> History:
+    """Keep the file and its checksum in `out`; nothing learns.
+
+    Args:
+        frames: [N, H, W, 3] uint8, N >= 1; the first show whether the network runs on such images.
+        labels: not looked at, like `seed`, `work`, `parts` and `groups`.
+        options: see `Options`.
+        seed: of nothing.
+        out: model folder.
+        work: stays empty.
+        parts: of nothing.
+        groups: of nothing.
+    Returns:
+        No losses.
+    Raises:
+        DataError: as `input_files` and `features`.
+    """
+    (file,) = input_files(options)
+    architecture = "inception" if _is_inception(file) else options.architecture
+    feature_files.write_extractor(out, NAME, VERSION, architecture, {_FILE: file}, cache_material(options))
+    features(out, frames[:2], options.device)
+    return History()
+
+
+def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarray:
+    """Features [N, D] float32 of frames [N, H, W, 3] uint8.
+
+    Raises:
+        DataError: the folder is of another model, the file is not TorchScript, or does not make features of frames.
+    """
+    import torch
+
+    from ctlev_core.supervised import resolve_device
+
+    config = feature_files.read_extractor(model, NAME)
+    options, path, place = Options(**config["options"]), model / feature_files.FILES_FOLDER / _FILE, device
+    try:
+        network: Any = torch.jit.load(path, map_location=resolve_device(place)).eval()
+    except (RuntimeError, ValueError) as error:
+        raise DataError(f"{path}: cannot be loaded as TorchScript: {error}") from error
+    arguments = {argument.name for argument in network.forward.schema.arguments}
+    extra = {"return_features": True} if "return_features" in arguments else {}
+
+    def run(images: torch.Tensor) -> torch.Tensor:
+        images = feature_files.resize_images(images, options.image_size)
+        if options.values in _CHANNELS:
+            images = feature_files.normalise(images, *_CHANNELS[options.values])
+        return network(images, **extra)
+
+    return feature_files.compute_features(frames, run, resolve_device(place), f"features of {path.parent.parent}")
+
+
+def name_score(model: Path, score: str) -> str:
+    """What a score in these features is called: `fid` for `fd` of the verified Inception, or SCORE_event_..._SHA8."""
+    return feature_files.name_score(score, feature_files.read_extractor(model, NAME))
+
+
+def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+    """`features` [N, D]: there is nothing else to predict."""
+    return {"features": features(model, frames)}
+
+
+def _is_inception(path: Path) -> bool:
+    return file_digest(path) == feature_files.INCEPTION_SHA256
