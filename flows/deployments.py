@@ -24,6 +24,7 @@ from flows import export_events as of_export_events
 from flows import full_experiment as of_full_experiment
 from flows import prepare_dataset as of_prepare_dataset
 from flows import pretrain_prior as of_pretrain_prior
+from flows import regenerate as of_regenerate
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
 from flows.command_line import PRESETS, check_home, load_experiment, load_preset, use_cores
@@ -86,6 +87,7 @@ prepare_dataset = _deployable(
 )
 train_generator = _deployable(of_train_generator.train_generator)
 synthesize = _deployable(of_synthesize.synthesize)
+regenerate = _deployable(of_regenerate.regenerate, load=of_regenerate.load_regeneration)
 baselines = _deployable(of_baselines.baselines)
 evaluate = _deployable(of_evaluate.evaluate)
 export_events = _deployable(of_export_events.export_streams, publish=publish_events)

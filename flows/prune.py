@@ -1,6 +1,6 @@
 """Remove from the store what no run has used for long, and nothing that anything kept was made from.
 
-python flows/prune.py [--keep-days N] [--apply] [--home FOLDER]
+python flows/prune.py [--keep-days N] [--keep-versions N] [--apply] [--home FOLDER]
 
 Without --apply it only lists what would go.
 """
@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from data_contracts.errors import DataError
-from tasks.store import Store, Stored, StoreInUseError, home_folder
+from tasks.store import KEEP_VERSIONS, Store, Stored, StoreInUseError, home_folder
 
 
 def _days(text: str) -> float:
@@ -22,6 +22,13 @@ def _days(text: str) -> float:
     if not (math.isfinite(days) and days >= 0):
         raise argparse.ArgumentTypeError(f"must be a number of days, 0 or more, got {text!r}")
     return days
+
+
+def _count(text: str) -> int:
+    count = int(text)
+    if count < 0:
+        raise argparse.ArgumentTypeError(f"must be a number of versions, 0 or more, got {text!r}")
+    return count
 
 
 def _size(items: list[Stored]) -> str:
@@ -32,6 +39,13 @@ def main() -> int:
     """Exit status: 0 done, 2 not possible; then nothing was removed, or the message says what was left."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--keep-days", type=_days, default=30.0, metavar="N", help="keep what was used since [30]")
+    parser.add_argument(
+        "--keep-versions",
+        type=_count,
+        default=KEEP_VERSIONS,
+        metavar="N",
+        help=f"keep the newest published versions of each experiment, and always the latest [{KEEP_VERSIONS}]",
+    )
     parser.add_argument("--apply", action="store_true", help="remove; without it, list what would be removed")
     parser.add_argument("--home", type=Path, help="folder of all state [CTLEV_HOME or .ctlev]")
     arguments = parser.parse_args()
@@ -40,9 +54,9 @@ def main() -> int:
         if not home.is_dir():
             raise FileNotFoundError(f"{home}: there is no such home folder")
         store = Store(home)
-        leaving, kept = store.unneeded(arguments.keep_days)
+        leaving, kept = store.unneeded(arguments.keep_days, arguments.keep_versions)
         if arguments.apply:
-            leaving = store.prune(arguments.keep_days)
+            leaving = store.prune(arguments.keep_days, arguments.keep_versions)
     except (DataError, StoreInUseError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -7,6 +7,7 @@
 <home>/locks/store                shared by every process that uses the store, until it ends; exclusive while pruning
 <home>/damaged/<stage>/           artefacts that were set aside; nothing here deletes them
 <home>/pruned/                    on its way out
+<home>/published/<experiment>/    which artefacts are the versions of its synthetic data (data_contracts.published)
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ from typing import IO, Any
 
 from data_contracts.errors import DataError
 from data_contracts.manifest import RUN_FILE, ManifestRef, file_digest, read_manifest
+from data_contracts.published import kept_versions
+
+KEEP_VERSIONS = 5
 
 
 def home_folder() -> Path:
@@ -185,20 +189,22 @@ class Store:
                 raise DataError(f"{path}: is a link to something outside the artefact")
         read_manifest(ref, full=True)
 
-    def unneeded(self, keep_days: float) -> tuple[list[Stored], list[Stored]]:
+    def unneeded(self, keep_days: float, keep_versions: int = KEEP_VERSIONS) -> tuple[list[Stored], list[Stored]]:
         """What can go, and what stays, if everything that was used within `keep_days` stays.
 
-        An artefact stays if it was used, or if the provenance record of one that stays names its key: what a report was
-        made from stays as long as the report. Half-made artefacts (`tmp`) can always go, for a rerun begins them anew;
+        An artefact stays if it was used, if one of the newest `keep_versions` published versions of an experiment, or
+        the latest, refers to it, or if the provenance record of one that stays names its key: what a report was made
+        from stays as long as the report. Half-made artefacts (`tmp`) can always go, for a rerun begins them anew;
         the resumable state of an interrupted stage (`work`) is kept as long as an artefact.
 
         Raises:
-            DataError: a provenance record cannot be read, so that what it refers to is not known.
+            DataError: a record cannot be read, so that what it refers to is not known.
         """
         oldest_s = time.time() - keep_days * 86_400
         stored = self.artefacts()
         referred = {item.folder: _keys_in(item.folder / RUN_FILE) for item in stored}
-        waiting = [item for item in stored if item.last_used_s >= oldest_s]
+        published = {found.key for version in kept_versions(self.home, keep_versions) for found in version.artefacts}
+        waiting = [item for item in stored if item.last_used_s >= oldest_s or item.folder.name in published]
         kept = {item.folder for item in waiting}
         while waiting:
             named = referred[waiting.pop().folder]
@@ -211,7 +217,7 @@ class Store:
         found = [*stored, *work, *half_made]
         return [item for item in found if item.folder not in kept], [item for item in found if item.folder in kept]
 
-    def prune(self, keep_days: float) -> list[Stored]:
+    def prune(self, keep_days: float, keep_versions: int = KEEP_VERSIONS) -> list[Stored]:
         """Remove what `unneeded` says can go, and return it; what an interrupted pruning left goes too.
 
         Everything is renamed out of the store while no run can start, and deleted after. A link is deleted, never what
@@ -227,7 +233,7 @@ class Store:
             if pruned.is_symlink():
                 raise DataError(f"{pruned}: is a link; nothing is moved out of the home")
             pruned.mkdir(exist_ok=True)
-            leaving, _ = self.unneeded(keep_days)
+            leaving, _ = self.unneeded(keep_days, keep_versions)
             for item in leaving:
                 item.folder.rename(pruned / uuid.uuid4().hex)
         for folder in _folders(pruned):

@@ -149,7 +149,7 @@ def service(tmp_path_factory):
         end(server)
 
 
-def test_deployments_say_what_they_take_and_synthesize_never_overlaps(service):
+def test_deployments_say_what_they_take_and_regenerate_never_overlaps(service):
     found = {name: service.api(f"deployments/name/{name}/default") for name in SCRIPTS}
     for name, deployment in found.items():
         parameters = deployment["parameter_openapi_schema"]["properties"]
@@ -160,8 +160,8 @@ def test_deployments_say_what_they_take_and_synthesize_never_overlaps(service):
         }
         assert all(value["description"] for value in parameters.values())
         assert deployment["enforce_parameter_schema"] and deployment["work_pool_name"] == "ctlev"
-        assert bool(deployment["schedules"]) == (name == "synthesize")
-    scheduled = found["synthesize"]
+        assert bool(deployment["schedules"]) == (name == "regenerate")
+    scheduled = found["regenerate"]
     (schedule,) = scheduled["schedules"]
     assert not schedule["active"] and schedule["schedule"]["cron"] == "0 3 * * 0"
     assert scheduled["global_concurrency_limit"]["limit"] == 1
@@ -220,9 +220,9 @@ def test_a_run_whose_worker_is_killed_goes_on_with_another(service, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_that_would_overlap_is_cancelled_and_says_why(service, tmp_path):
-    first = service.start_run("synthesize", tmp_path)
+    first = service.start_run("regenerate", tmp_path)
     service.state(first, until={"PENDING", "RUNNING"})
-    second = service.start_run("synthesize", tmp_path)
+    second = service.start_run("regenerate", tmp_path)
     state = service.state(second, until=ENDED)
     assert state["type"] == "CANCELLED" and "concurrency limit" in state["message"]
     assert service.prefect("flow-run", "cancel", first).returncode == 0

@@ -1,0 +1,69 @@
+"""Is a new version of synthetic data good enough to take the place of the one before?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ctlev_core.report.verdict import lower_is_better
+from data_contracts.errors import DataError
+from data_contracts.published import GateCheck
+from data_contracts.regeneration import Gates
+
+HELD_OUT = "held-out real"
+SYNTHETIC = "synthetic"
+REAL = "real"
+
+
+def check_gates(
+    gates: Gates, scores: Sequence[dict[str, Any]], *, task: str, labels_of: str, refused_share: float
+) -> list[GateCheck]:
+    """Every gate that is asked for, with the number it judges.
+
+    Args:
+        gates: thresholds; those that are None are left out.
+        scores: rows of the table `scores`: distances of `HELD_OUT` and `SYNTHETIC` frames, of equally many; scores of
+            the model trained on real frames, setting `REAL`, and of that model on the version's frames; copies.
+        task: of that model; its first score decides.
+        labels_of: setting of its scores on the version's frames.
+        refused_share: of frames that are no event images.
+    Raises:
+        DataError: a score that a gate needs is missing.
+    """
+    checks: list[GateCheck] = []
+    if gates.max_distance_ratio is not None:
+        floor, value = (_find(scores, "distance", setting, "fd_event_") for setting in (HELD_OUT, SYNTHETIC))
+        score = "Frechet distance to the real training frames"
+        checks.append(_check("max_distance_ratio", score, value["value"], gates.max_distance_ratio * floor["value"]))
+    if gates.max_label_error_ratio is not None:
+        floor, value = (_find(scores, task, setting) for setting in (REAL, labels_of))
+        score = f"error of labels, {value['metric']}"
+        checks.append(
+            _check("max_label_error_ratio", score, _error(value), gates.max_label_error_ratio * _error(floor))
+        )
+    if gates.max_copies_share is not None:
+        shares = [row["value"] for row in scores if row["task"] == "copies" and row["metric"] == "close_share"]
+        if not shares:
+            raise DataError("gate max_copies_share: nothing was searched for copies")
+        checks.append(_check("max_copies_share", "share of copies", max(shares), gates.max_copies_share))
+    if gates.max_refused_share is not None:
+        score = "share of frames that are no event images"
+        checks.append(_check("max_refused_share", score, refused_share, gates.max_refused_share))
+    return checks
+
+
+def _check(gate: str, score: str, value: float, limit: float) -> GateCheck:
+    return GateCheck(gate=gate, score=score, value=float(value), limit=float(limit))
+
+
+def _find(scores: Sequence[dict[str, Any]], task: str, setting: str, metric: str = "") -> dict[str, Any]:
+    """The first score of a task and setting, of all data, whose name starts so."""
+    for row in scores:
+        if (row["task"], row["setting"], row["group"]) == (task, setting, "all") and row["metric"].startswith(metric):
+            return row
+    raise DataError(f"gates: {task!r} has no score {metric!r} of setting {setting!r}")
+
+
+def _error(row: dict[str, Any]) -> float:
+    """Shares that want to be large become the share that is missing."""
+    return row["value"] if lower_is_better(row["metric"]) else 1 - row["value"]

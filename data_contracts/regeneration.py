@@ -1,0 +1,51 @@
+"""Options of regeneration: an experiment whose synthetic data is made anew, version by version."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from data_contracts.config import Frozen
+from data_contracts.experiment import Experiment
+
+
+class Gates(Frozen):
+    """What a new version must keep to become the latest; null = not asked.
+
+    Preset `demo` has a distance of 1.5 and a label error of 1.1 times that of real frames, and none refused.
+    """
+
+    max_distance_ratio: float | None = Field(
+        default=3.0,
+        gt=0,
+        description="Frechet distance to the real training frames, over that of as many held-out real frames",
+    )
+    max_label_error_ratio: float | None = Field(
+        default=1.5,
+        gt=0,
+        description="error in the first metric, of the model trained on real frames, over that on held-out real frames",
+    )
+    max_copies_share: float | None = Field(
+        default=0.05, ge=0, le=1, description="frames nearer to a training frame than 1 % of real frames are"
+    )
+    max_refused_share: float | None = Field(
+        default=0.05, ge=0, le=1, description="frames that are no event images after `max_tries`"
+    )
+
+
+class Regeneration(Experiment):
+    """An experiment, whether each version has poses of its own, and the gates before `latest`."""
+
+    gates: Gates = Gates()
+    new_poses: bool = Field(
+        default=True, description="choose the labels to sample from anew; otherwise only the noise is new"
+    )
+
+    @model_validator(mode="after")
+    def _distances_can_be_measured(self) -> Regeneration:
+        measured = self.feature_extractor is not None and any(choice.name == "frechet" for choice in self.distances)
+        if self.gates.max_distance_ratio is not None and not measured:
+            raise ValueError(
+                "gates.max_distance_ratio needs a feature_extractor, and frechet among the distances; "
+                "set it to null to do without"
+            )
+        return self

@@ -1,0 +1,108 @@
+"""Gates before a version becomes the latest: each at, below and above its limit."""
+
+import pytest
+from pydantic import ValidationError
+
+from ctlev_core.version_gates import check_gates
+from data_contracts.errors import DataError
+from data_contracts.regeneration import Gates, Regeneration
+
+OFF = dict.fromkeys(Gates.model_fields)
+DIGEST = "0123abcd"
+
+
+def row(task, setting, metric, value, group="all"):
+    return {"task": task, "setting": setting, "metric": metric, "value": value, "group": group}
+
+
+def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px"):
+    real_error = 6.0 if metric == "mpjpe2d_px" else 0.75
+    return [
+        row("distance", "held-out real", f"fd_event_classifier_{DIGEST}", 3.0),
+        row("distance", "held-out real", f"kid_event_classifier_{DIGEST}", -0.1),
+        row("distance", "synthetic", f"kid_event_classifier_{DIGEST}", 99.0),
+        row("distance", "synthetic", f"fd_event_classifier_{DIGEST}", distance),
+        row("copies", "synthetic", "duplicates", 5.0, "small pictures"),
+        row("copies", "synthetic", "close_share", copies[0], "small pictures"),
+        row("copies", "synthetic", "close_share", copies[1], "features of classifier"),
+        row("net", "real", metric, real_error),
+        row("net", "real", metric, 100.0, "walk"),
+        row("net", "real", "pck_px4", 0.9),
+        row("net", "labels of synthetic", metric, error),
+        row("net", "labels of synthetic", "pck_px4", 0.1),
+    ]
+
+
+def check(gates, found, refused_share=0.0):
+    return check_gates(
+        Gates(**{**OFF, **gates}), found, task="net", labels_of="labels of synthetic", refused_share=refused_share
+    )
+
+
+@pytest.mark.parametrize(
+    ("gate", "at_limit", "above", "limit"),
+    [
+        ({"max_distance_ratio": 2}, scores(distance=6.0), scores(distance=6.01), 6.0),
+        ({"max_label_error_ratio": 1.5}, scores(error=9.0), scores(error=9.01), 9.0),
+        # Accuracy .75 is an error of .25, and twice that an accuracy of .5.
+        (
+            {"max_label_error_ratio": 2},
+            scores(error=0.5, metric="accuracy"),
+            scores(error=0.49, metric="accuracy"),
+            0.5,
+        ),
+        ({"max_copies_share": 0.02}, scores(), scores(copies=(0.03, 0.0)), 0.02),
+    ],
+)
+def test_each_gate_is_kept_up_to_its_limit(gate, at_limit, above, limit):
+    (kept,), (broken,) = check(gate, at_limit), check(gate, above)
+    assert kept.passed and not broken.passed
+    assert kept.gate == next(iter(gate)) and kept.limit == broken.limit == limit
+
+
+def test_refused_frames_are_judged_by_their_share():
+    assert [check({"max_refused_share": 0.1}, [], share)[0].passed for share in (0.1, 0.11)] == [True, False]
+
+
+def test_gates_that_are_not_asked_need_no_scores():
+    assert check({}, []) == []
+
+
+@pytest.mark.parametrize(
+    ("gate", "without"),
+    [
+        ({"max_distance_ratio": 2}, ("distance", "synthetic", "fd_")),
+        ({"max_distance_ratio": 2}, ("distance", "held-out real", "fd_")),
+        ({"max_label_error_ratio": 2}, ("net", "real", "")),
+        ({"max_copies_share": 1}, ("copies", "synthetic", "close")),
+    ],
+)
+def test_a_gate_without_its_score_is_no_gate_that_was_kept(gate, without):
+    task, setting, metric = without
+    found = [
+        r for r in scores() if not (r["task"] == task and r["setting"] == setting and r["metric"].startswith(metric))
+    ]
+    with pytest.raises(DataError, match="gate"):
+        check(gate, found)
+
+
+def test_no_error_of_real_frames_leaves_no_room():
+    found = [r | {"value": 0.0} if (r["task"], r["setting"]) == ("net", "real") else r for r in scores(error=0.1)]
+    assert not check({"max_label_error_ratio": 100}, found)[0].passed
+
+
+EXPERIMENT = {
+    "name": "x",
+    **{part: {"name": "x"} for part in ("dataset", "encoding", "condition", "generator", "downstream")},
+    "num_synthetic": 1,
+    "metrics": [{"name": "x"}],
+}
+
+
+def test_a_distance_that_cannot_be_measured_is_refused_unless_it_is_not_asked_for():
+    with pytest.raises(ValidationError, match="needs a feature_extractor"):
+        Regeneration(**EXPERIMENT)
+    with pytest.raises(ValidationError, match="frechet among the distances"):
+        Regeneration(**EXPERIMENT, feature_extractor={"name": "x"}, distances=[{"name": "kid"}])
+    assert Regeneration(**EXPERIMENT, feature_extractor={"name": "x"}).gates == Gates()
+    assert Regeneration(**EXPERIMENT, gates={"max_distance_ratio": None}).new_poses
