@@ -83,6 +83,7 @@ _SOLVERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "dpm++": (DPMSolverMultistepScheduler, {"solver_order": 2}),
     "dpm++_3m": (DPMSolverMultistepScheduler, {"solver_order": 3}),
     "dpm++_sde": (DPMSolverMultistepScheduler, {"solver_order": 2, "algorithm_type": "sde-dpmsolver++"}),
+    # Of orders 2 and 3 the one with the smaller distribution error at 8 to 20 steps, with a denoiser in closed form.
     "deis": (_DEIS, {"solver_order": 3}),
     "sa_solver": (_SASolver, {"predictor_order": 3, "corrector_order": 3}),
     # The first-order DPM-Solver++ is DDIM (Lu et al., 2022), and unlike diffusers' DDIM takes uneven steps.
@@ -114,8 +115,9 @@ def make_scheduler(name: str, config: dict[str, Any], num_inference_steps: int, 
     steps = schedule.get("num_train_timesteps", 1000)
     if not 1 <= num_inference_steps <= steps:
         raise ValueError(f"the noise schedule has 1 to {steps} steps, got num_inference_steps {num_inference_steps}")
-    if spacing == "even" and num_inference_steps == steps:
-        spacing = "trailing"  # every step once; one interval less would round two to the same
+    if spacing == "even" and num_inference_steps in (1, steps):
+        # A single step must be the first, and all steps must be each once: rounding would get both wrong.
+        spacing = "trailing"
     solver, settings = _SOLVERS[name]
     if name in ("deis", "sa_solver") and schedule.pop("rescale_betas_zero_snr", False):
         schedule["trained_betas"] = _betas_without_signal(config)
@@ -125,6 +127,9 @@ def make_scheduler(name: str, config: dict[str, Any], num_inference_steps: int, 
         _take_lu_steps(scheduler, config)
     if len(scheduler.timesteps) > num_inference_steps:
         _drop_step_before_the_first(scheduler, num_inference_steps)
+    if name == "deis":
+        # In float32 its coefficients, differences of nearly equal numbers, get worse with more than 50 steps.
+        scheduler.sigmas = scheduler.sigmas.double()
     if hasattr(scheduler, "set_begin_index"):
         # Else the start is looked up by its time step, wrongly where close sigmas round to the same one.
         scheduler.set_begin_index(0)
