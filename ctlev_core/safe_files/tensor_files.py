@@ -69,6 +69,8 @@ def read_tensor_table(path: Path) -> dict[str, StoredTensor]:
         raise DataError(f"{path}: expected a weights file, got {'a folder' if path.is_dir() else 'nothing there'}")
     with path.open("rb") as file:
         head = file.read(9)
+    if head.startswith(b"version "):
+        raise DataError(f"{path}: a pointer of Git LFS, not the weights themselves; fetch them with `git lfs pull`")
     if head[:4] == b"PK\x03\x04":
         from ctlev_core.safe_files.torch_files import read_torch_table
 
