@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 
 from ctlev_core.provenance import Record, options_of, versions_of
@@ -46,7 +45,7 @@ def options_table(records: Sequence[Record]) -> Table:
             record.rows,
             record.key[:12],
             record.digest[:12],
-            ", ".join(f"{name}={json.dumps(value)}" for name, value in options_of(record).items()),
+            ", ".join(f"{name.replace('.options.', '.')}={value}" for name, value in options_of(record).items()),
         ]
         for record in records
         if record.stage not in ("score_model", "score_distance")  # one a score; in the provenance file

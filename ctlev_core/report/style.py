@@ -49,6 +49,8 @@ table { border-collapse: collapse; font-size: .92rem; line-height: 1.4; min-widt
 th, td { padding: .36rem .8rem; text-align: left; vertical-align: baseline; border-bottom: 1px solid var(--line); }
 th { padding-top: 0; border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600; }
 th:first-child, td:first-child { padding-left: 0; }
+th:first-child, td:first-child { position: sticky; left: 0; background: var(--page); }
+tbody tr:hover td:first-child { background: var(--tint); }
 td.number { white-space: nowrap; }
 .number, .number button { text-align: right; }
 tbody tr:hover { background: var(--tint); }

@@ -127,14 +127,19 @@ def render_markdown(tables: Sequence[Table], *, title: str, lead: str = "", verd
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def markdown_table(table: Table) -> str:
-    """The pipe table alone."""
+def markdown_table(table: Table, *, plain: bool = False) -> str:
+    """The pipe table alone; plain for terminals: nothing is escaped, and a star stands behind what is bold."""
     shown = format_table(table)
     if not shown.rows:
         return "No rows."
-    head = [_markdown_text(name) for name in table.columns]
+    head = list(table.columns) if plain else [_markdown_text(name) for name in table.columns]
     body = [
-        [f"**{_markdown_text(text)}**" if (y, x) in table.bold else _markdown_text(text) for x, text in enumerate(row)]
+        [f"{text}*" if (y, x) in table.bold else text for x, text in enumerate(row)]
+        if plain
+        else [
+            f"**{_markdown_text(text)}**" if (y, x) in table.bold else _markdown_text(text)
+            for x, text in enumerate(row)
+        ]
         for y, row in enumerate(shown.rows)
     ]
     widths = [max(3, *(len(row[x]) for row in [head, *body])) for x in range(len(head))]
@@ -184,7 +189,8 @@ def latex_table(table: Table, label: str, lead: str = "") -> str:
         for y, row in enumerate(shown.rows)
     ]
     texts = [_latex_text(" ".join(text.split())) for text in (table.caption, *table.footnotes, lead) if text.strip()]
-    caption = " ".join([rf"\textbf{{{_latex_text(table.title)}}}", *texts])
+    sentences = [text if text.endswith((".", "?", "!")) else f"{text}." for text in [_latex_text(table.title), *texts]]
+    caption = " ".join([rf"\textbf{{{sentences[0]}}}", *sentences[1:]])
     return "\n".join(
         [
             r"\begin{table}[t]",

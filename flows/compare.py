@@ -1,0 +1,120 @@
+"""What differs between two finished experiments: options, data, code and scores.
+
+python flows/compare.py RUN_A RUN_B [--home FOLDER]
+
+A run is the name of a report in the home, the key of a report's artefact (its first digits will do), or the path of a
+report, of its folder, or of a file in it. Of one name the newest report is in `reports`; older ones have their keys.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+from pathlib import Path
+
+from ctlev_core.report.html import render_report
+from ctlev_core.report.tables import Table, markdown_table
+from ctlev_core.run_comparison import Run, compare_runs, read_run
+from data_contracts.errors import DataError
+from flows.settings import HOME, flow
+
+
+def find_run(name: str, home: Path) -> Path:
+    """The folder with the tables of a run's report.
+
+    Raises:
+        DataError: there is no such run, or more than one.
+    """
+    path = Path(name)
+    if path.suffix == ".html" and path.is_file():
+        return path.with_suffix("")
+    for folder in (path, path.parent, home / "reports" / name):
+        if (folder / "provenance.json").is_file() and (folder != path.parent or path.is_file()):
+            return folder
+    keys = []
+    if re.fullmatch(r"[0-9a-f]{6,32}", name):
+        keys = [folder for folder in (home / "artefacts" / "report").glob(f"{name}*") if folder.is_dir()]
+    if len(keys) == 1:
+        return keys[0]
+    if keys:
+        raise DataError(f"run {name!r}: {len(keys)} reports have keys that start so; give more digits")
+    raise DataError(
+        f"run {name!r}: is neither the path of a report nor one of {home}, which has {_known(home)}; reports of "
+        "earlier versions, without provenance.json, must be made again"
+    )
+
+
+def _known(home: Path) -> str:
+    names = sorted(path.parent.name for path in (home / "reports").glob("*/provenance.json"))
+    keys = sorted(path.name[:12] for path in (home / "artefacts" / "report").glob("*") if path.is_dir())
+    return f"reports {', '.join(names) or '(none)'} and keys {', '.join(keys) or '(none)'}"
+
+
+@flow(name="compare")
+def compare(run_a: str, run_b: str, home: str | None = None) -> Path:
+    """Compare two finished experiments; write a page and return its path.
+
+    Args:
+        run_a: name, key or path of a report.
+        run_b: of another.
+        home: folder of all state; by default that of the process.
+    """
+    folder = Path(home).absolute() if home else HOME
+    return write_comparison(*_read_runs(run_a, run_b, folder), folder)[0]
+
+
+def _read_runs(run_a: str, run_b: str, home: Path) -> tuple[Run, Run]:
+    folders = [find_run(run, home) for run in (run_a, run_b)]
+    first, second = (folder.name[:12] for folder in folders)
+    return read_run(first, folders[0]), read_run(second if second != first else f"{second} (B)", folders[1])
+
+
+def write_comparison(first: Run, second: Run, home: Path) -> tuple[Path, list[Table]]:
+    """The page of a comparison, and its tables."""
+    found = compare_runs(first, second)
+    page = render_report(
+        title=f"{first.name} and {second.name}",
+        lead="Two finished experiments, and what differs between them.",
+        verdict=_summary(found),
+        sections=found,
+    )
+    names = [re.sub(r"[^A-Za-z0-9.-]+", "_", run.name).strip("_.") for run in (first, second)]
+    path = home / "reports" / f"compare_{names[0]}_{names[1]}.html"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}")
+    temporary.write_text(page, encoding="utf-8")
+    temporary.replace(path)
+    return path, found
+
+
+def _summary(found: list[Table]) -> str:
+    scores, *others = found
+    counts = ", ".join(f"{len(table.rows)} in {table.title.lower()}" for table in others)
+    compared = sum(bool(row[-1]) for row in scores.rows)
+    return f"{len(scores.bold)} of {compared} scores differ for certain. Differences: {counts}."
+
+
+def main() -> int:
+    """Exit status: 0 done, 2 a run cannot be read."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run_a", metavar="RUN_A", help="name, key or path of a report")
+    parser.add_argument("run_b", metavar="RUN_B", help="of another")
+    parser.add_argument("--home", help="folder of all state [CTLEV_HOME or .ctlev]")
+    arguments = parser.parse_args()
+    home = Path(os.environ["CTLEV_HOME"])
+    try:
+        path, found = write_comparison(*_read_runs(arguments.run_a, arguments.run_b, home), home)
+    except (DataError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print("A star: the interval excludes 0.\n")
+    for table in found:
+        print(f"{table.title}. {table.caption}\n\n{markdown_table(table, plain=True)}\n")
+    print(f"{_summary(found)}\ncomparison: {path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
