@@ -44,7 +44,7 @@ def test_the_spread_between_trainings_is_covered(count):
 
 
 def test_intervals_cover_the_truth_about_as_often_as_they_say():
-    random, covered, runs = np.random.default_rng(5), 0, 150
+    random, covered, runs = np.random.default_rng(5), 0, 60
     for run in range(runs):
         recordings = [f"r{row // 3}" for row in range(90)]
         shared = np.repeat(random.normal(0, 1, 30), 3) + random.normal(0, 1, 90)
@@ -55,13 +55,14 @@ def test_intervals_cover_the_truth_about_as_often_as_they_say():
             settings.append(trainings(shared + own + effect + seeds + random.normal(0, 0.3, (5, 90)), recordings))
         found = paired_difference(*settings, seed=run)
         covered += found.low <= -0.5 <= found.high
-    # 5 trainings and 30 recordings: a little less than 95 %; the binomial spread of 150 runs is 2 %.
-    assert 0.85 <= covered / runs <= 0.99
+    # 5 trainings and 30 recordings: a little less than 95 %; the binomial spread of 60 runs is 3 %.
+    assert 0.83 <= covered / runs <= 0.99
 
 
 def test_missing_scores_leave_the_pair_out():
     before, after = trainings([1.0, 2, 3, 4, 5, 6]), trainings([2.0, 3, np.nan, 5, 6, 7])
-    assert paired_difference(before, after) == Difference(1.0, 1.0, 1.0)
+    found = paired_difference(before, after)
+    assert (found.value, found.low, found.high) == pytest.approx((1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="none of the 2 samples"):
         paired_difference(trainings([np.nan, 1.0]), trainings([1.0, np.nan]))
 
