@@ -19,6 +19,7 @@ from prefect.logging import get_run_logger
 
 from ctlev_core.diffusion.pretraining import PretrainingOptions
 from flows import baselines as of_baselines
+from flows import compare as of_compare
 from flows import evaluate as of_evaluate
 from flows import export_events as of_export_events
 from flows import full_experiment as of_full_experiment
@@ -90,6 +91,7 @@ synthesize = _deployable(of_synthesize.synthesize)
 regenerate = _deployable(of_regenerate.regenerate, load=of_regenerate.load_regeneration)
 baselines = _deployable(of_baselines.baselines)
 evaluate = _deployable(of_evaluate.evaluate)
+compare = of_compare.compare
 export_events = _deployable(of_export_events.export_streams, publish=publish_events)
 pretrain_prior = _deployable(
     of_pretrain_prior.pretrain_prior,
