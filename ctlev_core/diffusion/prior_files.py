@@ -105,8 +105,8 @@ def find_controlnet(folder: Path, controlnet: Path | None) -> Path | None:
         return controlnet
     inside = ", ".join(sorted(path.name for path in folder.glob("controlnet*"))) if folder.is_dir() else ""
     raise DataError(
-        f"{controlnet}: the ControlNet must be a diffusers folder or a single file, but there is no such folder or "
-        f"file; those of the prior: {inside or 'none'}"
+        f"{controlnet}: the ControlNet must be a diffusers folder or a checkpoint in one file, but there is no such "
+        f"folder; those of the prior: {inside or 'none'}"
     )
 
 
