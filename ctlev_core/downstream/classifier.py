@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
 from ctlev_core.supervised_options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
 VERSION = 1
 NAME = "classifier"
-_STRIDE = 32
-"""Image px a pixel of a ResNet's last feature map."""
 
 
 class Options(SupervisedOptions):
@@ -54,8 +53,6 @@ def input_files(options: Options) -> list[Path]:
     Raises:
         DataError: one is missing, or they are of another network.
     """
-    from ctlev_core.networks.resnet_files import check_resnet_folder
-
     return check_resnet_folder(options.weights, options.architecture) if options.weights else []
 
 
@@ -163,18 +160,12 @@ def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) ->
     classes = tuple(sorted(set(labels.class_names)))
     if len(classes) < 2:
         raise DataError(f"{where}: needs at least two classes, got {', '.join(classes) or 'no rows'}")
-    if options.batch_size == 1 and max(frames.shape[1:3]) <= _STRIDE:
-        raise DataError(
-            f"{where}: images of {frames.shape[2]} x {frames.shape[1]} px leave one value a channel, which batch "
-            "normalisation cannot spread; expected a batch_size of 2 or more"
-        )
+    check_batch(options.batch_size, *frames.shape[1:3], where)
     columns = {name: column for column, name in enumerate(classes)}
     return classes, np.array([columns[name] for name in labels.class_names], dtype=np.int64)
 
 
 def _shape(options: Options) -> dict[str, Any]:
-    from ctlev_core.networks.resnet_files import ARCHITECTURES
-
     return ARCHITECTURES[options.architecture]
 
 

@@ -18,7 +18,7 @@ from pydantic import Field
 from ctlev_core.image_shifts import shift_images
 from ctlev_core.skeletons import JOINT_SETS
 from ctlev_core.supervised_options import SupervisedOptions
-from data_contracts.config import cache_material
+from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import History, Labels, check_labels
 
@@ -33,6 +33,11 @@ class Options(SupervisedOptions):
     """Network, loss, decoding and training budget."""
 
     width: float = Field(default=1.0, gt=0, description="factor on the channel counts; 1 = DHP19, 218,592 parameters")
+    weights: Path | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="DHP19's published network (DHP_CNN.model, a Keras file) to start from; null = random weights",
+    )
     batch_norm: bool = Field(default=False, description="normalise after each convolution; DHP19 does not")
     output_stride: Literal[1, 2] = Field(
         default=1, description="2 = heatmaps of half the size, about 40 % faster; DHP19: 1"
@@ -56,6 +61,25 @@ class Options(SupervisedOptions):
     shift_px: int = Field(
         default=0, ge=0, description="move training images by up to so many px in x and y; black moves in"
     )
+
+
+def input_files(options: Options) -> list[Path]:
+    """The published weights to start from, if any.
+
+    Raises:
+        DataError: the file is missing, or the options are not those of the published network.
+    """
+    if options.weights is None:
+        return []
+    got = options.width, options.batch_norm, options.output_stride
+    if got != (1.0, False, 1):
+        raise DataError(
+            f"{options.weights}: DHP19's weights need width 1, batch_norm false and output_stride 1, got {got[0]:g}, "
+            f"{str(got[1]).lower()} and {got[2]}"
+        )
+    if not options.weights.is_file():
+        raise DataError(f"weights {options.weights}: expected a Keras file, found none")
+    return [options.weights]
 
 
 def train(
@@ -83,17 +107,22 @@ def train(
     Returns:
         The training loss per logged step, and the loss of rows held back.
     Raises:
-        DataError: shapes disagree, or no joint of any row is visible inside the image.
+        DataError: shapes disagree, no joint of any row is visible inside the image, or the weights do not fit.
     """
     from ctlev_core import supervised
+    from ctlev_core.networks.dhp19 import load_published
     from ctlev_core.supervised_training import train_model
     from ctlev_core.training_rows import plan_rows
 
     joints2d, visible = _check_training_set(frames, labels, options)
+    weights = supervised.file_digests(input_files(options))
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
     grey = _grey(frames)
     device = supervised.resolve_device(options.device)
-    model = supervised.build_seeded(lambda: _build(joints2d.shape[1], options), seed).to(device)
+    model: Any = supervised.build_seeded(lambda: _build(joints2d.shape[1], options), seed)
+    if options.weights:
+        load_published(model, options.weights)
+    model.to(device)
     mirror = JOINT_SETS[labels.joint_set].mirror if options.flip else None
 
     def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
@@ -117,7 +146,7 @@ def train(
         options,
         seed=seed,
         work=work,
-        run_digest=supervised.digest(NAME, VERSION, cache_material(options), seed, grey, joints2d, visible),
+        run_digest=supervised.digest(NAME, VERSION, cache_material(options), weights, seed, grey, joints2d, visible),
         description="train pose2d",
     )
     supervised.write_model(
@@ -129,6 +158,7 @@ def train(
             "joint_set": labels.joint_set,
             "num_joints": joints2d.shape[1],
             "options": cache_material(options),
+            "weights": weights,
             "training": record,
         },
     )

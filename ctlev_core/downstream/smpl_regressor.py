@@ -15,9 +15,10 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.image_shifts import shift_images
+from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
 from ctlev_core.skeletons import JOINT_SETS, joint_indices
 from ctlev_core.supervised_options import SupervisedOptions
-from data_contracts.config import cache_material
+from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import History, Labels, check_labels
 
@@ -33,6 +34,12 @@ class Options(SupervisedOptions):
 
     architecture: Literal["resnet10-quarter", "resnet10-half", "resnet18", "resnet34"] = Field(
         default="resnet10-quarter", description="Event-HPE's is a ResNet-50"
+    )
+    weights: Path | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="local folder (config.json, model.safetensors) of a published ResNet of this architecture to start "
+        "from; null = random weights",
     )
     pool_grid: int = Field(default=2, ge=1, description="features are averaged over so many cells a side; Event-HPE: 1")
     head_width: int = Field(default=256, ge=0, description="hidden units of the head, 0 = linear")
@@ -56,6 +63,15 @@ class _TrainingSet(NamedTuple):
     betas: np.ndarray
     transl: np.ndarray
     intrinsics: np.ndarray
+
+
+def input_files(options: Options) -> list[Path]:
+    """The files of the published ResNet to start from, if any.
+
+    Raises:
+        DataError: one is missing, or they are of another network.
+    """
+    return check_resnet_folder(options.weights, options.architecture) if options.weights else []
 
 
 def train(
@@ -83,20 +99,26 @@ def train(
     Returns:
         The training loss per logged step, and the loss of rows held back.
     Raises:
-        DataError: numbers of rows disagree, or the labels have no SMPL parameters or no intrinsics.
+        DataError: numbers of rows disagree, the labels have no SMPL parameters or no intrinsics, or the weights do not
+            fit.
     """
     import torch
 
     from ctlev_core import supervised
     from ctlev_core.body.layer import load_body
     from ctlev_core.body.torch_layer import BodyLayer
+    from ctlev_core.networks.resnet import load_backbone
     from ctlev_core.supervised_training import train_model
     from ctlev_core.training_rows import plan_rows
 
     data = _check_training_set(frames, labels)
+    check_batch(options.batch_size, *frames.shape[1:3], f"train {NAME}")
+    weights = supervised.file_digests(input_files(options))
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
     device = supervised.resolve_device(options.device)
     model: Any = supervised.build_seeded(lambda: _build(options), seed)
+    if options.weights:
+        load_backbone(model.network, options.weights)
     model.start_from(*(torch.from_numpy(array).float() for array in (data.rotations, data.betas, data.transl)))
     model.to(device)
     body = BodyLayer(load_body()).to(device)
@@ -120,7 +142,7 @@ def train(
         options,
         seed=seed,
         work=work,
-        run_digest=supervised.digest(NAME, VERSION, cache_material(options), seed, *data),
+        run_digest=supervised.digest(NAME, VERSION, cache_material(options), weights, seed, *data),
         description="train smpl_regressor",
     )
     config = {
@@ -129,6 +151,7 @@ def train(
         "joint_set": labels.joint_set or "smpl",
         "intrinsics_px": np.mean(data.intrinsics, axis=0, dtype=np.float64).tolist(),
         "options": cache_material(options),
+        "weights": weights,
         "training": record,
     }
     supervised.write_model(out, model, config)
@@ -200,7 +223,6 @@ def _check_training_set(frames: np.ndarray, labels: Labels) -> _TrainingSet:
 
 
 def _build(options: Options) -> Any:
-    from ctlev_core.networks.resnet_files import ARCHITECTURES
     from ctlev_core.networks.smpl_regressor import SmplRegressor
 
     return SmplRegressor(ARCHITECTURES[options.architecture], options.pool_grid, options.head_width)

@@ -7,10 +7,14 @@ seventeen 3 x 3 convolutions without bias, ReLU after every one of them, the las
 from __future__ import annotations
 
 from collections import OrderedDict
+from pathlib import Path
 
 import torch
 from torch import nn
 from torch.nn import functional
+
+from ctlev_core.networks.dhp19_weights import read_keras_weights
+from data_contracts.errors import DataError
 
 # Name, channels at width 1, dilation. `pool` halves the image, `up` doubles it by a transposed convolution.
 LAYERS: tuple[tuple[str, int, int], ...] = (
@@ -93,3 +97,20 @@ class DHP19Network(nn.Module):
         padded = functional.pad(images, (0, -width % DOWNSAMPLING, 0, -height % DOWNSAMPLING))
         heatmaps = self.layers(padded)
         return heatmaps[..., : -(-height // self.output_stride), : -(-width // self.output_stride)]
+
+
+def load_published(network: DHP19Network, path: Path) -> None:
+    """Take over the weights of the published Keras file.
+
+    Raises:
+        DataError: the file cannot be read, or its layers are not those of `network`.
+    """
+    found = {f"layers.{name}.weight": torch.from_numpy(kernel) for name, kernel in read_keras_weights(path).items()}
+    expected = network.state_dict()
+    if set(found) != set(expected):
+        odd = sorted(set(found) ^ set(expected))
+        raise DataError(f"{path}: expected the layers of DHP19's network, differs in {', '.join(odd[:3])}")
+    for name, tensor in expected.items():
+        if found[name].shape != tensor.shape:
+            raise DataError(f"{path}: {name} must be {list(tensor.shape)}, got {list(found[name].shape)}")
+    network.load_state_dict(found)

@@ -19,6 +19,8 @@ ARCHITECTURES: dict[str, dict[str, Any]] = {
     "resnet34": {"depths": [3, 4, 6, 3], "hidden_sizes": [64, 128, 256, 512], "embedding_size": 64},
 }
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
+STRIDE = 32
+"""Image px a pixel of the last feature map."""
 # What a config leaves out has these values in transformers.
 _OTHERS: dict[str, Any] = {
     "layer_type": "bottleneck",
@@ -27,6 +29,15 @@ _OTHERS: dict[str, Any] = {
     "downsample_in_first_stage": False,
 }
 _WANTED = {"layer_type": "basic", "hidden_act": "relu", "num_channels": 3, "downsample_in_first_stage": False}
+
+
+def check_batch(batch_size: int, height: int, width: int, where: str) -> None:
+    """Raise `DataError` where a ResNet would have one value a channel and batch to normalise, of which none is left."""
+    if batch_size == 1 and max(height, width) <= STRIDE:
+        raise DataError(
+            f"{where}: one image of {width} x {height} px has one value a channel in the last feature map, which batch "
+            "normalisation cannot spread; expected a batch_size of 2 or more"
+        )
 
 
 def check_resnet_folder(folder: Path, architecture: str) -> list[Path]:

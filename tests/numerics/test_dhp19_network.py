@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core.networks.dhp19 import LAYERS, DHP19Network
+from ctlev_core.networks.dhp19 import LAYERS, DHP19Network, load_published
 
 REAL_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "real"
 PUBLISHED_WEIGHTS = REAL_DATA / "dhp19_cnn" / "DHP_CNN.h5"
@@ -59,11 +59,7 @@ def forward(image: np.ndarray, kernels: dict[str, np.ndarray]) -> np.ndarray:
 def test_published_weights_give_the_heatmaps_of_a_slow_forward_pass():
     kernels = read_kernels()
     network = DHP19Network()
-    state = {}
-    for name, kernel in kernels.items():
-        # Both orders end in (rows, columns) first; PyTorch keeps (out, in) for one and (in, out) for the other.
-        state[f"layers.{name}.weight"] = torch.from_numpy(kernel.transpose(3, 2, 0, 1).copy()).float()
-    network.load_state_dict(state)
+    load_published(network, PUBLISHED_WEIGHTS)
     image = np.zeros((36, 28))
     image[6:30, 10:16] = np.random.default_rng(0).random((24, 6))
     expected = forward(image, kernels)
