@@ -151,7 +151,9 @@ def _judge(regeneration: Regeneration, checkpoint: ManifestRef, made: MadeVersio
     """The record of a version: what it is, what it was made from, its scores, and how it kept the gates."""
     rows = [row for ref in made.scores for row in read_manifest(ref).table.to_pylist()]
     refusals = count_refusals(read_manifest(made.synthetic))
-    scores = {f"{row['setting']}, {row['group']}: {row['metric']}": row["value"] for row in rows}
+    # Those of single classes are in the artefacts.
+    told = [row for row in rows if row["group"] == "all" or row["task"] == "copies"]
+    scores = {f"{row['setting']}, {row['group']}: {row['metric']}": row["value"] for row in told}
     scores["sampled again"], scores["refused"] = refusals.num_again, refusals.num_refused
     return Version(
         experiment=regeneration.name,

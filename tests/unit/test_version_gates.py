@@ -97,12 +97,13 @@ EXPERIMENT = {
     "num_synthetic": 1,
     "metrics": [{"name": "x"}],
 }
+WITH_FEATURES = EXPERIMENT | {"feature_extractor": {"name": "x"}}
 
 
 def test_a_distance_that_cannot_be_measured_is_refused_unless_it_is_not_asked_for():
     with pytest.raises(ValidationError, match="needs a feature_extractor"):
-        Regeneration(**EXPERIMENT)
+        Regeneration.model_validate(EXPERIMENT)
     with pytest.raises(ValidationError, match="frechet among the distances"):
-        Regeneration(**EXPERIMENT, feature_extractor={"name": "x"}, distances=[{"name": "kid"}])
-    assert Regeneration(**EXPERIMENT, feature_extractor={"name": "x"}).gates == Gates()
-    assert Regeneration(**EXPERIMENT, gates={"max_distance_ratio": None}).new_poses
+        Regeneration.model_validate(WITH_FEATURES | {"distances": [{"name": "kid"}]})
+    assert Regeneration.model_validate(WITH_FEATURES).gates == Gates()
+    assert Regeneration.model_validate(EXPERIMENT | {"gates": {"max_distance_ratio": None}}).new_poses
