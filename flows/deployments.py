@@ -26,6 +26,7 @@ from flows import full_experiment as of_full_experiment
 from flows import prepare_dataset as of_prepare_dataset
 from flows import pretrain_prior as of_pretrain_prior
 from flows import regenerate as of_regenerate
+from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
 from flows.command_line import PRESETS, check_home, load_experiment, load_preset, use_cores
@@ -33,6 +34,7 @@ from flows.settings import HOME, flow
 from tasks.contact_sheet import publish_contact_sheet
 from tasks.export_events import publish_events
 from tasks.report import publish_report
+from tasks.speed_vs_error import publish_speed_report
 from tasks.stage import planning
 
 _ARGUMENTS = """
@@ -93,6 +95,9 @@ baselines = _deployable(of_baselines.baselines)
 evaluate = _deployable(of_evaluate.evaluate)
 compare = of_compare.compare
 export_events = _deployable(of_export_events.export_streams, publish=publish_events)
+speed_vs_error = _deployable(
+    of_speed_vs_error.speed_vs_error, load=of_speed_vs_error.load_speed_vs_error, publish=publish_speed_report
+)
 pretrain_prior = _deployable(
     of_pretrain_prior.pretrain_prior,
     default_preset="small_prior",
