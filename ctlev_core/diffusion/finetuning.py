@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
-from ctlev_core.diffusion.latent_cache import cache_latents, check_cache, check_training_data, check_weights
+from ctlev_core.diffusion.latent_cache import cache_latents, check_cache, check_training_data
 from ctlev_core.diffusion.prior import Prior
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.sampling import sample_frames
@@ -80,11 +80,10 @@ def fine_tune(
     Returns:
         Loss curves; `shuffled_loss` is the validation loss with the conditions of other frames.
     Raises:
-        ValueError: frames and conditions do not fit the prior or one another, weights or latents are not finite, or
-            options do not fit one another.
+        ValueError: frames and conditions do not fit the prior or one another, latents are not finite, or options do
+            not fit one another.
     """
     check_training_data(frames, conditions, prior.image_size)
-    check_weights(prior)
     device = prior.unet.device
     cache = cache_latents(prior, frames, conditions, class_names)
     check_cache(cache, conditions)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,8 +15,6 @@ from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 
 ENCODE_BATCH = 32
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +78,6 @@ def cache_latents(
             if hasattr(posterior, "std"):
                 deviations.append(posterior.std.float().cpu())
     prompts = sorted(set(conditions.prompts))
-    warn_of_long_prompts(prior, prompts)
     position = {prompt: row for row, prompt in enumerate(prompts)}
     return LatentCache(
         mean=torch.cat(means),
@@ -120,15 +116,6 @@ def check_training_data(frames: np.ndarray, conditions: Conditions, image_size: 
         raise DataError("fine-tuning needs at least one frame, got none")
 
 
-def check_weights(prior: Prior) -> None:
-    """Raise `DataError` naming the first weight of the prior that is not finite: every loss would be NaN."""
-    for name in ("text_encoder", "vae", "unet", "controlnet"):
-        network = getattr(prior, name)
-        for key, value in network.state_dict().items() if network is not None else ():
-            if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-                raise DataError(f"the prior's {name} has weights that are not finite in {key}; fetch or train it anew")
-
-
 def check_cache(cache: LatentCache, conditions: Conditions) -> None:
     """Raise `DataError` naming the first frame or prompt whose latents or embedding are not finite."""
     for name, values in (("mean", cache.mean), ("standard deviation", cache.std)):
@@ -144,19 +131,3 @@ def check_cache(cache: LatentCache, conditions: Conditions) -> None:
         row = int(wrong.nonzero()[0])
         prompt = [*sorted(set(conditions.prompts)), ""][row]
         raise DataError(f"prompt {prompt!r}: its embedding is not finite; check the prior's text encoder")
-
-
-def warn_of_long_prompts(prior: Prior, prompts: Sequence[str]) -> None:
-    """Name the prompts that the tokenizer cuts off, as `encode_prompts` and diffusers do: their ends are not heeded."""
-    limit = prior.tokenizer.model_max_length
-    lengths = [len(tokens) for tokens in prior.tokenizer(list(prompts), truncation=False)["input_ids"]]
-    long = [position for position, length in enumerate(lengths) if length > limit]
-    if long:
-        kept = prior.tokenizer.decode(
-            prior.tokenizer(prompts[long[0]], truncation=True, max_length=limit)["input_ids"], skip_special_tokens=True
-        )
-        logger.warning(
-            "%d of %d prompts are longer than the tokenizer's limit of %d tokens and are cut off; the first is %r with "
-            "%d tokens, of which %r is left",
-            len(long), len(prompts), limit, prompts[long[0]], lengths[long[0]], kept,
-        )  # fmt: skip

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from ctlev_core.diffusion.acceleration import accelerated, autocast, check_precision
@@ -168,5 +169,6 @@ def _validate(trainer: Trainer, validate: Callable[[], tuple[float, float]], log
 def _draw(trainer: Trainer, draw: Callable[[], np.ndarray] | None, log: TrainingLog, ranks: Ranks) -> None:
     every = trainer.options.sample_every
     if draw is not None and every and trainer.step % every == 0 and ranks.rank == 0:
-        with trainer.using_average():
+        # Sampling swaps a part of the ControlNet and has other shapes: to compile that anew would take minutes.
+        with trainer.using_average(), torch.compiler.set_stance("force_eager"):
             log.picture(trainer.step, draw())

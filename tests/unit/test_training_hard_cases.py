@@ -1,0 +1,155 @@
+"""What is wrong with data, prior or gradients is named, and nothing of it gets into the weights."""
+
+import dataclasses
+import logging
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+from tiny_prior import CORPUS, make_data, make_prior, shared_prior
+
+from ctlev_core.diffusion import trainer
+from ctlev_core.diffusion.checkpoint_training import train_checkpoint
+from ctlev_core.diffusion.finetuning import fine_tune
+from ctlev_core.diffusion.latent_cache import cache_latents
+from ctlev_core.diffusion.prior import encode_prompts, save_prior
+from ctlev_core.diffusion.training_options import FineTuningOptions
+from data_contracts.errors import DataError, TrainingError
+from data_contracts.labels import Conditions
+
+OPTIONS = FineTuningOptions(num_steps=4, batch_size=2, warmup_steps=1, log_every=1, num_validation=0, ema_decay=0.5)
+FRAMES, CONDITIONS = make_data(4)
+
+
+def tuned(work, prior=None, frames=FRAMES, conditions=CONDITIONS, options=OPTIONS):
+    prior = prior or make_prior()
+    return prior, fine_tune(prior, frames, conditions, options, tune="both", seed=0, work=work)
+
+
+def finite(prior):
+    parameters = [*prior.unet.parameters(), *prior.controlnet.parameters()]
+    return all(bool(torch.isfinite(value).all()) for value in parameters)
+
+
+@pytest.mark.parametrize("network", ["unet", "controlnet", "vae", "text_encoder"])
+def test_weights_of_the_prior_that_are_not_finite_are_named(tmp_path, network):
+    prior = make_prior()
+    key, tensor = next((key, tensor) for key, tensor in getattr(prior, network).state_dict().items() if tensor.ndim)
+    tensor.view(-1)[-1] = math.nan
+    save_prior(prior, tmp_path / "prior")
+    options = OPTIONS.model_copy(update={"prior": tmp_path / "prior"})
+    folders = {"out": tmp_path / "out", "work": tmp_path / "work"}
+    with pytest.raises(DataError, match=rf"{network}.*{re.escape(key)}.* not finite"):
+        train_checkpoint(FRAMES, CONDITIONS, options, tune="both", with_controlnet=True, seed=0, **folders)
+    assert not any(folder.exists() for folder in folders.values())
+
+
+def test_latents_that_are_not_finite_name_their_frame(tmp_path):
+    """Half-precision autoencoders overflow on saturated frames; the weights are all finite then."""
+    prior = make_prior()
+    frames = FRAMES.copy()
+    frames[2] = 255
+    encode = prior.vae.encode
+
+    def overflowing(images):
+        posterior = encode(images)
+        saturated = (images == 1).flatten(1).all(dim=1)
+        posterior.latent_dist.mean[saturated, 0, 0, 0] = math.inf
+        return posterior
+
+    prior.vae.encode = overflowing
+    with pytest.raises(DataError, match="frame 2 of 4: the mean of its latents must be finite"):
+        tuned(tmp_path, prior, frames)
+
+
+def test_embeddings_that_are_not_finite_name_their_prompt(tmp_path, monkeypatch):
+    from ctlev_core.diffusion import latent_cache
+
+    def broken(prior, prompts):
+        embeddings = encode_prompts(prior, prompts)
+        embeddings[prompts.index("a photo of a cup"), 0, 0] = math.nan
+        return embeddings
+
+    monkeypatch.setattr(latent_cache, "encode_prompts", broken)
+    with pytest.raises(DataError, match="prompt 'a photo of a cup': its embedding is not finite"):
+        tuned(tmp_path)
+
+
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_a_single_image_can_be_learnt(tmp_path, batch_size):
+    options = OPTIONS.model_copy(
+        update={"num_steps": 40, "batch_size": batch_size, "num_validation": 8, "learning_rate": 3e-3}
+    )
+    prior, history = tuned(tmp_path, frames=FRAMES[:1], conditions=CONDITIONS.take(slice(0, 1)), options=options)
+    assert finite(prior) and history.validation_loss == []  # no frame is left to be held back
+    assert np.mean(history.loss[-10:]) < np.mean(history.loss[:10])
+
+
+def test_prompts_beyond_the_tokenizers_limit_are_cut_off_and_named(caplog):
+    prior = shared_prior()
+    limit = prior.tokenizer.model_max_length
+    long = "a photo of a cup " * limit
+    with caplog.at_level(logging.WARNING):
+        cache = cache_latents(prior, FRAMES[:2], Conditions((long, "a photo of a ball")))
+    (record,) = caplog.records
+    assert repr(long) in record.getMessage() and f"cut to {limit}" in record.getMessage()
+    # A word is a token here, and two are taken by the marks around them.
+    kept = " ".join(long.split()[: limit - 2])
+    ordered = sorted([long, "a photo of a ball"])
+    torch.testing.assert_close(cache.embeddings[ordered.index(long)], encode_prompts(prior, [kept])[0])
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        cache_latents(prior, FRAMES[:2], Conditions(CORPUS[:2]))
+    assert not caplog.records
+
+
+def overflow_at(monkeypatch, steps):
+    """One gradient becomes infinite at the given steps; the loss stays finite."""
+    original = trainer.Trainer.update
+
+    def update(self, progress):
+        if self.step in steps:
+            self.parameters[0].grad.view(-1)[0] = math.inf
+        return original(self, progress)
+
+    monkeypatch.setattr(trainer.Trainer, "update", update)
+
+
+def test_a_gradient_that_overflows_changes_nothing(tmp_path, monkeypatch):
+    steps = OPTIONS.model_copy(update={"num_steps": 3})
+    with monkeypatch.context() as patch:
+        overflow_at(patch, {0, 2})
+        prior, history = tuned(tmp_path / "some", options=steps)
+    assert finite(prior)
+    assert [math.isfinite(loss) for loss in history.loss] == [False, True, False]
+    state = torch.load(tmp_path / "some" / "state.pt", weights_only=True)
+    assert state["skipped"] == 2 and state["non_finite"] == 1
+    # Adam counts the steps it made: one.
+    assert {int(value["step"]) for value in state["optimizer"]["state"].values()} == {1}
+
+
+def test_gradients_that_always_overflow_end_the_run(tmp_path, monkeypatch):
+    overflow_at(monkeypatch, set(range(30)))
+    with pytest.raises(TrainingError, match="gradient was not finite 10 times in a row, the last at step 9"):
+        tuned(tmp_path, options=OPTIONS.model_copy(update={"num_steps": 30}))
+
+
+def test_ten_in_a_row_are_counted_across_a_kill(tmp_path, monkeypatch):
+    """Otherwise a run that is killed again and again would never say that it learns nothing."""
+    overflow_at(monkeypatch, set(range(30)))
+    first = OPTIONS.model_copy(update={"num_steps": 30, "checkpoint_every_s": 1e-9})
+    with pytest.raises(TrainingError, match="the last at step 9"):
+        tuned(tmp_path, options=first)
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    assert state["step"] == 9 and state["non_finite"] == 9
+    with pytest.raises(TrainingError, match="10 times in a row, the last at step 9"):
+        tuned(tmp_path, options=first)
+
+
+def test_empty_and_saturated_frames_can_be_learnt(tmp_path):
+    frames = FRAMES.copy()
+    frames[0], frames[1] = 0, 255
+    prior, history = tuned(tmp_path, frames=frames, conditions=dataclasses.replace(CONDITIONS, images=frames))
+    assert finite(prior) and all(math.isfinite(loss) for loss in history.loss)

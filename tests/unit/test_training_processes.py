@@ -1,0 +1,116 @@
+"""Processes that train together end where one alone does."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_prior import make_data, make_prior
+
+from ctlev_core.diffusion.checkpoint_training import child_environment, train_checkpoint
+from ctlev_core.diffusion.prior import load_prior, save_prior
+from ctlev_core.diffusion.ranks import Ranks
+from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.generators import controlnet
+from data_contracts.errors import TrainingError
+
+OPTIONS = FineTuningOptions(
+    num_steps=4, batch_size=2, gradient_accumulation=4, warmup_steps=1, log_every=2, num_validation=4, ema_decay=0.5,
+    validation_every=2, keep="best", device="cpu",
+)  # fmt: skip
+
+
+def trained(folder, prior, options, tune="both"):
+    frames, conditions = make_data(40)
+    return train_checkpoint(
+        frames,
+        conditions,
+        options.model_copy(update={"prior": prior}),
+        tune=tune,
+        with_controlnet=True,
+        seed=5,
+        out=folder / "out",
+        work=folder / "work",
+    )
+
+
+@pytest.fixture(scope="module")
+def prior_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prior")
+    save_prior(make_prior(), folder)
+    return folder
+
+
+@given(st.integers(1, 9), st.integers(1, 9))
+def test_every_batch_of_a_step_is_one_processs(count, share):
+    shares = [Ranks(rank, count).batches(count * share) for rank in range(count)]
+    assert sorted(number for each in shares for number in each) == list(range(count * share))
+    assert {len(each) for each in shares} == {share}
+
+
+def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder):
+    alone = trained(tmp_path / "alone", prior_folder, OPTIONS)
+    together = trained(tmp_path / "together", prior_folder, OPTIONS.model_copy(update={"num_processes": 2}))
+    one, two = (load_prior(tmp_path / name / "out") for name in ("alone", "together"))
+    start = load_prior(prior_folder)
+    for name in ("unet", "controlnet"):
+        states = [getattr(prior, name).state_dict() for prior in (one, two, start)]
+        for key, value in states[0].items():
+            # Sums in another order. Adam divides by the gradient's size, which makes more of rounding where that is 0.
+            torch.testing.assert_close(
+                value, states[1][key], rtol=0, atol=1e-5, msg=lambda text, key=key: f"{key} {text}"
+            )
+        assert max((states[0][key] - states[2][key]).abs().max().item() for key in states[0]) > 1e-3
+    assert together.step == alone.step and together.kept_step == alone.kept_step
+    for name in ("loss", "validation_loss", "shuffled_loss"):
+        np.testing.assert_allclose(getattr(together, name), getattr(alone, name), rtol=1e-4)
+    # The state is that of the run, not of its processes: one alone takes it up, and finds it finished.
+    again = trained(tmp_path / "together", prior_folder, OPTIONS)
+    assert vars(again) == vars(together)
+
+
+@pytest.mark.slow
+def test_failure_of_a_process_is_reported(tmp_path):
+    prior = make_prior()
+    with torch.no_grad():
+        prior.unet.conv_in.weight[0] = torch.nan
+    save_prior(prior, tmp_path / "prior")
+    with pytest.raises(TrainingError, match=r"in 2 processes failed: process \d: .*'conv_in.weight'.* not finite"):
+        trained(tmp_path, tmp_path / "prior", OPTIONS.model_copy(update={"num_processes": 2}))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"num_processes": 3}, "gradient_accumulation must be a multiple of the 3 processes.*got 4; halve batch_size"),
+        ({"num_processes": 2, "device": "cuda:1"}, "device must be auto, cuda or cpu with 2 processes.*got 'cuda:1'"),
+    ],
+)
+def test_what_processes_cannot_share_is_refused_before_they_start(tmp_path, prior_folder, changed, message):
+    with pytest.raises(ValueError, match=message):
+        trained(tmp_path, prior_folder, OPTIONS.model_copy(update=changed))
+    assert not (tmp_path / "work").exists()
+
+
+def test_an_outer_launcher_says_how_many(tmp_path, prior_folder, monkeypatch):
+    """`accelerate launch --num_processes 3 flows/train_generator.py ...` is asked for three here too."""
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
+    with pytest.raises(ValueError, match="a multiple of the 3 processes"):
+        trained(tmp_path, prior_folder, OPTIONS)
+
+
+def test_children_hear_nothing_of_an_outer_launcher():
+    outer = {"RANK": "1", "MASTER_PORT": "29500", "TORCHELASTIC_RUN_ID": "x", "GROUP_RANK": "0", "HOME": "/home/me"}
+    inner = child_environment({**outer, "ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "3"}, 2)
+    assert not set(inner) & (set(outer) - {"HOME"})
+    assert inner["HOME"] == "/home/me" and inner["ACCELERATE_USE_CPU"] == "true" and inner["OMP_NUM_THREADS"] == "3"
+
+
+def test_the_number_of_processes_is_no_part_of_a_result():
+    from data_contracts.config import cache_material
+
+    plain, shared = (cache_material(controlnet.Options(num_processes=count)) for count in (None, 4))
+    assert json.dumps(plain) == json.dumps(shared)
