@@ -11,7 +11,7 @@ from ctlev_core.report.html import Curves
 
 REFERENCE_LINE, CONVERGED_LINE = "reference", "converged"
 """Names of the settings that others are compared with."""
-_BAND_BARS = 90
+_BAND_BARS = 60
 """Bars that a band is hatched with."""
 _LOG_RANGE = 5.0
 """From this ratio of its largest to its smallest value on, a chart's y axis is logarithmic."""
