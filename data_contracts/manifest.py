@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from data_contracts.config import Frozen
-from data_contracts.errors import DataError
+from data_contracts.errors import DataError, TableVersionError
 from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, History, Labels
 from data_contracts.tables import TABLES, TableSchema, check_table
 
@@ -134,7 +134,8 @@ def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
         full: hash every file again; otherwise the manifest is hashed and the other files are checked by size.
 
     Raises:
-        DataError: a file is missing or has changed, or the schema version is not the one this code reads.
+        DataError: a file is missing or has changed.
+        TableVersionError: the table has another version than the one this code reads.
     """
     path = ref.path / MANIFEST_FILE
     if not path.is_file():
@@ -148,9 +149,11 @@ def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
         raise DataError(f"{path}: is not a ctlev manifest; its metadata names no schema")
     declared = json.loads(metadata[_SCHEMA_KEY])
     schema = TABLES.get(declared["name"])
-    if schema is None or schema.version != declared["version"]:
-        known = f"version {schema.version}" if schema else f"one of {sorted(TABLES)}"
-        raise DataError(f"{path}: table {declared['name']!r} version {declared['version']}; this code reads {known}")
+    if schema is None:
+        raise DataError(f"{path}: table {declared['name']!r}; this code reads {sorted(TABLES)}")
+    if schema.version != declared["version"]:
+        found = f"table {declared['name']!r} version {declared['version']}"
+        raise TableVersionError(f"{path}: {found}; this code reads version {schema.version}")
     files = json.loads(metadata[_FILES_KEY])
     for name, expected in files.items():
         _check_file(ref.path / name, expected, full)

@@ -11,18 +11,22 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from data_contracts.errors import DataError, TableVersionError
+from data_contracts.published import kept_versions
 from tasks.store import Store, home_folder
 
 
 def verify(store: Store) -> tuple[int, int]:
     """Check every artefact; damaged ones are moved, never deleted.
 
+    Artefacts of tables of another version stay: no run of this code looks for them, and what it needs it makes anew.
+
     Returns:
-        How many are damaged, and how many cannot be read or moved.
+        How many are damaged, or missing though published; and how many cannot be read or moved.
     """
     store.use()
     artefacts = store.artefacts()
-    damaged = failed = 0
+    damaged = outdated = failed = 0
     with tqdm(total=sum(item.size_bytes for item in artefacts), unit="B", unit_scale=True, desc="verify") as progress:
         for item in artefacts:
             try:
@@ -30,6 +34,9 @@ def verify(store: Store) -> tuple[int, int]:
             except PermissionError as error:
                 failed += 1
                 tqdm.write(f"error: {item.name}: cannot be read: {error}", file=sys.stderr)
+            except TableVersionError as error:
+                outdated += 1
+                tqdm.write(f"outdated, made anew when needed: {item.name}: {error}")
             except (ValueError, OSError) as error:
                 damaged += 1
                 tqdm.write(f"damaged: {item.name}: {error}")
@@ -39,12 +46,30 @@ def verify(store: Store) -> tuple[int, int]:
                     failed += 1
                     tqdm.write(f"error: {item.name}: is damaged and cannot be set aside: {cause}", file=sys.stderr)
             progress.update(item.size_bytes)
-    print(f"{len(artefacts)} artefacts, {damaged} of them damaged" + ("; run the flow again" if damaged else ""))
-    return damaged, failed
+    counted = f"{len(artefacts)} artefacts, {damaged} of them damaged" + (f", {outdated} outdated" if outdated else "")
+    print(counted + ("; run the flow again" if damaged else ""))
+    return damaged + _check_latest(store), failed
+
+
+def _check_latest(store: Store) -> int:
+    """How many latest versions of synthetic data refer to something that is not there, or have a damaged record."""
+    try:
+        latest = kept_versions(store.home, 0)
+    except DataError as error:
+        print(f"damaged: {error}")
+        return 1
+    broken = 0
+    for version in latest:
+        missing = [a for a in version.artefacts if not store.folder(a.stage, a.key).is_dir()]
+        broken += bool(missing)
+        for artefact in missing:
+            where = f"{artefact.stage}/{artefact.key}"
+            print(f"missing: {where} of the latest data, {version}; make the next with flows/regenerate.py")
+    return broken
 
 
 def main() -> int:
-    """Exit status: 0 all is whole, 1 something was damaged, 2 something could not be checked or set aside."""
+    """Exit status: 0 all is whole, 1 something was damaged or missing, 2 something cannot be checked or set aside."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--home", type=Path, help="folder of all state [CTLEV_HOME or .ctlev]")
     home = (parser.parse_args().home or home_folder()).absolute()

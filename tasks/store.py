@@ -177,6 +177,7 @@ class Store:
 
         Raises:
             DataError: it is damaged: a file is missing or has changed, or is a link to something outside the artefact.
+            TableVersionError: it is of an older or newer version of the code; its files were not hashed.
             OSError: it cannot be read.
         """
         try:

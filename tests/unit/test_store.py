@@ -9,6 +9,7 @@ import tempfile
 import textwrap
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,9 @@ from hypothesis import strategies as st
 from data_contracts import tables
 from data_contracts.errors import DataError
 from data_contracts.manifest import write_manifest
+from data_contracts.published import StoredArtefact, Version, published_folder, write_latest, write_version
+from data_contracts.regeneration import Gates
+from data_contracts.tables import TABLES
 from flows import prune, verify
 from tasks.store import RawFileDigests, Store, StoreInUseError
 
@@ -313,6 +317,81 @@ def test_damage_is_found_and_set_aside_and_the_rest_stays(tmp_path, monkeypatch,
     assert sorted(path.name for path in moved.rglob("*")) == left
     assert store.find("encode", damaged.name) is None
     assert command(verify, monkeypatch, home) == 0
+
+
+@pytest.mark.parametrize("by", [-1, 1])
+def test_what_another_version_of_the_code_wrote_is_no_damage_and_stays(tmp_path, monkeypatch, capsys, by):
+    store = Store(tmp_path)
+    other = replace(tables.TRAINING, version=tables.TRAINING.version + by)
+    with monkeypatch.context() as patch:
+        patch.setitem(TABLES, other.name, other)
+        patch.setattr(tables, "TRAINING", other)
+        folder = add(store, 1)
+    add(store, 2)
+    assert command(verify, monkeypatch, tmp_path) == 0
+    output = capsys.readouterr().out
+    assert f"outdated, made anew when needed: encode/{folder.name}: " in output and "damaged:" not in output
+    assert "2 artefacts, 0 of them damaged, 1 outdated" in output
+    assert folder.exists() and not (tmp_path / "damaged").exists()
+
+
+def publish(store, number, folder, *others):
+    """A record of synthetic data that refers to artefacts."""
+    artefacts = [
+        StoredArtefact(stage=path.parent.name, key=path.name, digest="0" * 64, rows=2) for path in (folder, *others)
+    ]
+    record = Version(
+        experiment="walks",
+        number=number,
+        seed=0,
+        made="2026-01-01T00:00:00Z",
+        synthetic=artefacts[0],
+        made_from=(),
+        scored_in=tuple(artefacts[1:]),
+        scores={},
+        gates=Gates(),
+        checks=(),
+    )
+    place = published_folder(store.home, "walks")
+    place.mkdir(parents=True, exist_ok=True)
+    write_version(place, record)
+    write_latest(place, record)
+
+
+def test_pruning_keeps_published_versions_with_their_scores_and_what_they_were_made_from(tmp_path, monkeypatch):
+    store = Store(tmp_path)
+    source = add(store, 1, age_days=99, stage="finetune")
+    versions = [add(store, number, inputs=[1], age_days=99, stage="sample") for number in (2, 3, 4)]
+    score = add(store, 5, inputs=[2], age_days=99, stage="copy_check")
+    publish(store, 1, versions[0], score)
+    publish(store, 2, versions[1])
+    assert command(prune, monkeypatch, tmp_path, "--apply") == 0
+    assert [path.exists() for path in (source, *versions, score)] == [True, True, True, False, True]
+    assert command(prune, monkeypatch, tmp_path, "--keep-versions", "1", "--apply") == 0
+    assert [path.exists() for path in (source, *versions, score)] == [True, False, True, False, False]
+    with pytest.raises(SystemExit):
+        command(prune, monkeypatch, tmp_path, "--keep-versions", "-1")
+
+
+def test_a_damaged_record_of_a_version_stops_pruning_and_is_named(tmp_path, monkeypatch, capsys):
+    store = Store(tmp_path)
+    folder = add(store, 1, age_days=99, stage="sample")
+    publish(store, 1, folder)
+    (published_folder(tmp_path, "walks") / "v0001.json").write_text("{")
+    assert command(prune, monkeypatch, tmp_path, "--apply") == 2 and folder.exists()
+    assert "v0001.json: is not the record of a version" in capsys.readouterr().err
+    assert command(verify, monkeypatch, tmp_path) == 1
+    assert "damaged: " in capsys.readouterr().out
+
+
+def test_latest_data_that_is_not_there_is_found(tmp_path, monkeypatch, capsys):
+    store = Store(tmp_path)
+    folder = add(store, 1, stage="sample")
+    publish(store, 1, folder)
+    assert command(verify, monkeypatch, tmp_path) == 0
+    flip_a_bit(folder)
+    assert command(verify, monkeypatch, tmp_path) == 1
+    assert f"missing: sample/{folder.name} of the latest data, version 1 of walks" in capsys.readouterr().out
 
 
 def test_what_was_set_aside_is_neither_overwritten_nor_pruned(tmp_path, monkeypatch):
