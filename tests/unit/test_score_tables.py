@@ -1,0 +1,168 @@
+"""The tables of scores and the scaling curve, from rows as the stages write them."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from ctlev_core.paired_differences import Difference
+from ctlev_core.report.html import Curves
+from ctlev_core.report.scaling import ScalePoint, scaling_figure, scaling_points
+from ctlev_core.report.score_tables import (
+    PairedScores,
+    baseline_tables,
+    cell_text,
+    group_tables,
+    interval_over_trainings,
+    score_tables,
+)
+from ctlev_core.report.verdict import verdict
+from ctlev_core.traced_scores import paired_samples
+
+METRIC = "mpjpe2d_px"
+NAMES = [f"s{number}" for number in range(40)]
+
+
+def row(setting, value, *, seed=0, metric=METRIC, group="all", task="pose2d", num_train=100, low=None, high=None):
+    return {
+        "task": task, "setting": setting, "seed": seed, "group": group, "metric": metric, "value": value, "low": low,
+        "high": high, "num_samples": 40, "num_train": num_train, "model_digest": f"{setting}{seed}", "data_digest": "d",
+    }  # fmt: skip
+
+
+def scored(setting, shift, *, seed=0, noise=0.1, names=NAMES):
+    """Rows, scores of samples, and a digest, of one training whose errors are those of `real` plus a shift."""
+    random = np.random.default_rng([seed, len(setting)])
+    values = 6 + np.random.default_rng(9).normal(0, 1, len(names)) + shift + random.normal(0, noise, len(names))
+    samples = pa.table({"sample_id": names, "recording_id": names, "metric": ["mpjpe2d"] * len(names), "value": values})
+    return [row(setting, float(values.mean()), seed=seed)], samples, "d"
+
+
+def tables_of(*parts, more=(), settings=("real",)):
+    rows = [one for rows, _, _ in parts for one in rows] + list(more)
+    paired = PairedScores(paired_samples(parts))
+    return score_tables(rows, settings, paired), paired, rows
+
+
+def test_only_what_the_paired_interval_shows_is_bold():
+    parts = [scored("real", 0, noise=0), scored("synthetic", -0.5), scored("real+synthetic", 0.01, noise=0.5)]
+    parts += [scored("worse", 0.5)]
+    (table, *_), _, _ = tables_of(*parts, settings=("real", "synthetic", "real+synthetic", "worse"))
+    assert table.columns[:4] == ["trained on", f"{METRIC} ↓", f"{METRIC}: minus real", "trainings"]
+    assert [cells[0] for cells in table.rows] == ["real", "synthetic", "real+synthetic", "worse"]
+    # Better: score and difference; undecided: neither; worse: the difference alone.
+    assert set(table.bold) == {(1, 1), (1, 2), (3, 2)}
+    assert table.rows[0][2] == "" and float(str(table.rows[1][2]).split()[0]) == pytest.approx(-0.5, abs=0.05)
+
+
+def test_trainings_are_averaged_and_counted_and_unknown_settings_follow_the_known():
+    parts = [scored("more_real", -1), scored("real", 0, seed=1), scored("real", 0.2, seed=2), scored("thing+other", 0)]
+    (table, *_), _, rows = tables_of(*parts, settings=("real",))
+    assert [cells[0] for cells in table.rows] == ["real", "more_real", "thing+other"]
+    assert [cells[3] for cells in table.rows] == [2, 1, 1]
+    mean = np.mean([one["value"] for one in rows if one["setting"] == "real"])
+    assert table.rows[0][1] == f"{mean:.3f}"
+    assert any("the most they can give" in note for note in table.footnotes)
+
+
+def test_labels_shuffled_labels_and_distances_have_tables_of_their_own():
+    more = [
+        row("labels of synthetic", 5.0),
+        row("shuffled labels of synthetic", 15.0),
+        row("held-out real", 3.0, task="distance", metric="fd_event_x"),
+        row("synthetic", 9.0, task="distance", metric="fd_event_x", low=8.0, high=10.0),
+    ]
+    (headline, labels, distances), _, _ = tables_of(scored("real", 0), more=more)
+    assert [cells[0] for cells in headline.rows] == ["real"]
+    names = ["held-out real (floor)", "labels of synthetic", "shuffled labels of synthetic"]
+    assert [cells[0] for cells in labels.rows] == names
+    assert distances.rows[1][:2] == ["synthetic", "9.000 [8.000, 10.000]"]
+
+
+def test_two_tasks_are_two_tables_and_classes_against_the_rest_a_third():
+    more = [
+        row("real", 0.7, task="classifier", metric="accuracy"),
+        row("real", 0.1, task="classifier", metric="chance_accuracy"),
+        row("real", 0.8, task="classifier", metric="binary_accuracy_mean"),
+        row("real", 0.9, task="classifier", metric="binary_accuracy_bonsai"),
+    ]
+    (_, classes, binary), _, _ = tables_of(scored("real", 0), more=more)
+    assert classes.title == "classifier: Does synthetic data help?"
+    assert classes.columns[1:3] == ["accuracy ↑", "binary_accuracy_mean ↑"]
+    assert "`chance_accuracy`: 0.100" in classes.footnotes
+    assert binary.rows == [["bonsai", "0.900", 40]]
+
+
+def test_scores_of_other_samples_are_not_paired():
+    parts = [scored("real", 0), scored("synthetic", -0.5, names=NAMES[::-1])]
+    (table, *_), paired, _ = tables_of(*parts, settings=("real", "synthetic"))
+    assert paired.difference("real", "synthetic", METRIC) is None and not table.bold
+
+
+def test_baselines_stand_beside_the_first_generator():
+    settings = {"real": 0, "synthetic": 0.3, "gan": 0.6, "real+synthetic": -0.5, "real+gan": -0.2}
+    _, paired, _ = tables_of(*(scored(name, shift) for name, shift in settings.items()))
+    (table,) = baseline_tables(["synthetic", "gan", "absent"], METRIC, paired)
+    # Means of 40 samples, each with noise of 0.1 in both settings.
+    found = [float(str(cell).split()[0]) for cell in table.rows[0][1:]]
+    assert found == pytest.approx([-0.3, -0.3, -0.2], abs=0.08) and table.bold == {(0, 1), (0, 2), (0, 3)}
+    assert table.rows[1] == ["absent", "", "", ""]
+    assert baseline_tables(["synthetic"], METRIC, paired) == []
+
+
+def test_the_score_that_the_samples_are_the_mean_of_is_found():
+    rows = [row("real", value, metric=name) for name, value in (("oks_ap25", 0.9), ("oks_mean", 0.6), ("pck_px4", 0.6))]
+    values = [0.5, 0.7] * 10
+    samples = pa.table(
+        {"sample_id": NAMES[:20], "recording_id": NAMES[:20], "metric": ["oks"] * 20, "value": pa.array(values)}
+    )
+    table = paired_samples([(rows, samples, "d")])
+    assert set(table["metric"].to_pylist()) == {"oks_mean"}
+
+
+def test_groups_by_origin_and_by_class_are_apart():
+    groups = ("walk", "classes with real training frames", "classes without training frames")
+    rows = [row(setting, 5.0, group=group) for setting in ("real", "new") for group in groups]
+    (origins,), (classes,) = group_tables([row("real", 5.0), *rows], ["real"])
+    assert [cells[0] for cells in origins.rows] == [*groups[1:]]
+    assert classes.columns == ["classes", "real", "new", "frames scored"]
+    assert classes.rows == [["walk", "5.000", "5.000", 40]]
+    assert group_tables([row("real", 5.0)], ["real"]) == ([], [])
+
+
+def test_intervals_join_recordings_and_trainings():
+    rows = [row("a", value, seed=seed, low=value - 0.3, high=value + 0.4) for seed, value in enumerate((5.0, 5.2, 5.4))]
+    value, low, high = interval_over_trainings(rows)
+    spread = 1.96 * 0.2 / np.sqrt(3)
+    assert (value, low, high) == pytest.approx((5.2, 5.2 - np.hypot(0.3, spread), 5.2 + np.hypot(0.4, spread)))
+    assert cell_text(rows[:1]) == "5.000 [4.700, 5.400]"
+    assert cell_text([row("a", 5.0)]) == "5.000" and cell_text([]) == ""
+
+
+def test_scaling_points_are_amounts_for_each_real_frame():
+    rows = [
+        row("real", 7.0, num_train=100), row("real+synthetic@0.5", 6.5, num_train=150, low=6.4, high=6.6),
+        row("real+synthetic", 6.0, num_train=200), row("real+gan", 5.0, num_train=200), row("synthetic@0.5", 9.0),
+    ]  # fmt: skip
+    points = scaling_points(rows, METRIC)
+    assert [(p.series, p.ratio, p.value) for p in sorted(points, key=lambda p: p.ratio)] == [
+        ("synthetic", 0.0, 7.0), ("synthetic", 0.5, 6.5), ("synthetic", 1.0, 6.0),
+    ]  # fmt: skip
+    figure = scaling_figure(points, METRIC)
+    assert isinstance(figure, Curves)
+    assert figure.series == {"synthetic": ([0.0, 0.5, 1.0], [7.0, 6.5, 6.0])}
+    np.testing.assert_array_equal(figure.spans["synthetic"][0], [np.nan, 6.4, np.nan])
+    assert scaling_points(rows[:1], METRIC) == [] == scaling_points([], METRIC)
+    assert scaling_figure([ScalePoint("a", 1.0, 2.0)]).series == {"a": ([1.0], [2.0])}
+
+
+def test_the_verdict_says_how_much_of_the_ceiling_was_reached_and_whether_labels_hold():
+    rows = [row(name, value) for name, value in (("real", 7.0), ("real+synthetic", 6.4), ("real+more_real", 6.0))]
+    rows += [row("labels of synthetic", 5.5), row("shuffled labels of synthetic", 15.0)]
+    settings = ("real", "real+synthetic", "real+more_real")
+    difference, gain = Difference(-0.6, -0.8, -0.4), Difference(-1.0, -1.2, -0.8)
+    text = verdict(rows, settings, difference, ceiling=(gain, Difference(0.6, 0.45, 0.75)))
+    assert "Adding synthetic data made it better" in text and "9% of what real data alone gives" in text
+    assert "synthetic ones give 60% [45%, 75%] of that." in text
+    assert "scores 5.500 on synthetic frames against their labels, and 15.000 on them with shuffled labels." in text
+    unsure = verdict(rows, settings, difference, ceiling=(Difference(-0.1, -0.3, 0.1), None))
+    assert "change it by -0.100 [-0.300, +0.100]." in unsure and "of that" not in unsure
