@@ -57,13 +57,15 @@ def check_prior_folder(folder: Path, *, controlnet: Path | None = None, needs_co
     Args:
         folder: or a single file.
         controlnet: as for `find_controlnet`.
-        needs_controlnet: raise where the prior has none and none is given.
+        needs_controlnet: raise where the prior has none and none is given; where neither this is asked for nor a
+            ControlNet, the prior's own is not looked at.
     Returns:
         The folder or file.
     Raises:
         DataError: what is missing or does not fit, and where it was looked for.
     """
-    files = read_prior_files(folder, controlnet=controlnet)
+    wanted = needs_controlnet or controlnet is not None
+    files = read_prior_files(folder, controlnet=controlnet, with_controlnet=wanted)
     if needs_controlnet and "controlnet" not in files.parts:
         raise DataError(f"{folder}: no subfolder 'controlnet', and no separate ControlNet folder or file was given")
     return folder

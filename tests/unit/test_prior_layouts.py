@@ -360,6 +360,7 @@ def test_a_controlnet_that_is_not_wanted_is_not_looked_at(folder):
     shutil.copytree(folder.with_name("sd-controlnet"), folder / "controlnet")
     weights_of(folder / "controlnet").write_bytes(b"")
     assert load_prior(folder, with_controlnet=False).controlnet is None
+    assert stable_diffusion.prior_folders(stable_diffusion.Options(prior=folder)) == [folder]
     with pytest.raises(DataError, match=r"controlnet/.*no safetensors file: 0 bytes"):
         load_prior(folder)
 
