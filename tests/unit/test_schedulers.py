@@ -156,7 +156,7 @@ def test_the_default_is_diffusers_unipc_of_order_three():
 
 
 def test_ddim_is_that_of_diffusers_where_both_have_the_steps():
-    reference: Any = DDIMScheduler(**CONFIG | {"timestep_spacing": "trailing", "set_alpha_to_one": True})
+    reference: Any = DDIMScheduler(**dict(CONFIG, timestep_spacing="trailing", set_alpha_to_one=True))
     reference.set_timesteps(20)
     ours = make_scheduler("ddim", CONFIG, 20, "trailing")
     assert torch.equal(ours.timesteps, reference.timesteps)
@@ -167,7 +167,7 @@ def test_ddim_is_that_of_diffusers_where_both_have_the_steps():
 def test_a_thousand_steps_of_the_paper_are_all_time_steps():
     solver = make_scheduler("ddpm", CONFIG, 1000)
     assert solver.timesteps.tolist() == list(range(999, -1, -1))
-    reference: Any = DDPMScheduler(**CONFIG | {"steps_offset": 0})
+    reference: Any = DDPMScheduler(**dict(CONFIG, steps_offset=0))
     reference.set_timesteps(1000)
     assert torch.equal(
         solve(solver, CONFIG, gaussian(0.5, 0.3), count=1), solve(reference, CONFIG, gaussian(0.5, 0.3), count=1)
