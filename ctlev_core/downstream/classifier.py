@@ -160,7 +160,7 @@ def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) ->
     classes = tuple(sorted(set(labels.class_names)))
     if len(classes) < 2:
         raise DataError(f"{where}: needs at least two classes, got {', '.join(classes) or 'no rows'}")
-    check_batch(options.batch_size, *frames.shape[1:3], where)
+    check_batch(options.batch_size, frames.shape[1], frames.shape[2], where)
     columns = {name: column for column, name in enumerate(classes)}
     return classes, np.array([columns[name] for name in labels.class_names], dtype=np.int64)
 

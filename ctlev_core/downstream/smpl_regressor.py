@@ -112,7 +112,7 @@ def train(
     from ctlev_core.training_rows import plan_rows
 
     data = _check_training_set(frames, labels)
-    check_batch(options.batch_size, *frames.shape[1:3], f"train {NAME}")
+    check_batch(options.batch_size, frames.shape[1], frames.shape[2], f"train {NAME}")
     weights = supervised.file_digests(input_files(options))
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
     device = supervised.resolve_device(options.device)

@@ -159,7 +159,7 @@ def test_a_network_that_says_exactly_pi_has_a_finite_gradient():
     from ctlev_core.networks.smpl_regressor import SmplBodies
 
     labels = bodies(8, half_turns())
-    rotations = torch.from_numpy(matrix_from_axis_angle(labels.smpl_pose.reshape(-1, 24, 3))).float()
+    rotations = torch.from_numpy(matrix_from_axis_angle(half_turns().reshape(-1, 24, 3))).float()
     betas, transl, intrinsics = (
         torch.from_numpy(np.array(array)) for array in (labels.smpl_betas, labels.smpl_transl, labels.intrinsics)
     )
