@@ -34,7 +34,7 @@ from flows.settings import HOME, flow
 from tasks.contact_sheet import publish_contact_sheet
 from tasks.export_events import publish_events
 from tasks.report import publish_report
-from tasks.speed_vs_error import publish_speed_report
+from tasks.speed_report import publish_speed_report
 from tasks.stage import planning
 
 _ARGUMENTS = """

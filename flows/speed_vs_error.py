@@ -19,18 +19,12 @@ from data_contracts.config import DownstreamChoice, SamplingChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from flows.command_line import PRESETS, load_experiment, load_preset, main
-from flows.prepare_dataset import prepare_dataset
+from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
 from flows.train_generator import train_generator
 from tasks.downstream import train_downstream
-from tasks.speed_vs_error import (
-    exact_score_errors,
-    precision_errors,
-    publish_speed_report,
-    sample_timed,
-    sampling_errors,
-    speed_report,
-)
+from tasks.speed_report import publish_speed_report, speed_report
+from tasks.speed_vs_error import exact_score_errors, precision_errors, sample_timed, sampling_errors
 from tasks.stage import call_flow
 
 _OF_EXPERIMENT = "experiment."
@@ -102,56 +96,22 @@ def speed_vs_error(measured: SpeedVsError) -> ManifestRef:
     experiment, options = measured.experiment, measured.options
     dataset = call_flow(prepare_dataset, experiment)
     checkpoint = call_flow(train_generator, experiment, dataset)
-    conditions = dataset.sample_conditions
+    conditions, sampling = dataset.sample_conditions, experiment.sampling_choice
     extractor = train_downstream(
         [dataset.frames], downstream=measured.feature_extractor, seed=experiment.seed, label="feature extractor"
     )
-    model = None
-    if options.label_errors:
-        seed = experiment.downstream_seeds[0]
-        label = f"{experiment.downstream.name} on real, seed {seed}"
-        model = train_downstream([dataset.frames], downstream=experiment.downstream, seed=seed, label=label)
     points = list(measured.points())
-    # One after the other: side by side they would slow one another, and the times would say so.
-    runs = [
-        [
-            sample_timed(
-                checkpoint,
-                conditions,
-                sampling=sampling,
-                num_images=options.num_images,
-                seed=seed,
-                label=f"{setting.line}, {setting.num_inference_steps} steps, seed {seed}",
-            )
-            for seed in (options.seeds[:1] if setting.line == CONVERGED_LINE else options.seeds)
-        ]
-        for setting, sampling in points
-    ]
     settings = [setting for setting, _ in points]
-    tables = [
-        sampling_errors(
-            extractor,
-            dataset.frames,
-            conditions,
-            model,
-            runs[0],
-            runs[1],
-            [run for of_setting in runs[2:] for run in of_setting],
-            feature_extractor=measured.feature_extractor,
-            downstream=experiment.downstream,
-            metric=experiment.metrics[0],
-            settings=settings,
-            label=experiment.name,
-        )
-    ]
+    runs = [_timed(measured, checkpoint, conditions, setting, choice) for setting, choice in points]
+    tables = [_errors(measured, dataset, extractor, settings, runs)]
     if options.exact_score is not None:
-        tables.append(exact_score_errors(checkpoint, options=options.exact_score))
+        solvers = SamplingChoice(name=sampling.name)
+        tables.append(exact_score_errors(checkpoint, sampling=solvers, options=options.exact_score))
     if options.precision is not None:
-        sampling = experiment.sampling_choice
         tables.append(
             precision_errors(checkpoint, conditions, sampling=sampling, options=options.precision, seed=experiment.seed)
         )
-    own = plugins.load_options(experiment.sampling_choice).options
+    own = plugins.load_options(sampling).options
     return speed_report(
         extractor,
         conditions,
@@ -159,12 +119,66 @@ def speed_vs_error(measured: SpeedVsError) -> ManifestRef:
         runs[0][0],
         [of_setting[0] for of_setting in runs[2:]],
         settings=settings[2:],
-        own=next((s for s, sampling in points[2:] if plugins.load_options(sampling).options == own), None),
+        own=next((setting for setting, choice in points[2:] if plugins.load_options(choice).options == own), None),
         title=experiment.name,
         notice=experiment.data_notice,
         reference_name=_name(points[0][1]),
         converged_name=_name(points[1][1]),
         feature_extractor=measured.feature_extractor.name,
+        label=experiment.name,
+    )
+
+
+def _timed(
+    measured: SpeedVsError,
+    checkpoint: ManifestRef,
+    conditions: ManifestRef,
+    setting: SamplerSetting,
+    sampling: SamplingChoice,
+) -> list[ManifestRef]:
+    """Timed samples of a setting, one artefact a seed; of the converged solution the first seed alone.
+
+    One after the other: side by side they would slow one another, and the times would say so.
+    """
+    options = measured.options
+    return [
+        sample_timed(
+            checkpoint,
+            conditions,
+            sampling=sampling,
+            num_images=options.num_images,
+            seed=seed,
+            label=f"{setting.line}, {setting.num_inference_steps} steps, seed {seed}",
+        )
+        for seed in (options.seeds[:1] if setting.line == CONVERGED_LINE else options.seeds)
+    ]
+
+
+def _errors(
+    measured: SpeedVsError,
+    dataset: PreparedDataset,
+    extractor: ManifestRef,
+    settings: list[SamplerSetting],
+    runs: list[list[ManifestRef]],
+) -> ManifestRef:
+    """Errors of all settings; with label errors by the model that `evaluate` trains on real frames."""
+    experiment, model = measured.experiment, None
+    if measured.options.label_errors:
+        seed = experiment.downstream_seeds[0]
+        label = f"{experiment.downstream.name} on real, seed {seed}"
+        model = train_downstream([dataset.frames], downstream=experiment.downstream, seed=seed, label=label)
+    return sampling_errors(
+        extractor,
+        dataset.frames,
+        dataset.sample_conditions,
+        model,
+        runs[0],
+        runs[1],
+        [run for of_setting in runs[2:] for run in of_setting],
+        feature_extractor=measured.feature_extractor,
+        downstream=experiment.downstream,
+        metric=experiment.metrics[0],
+        settings=settings,
         label=experiment.name,
     )
 

@@ -16,7 +16,7 @@ import torch
 from ctlev_core.diffusion.prior import choose_device, load_prior
 from ctlev_core.diffusion.sampling import sample_frames
 from ctlev_core.diffusion.sampling_devices import device_names
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
 from data_contracts.labels import Conditions
 
 
@@ -57,14 +57,13 @@ def sample_timed(
     for network in (prior.unet, prior.controlnet, prior.text_encoder):
         if network is not None:
             network.to(getattr(torch, options.precision))
+    seeds = noise_seeds(seeds, options)  # before batches are cut: shared noise is that of the first row of all
     made: list[np.ndarray] = []
     costs: list[list[float]] = []
     with tempfile.TemporaryDirectory(dir=work) as folder, _counted(prior.unet, prior.controlnet) as counts:
 
         def sample(rows: slice, name: str, chosen: SamplingOptions) -> np.ndarray:
-            return sample_frames(
-                prior, conditions.take(rows), chosen, seeds=list(seeds[rows]), work=Path(folder) / name
-            )
+            return sample_frames(prior, conditions.take(rows), chosen, seeds=seeds[rows], work=Path(folder) / name)
 
         sample(slice(0, options.batch_size), "warm_up", options.model_copy(update={"num_inference_steps": 2}))
         for start in range(0, len(conditions), options.batch_size):

@@ -1,0 +1,94 @@
+"""The page on speed against error, and its table."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ctlev_core.report.html import render_report
+from ctlev_core.report.speed_vs_error import SpeedPage
+from ctlev_core.speed_vs_error_options import SamplerSetting
+from data_contracts import tables
+from data_contracts.manifest import Manifest, ManifestRef
+from tasks.stage import Output, stage
+
+PAGE = "speed_vs_error.html"
+TABLE = f"{tables.SPEED_VS_ERROR.name}.parquet"
+
+
+@stage(version=1, schema=tables.REPORT)
+def speed_report(
+    out: Output,
+    extractor: Manifest,
+    conditions: Manifest,
+    measured: list[Manifest],
+    reference: Manifest,
+    shown: list[Manifest],
+    *,
+    settings: list[SamplerSetting],
+    own: SamplerSetting | None,
+    title: str,
+    notice: str,
+    reference_name: str,
+    converged_name: str,
+    feature_extractor: str,
+) -> pa.Table:
+    """Write the page and the table of all measurements.
+
+    Args:
+        out: of the stage.
+        extractor: the model in whose features frames were compared.
+        conditions: what was asked for.
+        measured: the tables to show together.
+        reference: timed samples of the reference.
+        shown: timed samples of every setting, of the same seed.
+        settings: of `shown`.
+        own: the setting of `settings` that the experiment samples with, if it is among them.
+        title: name of the experiment.
+        notice: what data these are.
+        reference_name: sampler and steps of the reference.
+        converged_name: and of what counts as converged.
+        feature_extractor: name of the plug-in of `extractor`.
+    """
+    table = pa.concat_tables([manifest.table for manifest in measured])
+    pictures = {
+        (setting.line, setting.num_inference_steps): manifest.array("frames")
+        for setting, manifest in zip(settings, shown, strict=True)
+    }
+    asked = None
+    if "images.npy" in conditions.files:
+        row_of = {name: row for row, name in enumerate(conditions.column("sample_id"))}
+        asked = conditions.array("images")[[row_of[name] for name in reference.column("condition_id")]]
+    page = SpeedPage(
+        rows=table.to_pylist(),
+        pictures=pictures,
+        reference_pictures=reference.array("frames"),
+        condition_pictures=asked,
+        reference_name=reference_name,
+        converged_name=converged_name,
+        own=None if own is None else (own.line, own.num_inference_steps),
+        features=f"{feature_extractor}, {extractor.ref.digest[:8]}",
+    )
+    html = render_report(
+        title=f"{title}: speed against error of sampling",
+        lead=notice,
+        verdict=page.verdict(),
+        sections=page.sections(),
+    )
+    (out.folder / PAGE).write_text(html, encoding="utf-8")
+    pq.write_table(table, out.folder / TABLE)
+    return pa.table({"table": [tables.SPEED_VS_ERROR.name], "file": [TABLE]})
+
+
+def publish_speed_report(ref: ManifestRef, home: Path, name: str) -> str:
+    """Put the newest page of an experiment, and its table, where a person looks for them; says where the page is."""
+    folder = home / "reports"
+    folder.mkdir(parents=True, exist_ok=True)
+    for source, suffix in ((TABLE, "parquet"), (PAGE, "html")):
+        temporary = folder / f".{name}.{suffix}"
+        shutil.copyfile(ref.path / source, temporary)
+        temporary.replace(folder / f"{name}.{suffix}")
+    return f"speed against error: {folder / f'{name}.html'}"
