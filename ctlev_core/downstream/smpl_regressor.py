@@ -44,7 +44,12 @@ class Options(SupervisedOptions):
     pool_grid: int = Field(default=2, ge=1, description="features are averaged over so many cells a side; Event-HPE: 1")
     head_width: int = Field(default=256, ge=0, description="hidden units of the head, 0 = linear")
     learning_rate: float = Field(default=2e-3, gt=0, description="peak of AdamW's learning rate")
-    rotation_weight: float = Field(default=1.0, ge=0, description="on the squared chordal distance of rotations")
+    rotation_loss: Literal["chordal", "geodesic"] = Field(
+        default="chordal",
+        description="mean over joints of the squared distance of the matrices, or of the angle between them, rad "
+        "(Event-HPE)",
+    )
+    rotation_weight: float = Field(default=1.0, ge=0, description="on the rotation loss; Event-HPE: 10")
     joints3d_weight: float = Field(default=10.0, ge=0, description="on the distance of joints from the pelvis, m")
     joints2d_weight: float = Field(default=10.0, ge=0, description="on the distance in the image, of its width")
     transl_weight: float = Field(default=1.0, ge=0, description="on the distance of translations, m")
@@ -272,13 +277,24 @@ def _project(joints: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:
     return focal * joints[..., :2] / joints[..., 2:].clamp(min=0.1) + centre
 
 
+def _angles(found: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+    """Angles [...] rad between rotations [..., 3, 3], by their logarithm: an arc cosine has no slope at 0 and pi."""
+    from ctlev_core.body.torch_rotations import axis_angle_from_matrix
+
+    return axis_angle_from_matrix(wanted.transpose(-1, -2) @ found).norm(dim=-1)
+
+
 def _loss(found: Any, wanted: list[torch.Tensor], body: Any, width: int, options: Options) -> torch.Tensor:
     rotations, betas, transl, intrinsics = wanted
     joints, true_joints = body.pose_joints(*found), body.pose_joints(rotations, betas, transl)
     from_pelvis, true_from_pelvis = joints - joints[:, :1], true_joints - true_joints[:, :1]
     in_image = (_project(joints, intrinsics) - _project(true_joints, intrinsics)) / width
+    if options.rotation_loss == "geodesic":
+        rotation_loss = _angles(found.rotations, rotations).mean()
+    else:
+        rotation_loss = (found.rotations - rotations).square().sum(dim=(-2, -1)).mean()
     return (
-        options.rotation_weight * (found.rotations - rotations).square().sum(dim=(-2, -1)).mean()
+        options.rotation_weight * rotation_loss
         + options.joints3d_weight * (from_pelvis - true_from_pelvis).norm(dim=-1).mean()
         + options.joints2d_weight * in_image.norm(dim=-1).mean()
         + options.transl_weight * (found.transl - transl).norm(dim=-1).mean()

@@ -152,7 +152,20 @@ def test_training_on_rotations_by_pi_stays_finite(tmp_path):
     assert np.isfinite(pose).all() and (np.linalg.norm(pose, axis=-1) <= np.pi + 1e-5).all()
 
 
-def test_a_network_that_says_exactly_pi_has_a_finite_gradient():
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.5, 3.0, np.pi - 1e-4, np.pi])
+def test_angle_between_rotations_is_the_one_they_were_turned_by(angle):
+    start = torch.from_numpy(matrix_from_axis_angle(np.random.default_rng(4).normal(size=(20, 3))))
+    axes = np.random.default_rng(5).normal(size=(20, 3))
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    turned = (start @ torch.from_numpy(matrix_from_axis_angle(angle * axes))).requires_grad_()
+    found = smpl_regressor._angles(turned, start)
+    (gradient,) = torch.autograd.grad(found.sum(), turned)
+    np.testing.assert_allclose(found.detach().numpy(), angle, atol=1e-12)
+    assert torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("rotation_loss", ["chordal", "geodesic"])
+def test_a_network_that_says_exactly_pi_has_a_finite_gradient(rotation_loss):
     """The loss and the joints at the label itself, where an arc cosine would have none."""
     from ctlev_core.body.layer import load_body
     from ctlev_core.body.torch_layer import BodyLayer
@@ -168,7 +181,7 @@ def test_a_network_that_says_exactly_pi_has_a_finite_gradient():
     for offset in (0.0, 1e-4):
         found = SmplBodies(matrix_from_rotation_6d(six + offset), betas, transl + offset)
         wanted = [rotations, betas, transl, intrinsics]
-        loss = smpl_regressor._loss(found, wanted, body, 24, smpl_regressor.Options())
+        loss = smpl_regressor._loss(found, wanted, body, 24, smpl_regressor.Options(rotation_loss=rotation_loss))
         (gradient,) = torch.autograd.grad(loss, six)
         assert torch.isfinite(loss) and torch.isfinite(gradient).all()
 
