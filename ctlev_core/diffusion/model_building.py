@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.prior_parts import PriorPart
-from ctlev_core.safe_files.tensor_files import StoredTensor, read_items
+from ctlev_core.safe_files.tensor_files import FLOATS, StoredTensor, read_items
 from data_contracts.errors import DataError
 
 _UNUSED = (".position_ids", "position_ids")
@@ -43,6 +43,8 @@ def build_model(part: PriorPart, dtype: torch.dtype) -> Any:
                 f"{part.place}: {part.name} by its config has {name} of shape {list(expected[name].shape)}, "
                 f"the weights file {list(tensor.shape)}"
             )
+        if expected[name].is_floating_point() and tensor.dtype not in FLOATS:
+            raise DataError(f"{tensor.path}: weight {name} is of type {tensor.dtype}; expected {', '.join(FLOATS)}")
     model.load_state_dict({name: load_tensor(tensor, dtype) for name, tensor in stored.items()}, assign=True)
     return model.eval().requires_grad_(False)
 

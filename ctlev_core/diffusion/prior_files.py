@@ -121,6 +121,10 @@ def _read_folder(folder: Path) -> PriorFiles:
     missing = [name for name in COMPONENTS if not (folder / name).is_dir()]
     if missing:
         found = sorted(path.name for path in folder.iterdir() if path.is_dir())
+        if "snapshots" in found:
+            raise DataError(
+                f"{folder}: a cache of Hugging Face's hub; give the folder of one revision in its snapshots"
+            )
         raise DataError(
             f"{folder}: a diffusers folder has the subfolders {', '.join(COMPONENTS)}; "
             f"missing: {', '.join(missing)}; found: {', '.join(found) or 'none'}"

@@ -23,6 +23,7 @@ ITEM_BYTES = {
 }  # fmt: skip
 MAX_HEADER = 100 * 2**20
 _EXPONENTS = {"F64": ("<u8", 0x7FF0 << 48), "F32": ("<u4", 0x7F800000), "F16": ("<u2", 0x7C00), "BF16": ("<u2", 0x7F80)}
+FLOATS = tuple(_EXPONENTS)
 _PIECE = 2**22
 
 

@@ -178,6 +178,18 @@ def test_missing_subfolder(folder, name):
     refused(folder, rf"sd: a diffusers folder has the subfolders .*; missing: {name}; found: ")
 
 
+def test_folder_of_a_hub_cache(folder):
+    (folder / "snapshots" / "0123").mkdir(parents=True)
+    shutil.move(folder / "unet", folder / "snapshots" / "0123")
+    refused(folder, "a cache of Hugging Face's hub; give the folder of one revision in its snapshots")
+
+
+def test_quantised_weights(folder):
+    change_weights(folder / "vae", lambda tensors: {**tensors, "quant_conv.bias": torch.zeros(8, dtype=torch.int8)})
+    with pytest.raises(DataError, match=r"quant_conv.bias is of type I8; expected F64, F32, F16, BF16"):
+        load_prior(folder)
+
+
 @pytest.mark.parametrize("name", ["text_encoder", "vae", "unet"])
 def test_missing_config_or_weights(folder, name):
     weights_of(folder / name).rename(folder / name / "notes.txt")

@@ -184,6 +184,18 @@ def test_headers_that_lie_are_refused(tmp_path, header, message):
         read_tensor_table(tmp_path / "x")
 
 
+@pytest.mark.parametrize("dtype", ["F64", "F32", "F16", "BF16"])
+def test_data_may_begin_at_any_byte(tmp_path, dtype):
+    """Of safetensors only the order is prescribed; writers pad the header, but need not."""
+    values = torch.tensor([1.5, -2.0, 3.0], dtype=DTYPES[dtype])
+    data = values.view(torch.uint8).numpy().tobytes()
+    for padding in range(8):
+        entry = {"dtype": dtype, "shape": [3], "data_offsets": [0, len(data)]}
+        header = json.dumps({"a": entry}) + " " * padding
+        (tmp_path / "x").write_bytes(with_header(header.encode(), data))
+        check_loads(tmp_path / "x", {"a": values})
+
+
 def rewritten(path, tensors, change):
     """A torch archive whose entries go through `change`: name and content to content, None drops it."""
     torch.save(tensors, path.with_suffix(".whole"))
