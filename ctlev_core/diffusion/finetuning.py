@@ -25,7 +25,7 @@ from ctlev_core.diffusion.sampling import sample_frames
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.small_prior import break_zeros
 from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
-from ctlev_core.diffusion.training import run_training, sample_rows
+from ctlev_core.diffusion.training import check_run, run_training, sample_rows
 from ctlev_core.diffusion.training_log import picture_of_samples
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.config import cache_material
@@ -85,19 +85,22 @@ def fine_tune(
     """
     check_training_data(frames, conditions, prior.image_size)
     device = prior.unet.device
-    cache = cache_latents(prior, frames, conditions, class_names)
-    check_cache(cache, conditions)
-    prior.text_encoder.to("cpu")
     networks = {"unet": (prior.unet,), "controlnet": (prior.controlnet,), "both": (prior.unet, prior.controlnet)}[tune]
     parameters = []
     for network in networks:
         network.train().requires_grad_(True)
         parameters += list(network.parameters())
     validation_rows, training_rows = split_rows(len(frames), options, seed)
-    denoiser = Denoiser(prior.unet, prior.controlnet)
-    schedule = NoiseSchedule(prior.scheduler_config)
     identity = _identity(frames, conditions, options, tune, seed, class_names)
     trainer = Trainer(parameters, options, identity, options.optimizer, keep=options.keep, patience=options.patience)
+    # Two frames at least: one frame has no other's condition to be shuffled with.
+    validated = len(validation_rows) >= 2
+    check_run(trainer, ranks, validated=validated)
+    denoiser = Denoiser(prior.unet, prior.controlnet)
+    schedule = NoiseSchedule(prior.scheduler_config)
+    cache = cache_latents(prior, frames, conditions, class_names)
+    check_cache(cache, conditions)
+    prior.text_encoder.to("cpu")
 
     def fetch(number: int) -> Batch:
         rows = training_rows[sample_rows(seed, number, options.batch_size, len(training_rows))]
@@ -115,8 +118,7 @@ def fine_tune(
         fetch,
         seed=seed,
         work=work,
-        # Two frames at least: one frame has no other's condition to be shuffled with.
-        validate=validate if len(validation_rows) >= 2 else None,
+        validate=validate if validated else None,
         draw=partial(draw_samples, prior, frames[shown], _rows_of(conditions, shown)),
         description="fine-tuning",
         ranks=ranks,

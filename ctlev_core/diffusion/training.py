@@ -30,6 +30,20 @@ def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray
     return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
 
 
+def check_run(trainer: Trainer, ranks: Ranks, *, validated: bool) -> None:
+    """Raise ValueError where options do not go together: to be called before anything long starts.
+
+    Float16 needs a CUDA device, best weights and early stopping a validation loss, and several processes batches that
+    they can share evenly.
+    """
+    check_precision(trainer.options, trainer.parameters[0].device)
+    if not validated and (trainer.keep == "best" or trainer.patience is not None):
+        raise ValueError(
+            "the best weights and early stopping need a validation loss: num_validation of 2 and more, and 20 frames"
+        )
+    ranks.batches(trainer.options.gradient_accumulation)
+
+
 def run_training(
     trainer: Trainer,
     denoiser: Denoiser,
@@ -62,17 +76,11 @@ def run_training(
     Returns:
         The loss curves.
     Raises:
-        ValueError: best weights or early stopping without validation, float16 on a CPU, or batches that the processes
-            cannot share evenly.
+        ValueError: see `check_run`.
         TrainingError: the loss was not finite ten times in a row, or the state in `work` is of another run.
     """
     options, state, device = trainer.options, work / "state.pt", trainer.parameters[0].device
-    check_precision(options, device)
-    if validate is None and (trainer.keep == "best" or trainer.patience is not None):
-        raise ValueError(
-            "the best weights and early stopping need a validation loss: num_validation of 2 and more, and 20 frames"
-        )
-    ranks.batches(options.gradient_accumulation)  # raises before anything long starts
+    check_run(trainer, ranks, validated=validate is not None)
     if state.is_file():
         trainer.restore(state)
     saved = time.monotonic()

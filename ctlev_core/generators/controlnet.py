@@ -65,9 +65,11 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
         out: the checkpoint folder to write.
         work: resumable state.
     Returns:
-        Loss curves.
+        Loss curves, and the step whose weights were kept.
     Raises:
-        ValueError: frames do not fit the prior or the conditions, or there are no condition images.
+        TrainingError: losses or gradients stayed not finite, or one of several processes failed.
+        ValueError: options do not go together, frames do not fit the prior or the conditions, or
+            there are no condition images.
     """
     from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 
