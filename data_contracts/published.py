@@ -90,7 +90,13 @@ class Version(Frozen):
 
 
 def published_folder(home: Path, experiment: str) -> Path:
-    """Where the versions of an experiment are listed."""
+    """Where the versions of an experiment are listed.
+
+    Raises:
+        DataError: the name leads out of the folder.
+    """
+    if not experiment.strip(".") or Path(experiment).name != experiment:
+        raise DataError(f"an experiment's name must be that of a folder, got {experiment!r}")
     return home / "published" / experiment
 
 

@@ -164,3 +164,9 @@ def test_kept_are_the_newest_that_passed_and_the_latest(tmp_path, folder, count,
     other = published_folder(tmp_path, "other")
     make(other, 1, name="other", passed=False)
     assert [version.number for version in kept_versions(tmp_path, count)] == expected
+
+
+@pytest.mark.parametrize("name", ["..", ".", "", "a/b", "/a"])
+def test_no_name_leads_out_of_the_home(tmp_path, name):
+    with pytest.raises(DataError, match="must be that of a folder"):
+        published_folder(tmp_path, name)
