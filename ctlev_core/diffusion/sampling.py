@@ -279,7 +279,8 @@ def _read(shards: list[Shard]) -> np.ndarray:
 def _checkpoint_digest(checkpoint: Path) -> str:
     """Digest of the weights, and of the configs that say what they mean."""
     digest = hashlib.sha256()
-    for path in sorted(path for path in checkpoint.glob("*/*") if path.is_file()):
+    parts = [checkpoint] if checkpoint.is_file() else sorted(path for path in checkpoint.glob("*/*") if path.is_file())
+    for path in parts:
         with path.open("rb") as file:
             digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
