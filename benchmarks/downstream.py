@@ -102,6 +102,10 @@ def cases(arguments: Any, device: torch.device) -> dict[str, tuple[Callable[[Pat
             ours(pose2d, posed, {"width": 0.5, "batch_norm": True}),
             plain(lambda: DHP19Network(NUM_JOINTS, 0.5, batch_norm=True), heatmaps, nn.MSELoss()),
         ),
+        "the same, channels_last": (
+            ours(pose2d, posed, {"width": 0.5, "batch_norm": True, "channels_last": True}),
+            plain(lambda: DHP19Network(NUM_JOINTS, 0.5, batch_norm=True), heatmaps, nn.MSELoss()),
+        ),
         "DHP19's CNN": (ours(pose2d, posed, {}), plain(lambda: DHP19Network(NUM_JOINTS), heatmaps, nn.MSELoss())),
     }
 

@@ -27,6 +27,11 @@ class SupervisedOptions(Frozen):
     precision: Literal["float32", "bfloat16"] = Field(
         default="float32", description="of the network's forward pass; weights and losses stay float32"
     )
+    channels_last: bool = Field(
+        default=False,
+        description="keep the channels of a pixel side by side in training: the pose network is up to 1.4 times as "
+        "fast on a CPU; sums are rounded in another order",
+    )
     validation_share: float = Field(
         default=0.0,
         ge=0,

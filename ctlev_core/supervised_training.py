@@ -83,6 +83,9 @@ def train_model(
             `work` cannot be read.
     """
     work.mkdir(parents=True, exist_ok=True)
+    if options.channels_last:
+        # Weights decide: convolutions give their output the layout of their weights, or of their input.
+        model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     path = work / CHECKPOINT_NAME
     run = _Run(model, options, digest(run_digest, *rows.pools, rows.mixing, rows.held_back), description)
     run.restore(path)

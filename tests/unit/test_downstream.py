@@ -93,11 +93,18 @@ def test_published_recipe_learns_without_batch_norm(tmp_path):
     assert np.median(error_px) < 1.5
 
 
-@pytest.mark.parametrize("kind", ["pose2d", "classifier"])
+@pytest.mark.parametrize("kind", ["pose2d", "pose2d, channels last", "classifier"])
 def test_interrupted_training_ends_in_the_same_model(tmp_path, monkeypatch, kind):
-    if kind == "pose2d":
+    if kind != "classifier":
         module, (frames, labels) = pose2d, blobs(30)
-        options = pose2d.Options(**FAST_POSE, num_steps=12, log_every=5, checkpoint_every_s=0, shift_px=2)
+        options = pose2d.Options(
+            **FAST_POSE,
+            num_steps=12,
+            log_every=5,
+            checkpoint_every_s=0,
+            shift_px=2,
+            channels_last=kind == "pose2d, channels last",
+        )
     else:
         module, (frames, labels) = classifier, stripes(30)
         options = classifier.Options(

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.body.torch_rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
@@ -215,6 +216,20 @@ def test_every_model_takes_sets_groups_and_half_precision(tmp_path):
         assert weights(plain) == weights(same), "without the options, sets and groups change nothing"
 
 
+@pytest.mark.parametrize("module", [pose2d, classifier, smpl_regressor], ids=lambda module: module.NAME)
+def test_channels_last_is_the_same_training_but_for_rounding(tmp_path, module):
+    labels = {"pose2d": points(8), "classifier": Labels(tuple("ab") * 4, np.arange(8)), "smpl_regressor": bodies(8)}
+    options = POSE if module is pose2d else SMALL
+    found = []
+    for channels_last in (False, True):
+        chosen = module.Options(**{**options, "num_steps": 2, "learning_rate": 1e-4}, channels_last=channels_last)
+        model = train(module, frames_of(8), labels[module.NAME], chosen, tmp_path, str(channels_last))
+        found.append({name: tensor.double() for name, tensor in load_file(model / "model.safetensors").items()})
+    for name, tensor in found[0].items():
+        # Two steps of Adam move a weight by 2e-4 at most, by its gradient's sign alone where that is rounding.
+        torch.testing.assert_close(found[1][name], tensor, atol=5e-4, rtol=1e-3, msg=name)
+
+
 def write_keras(path, change=None):
     """A file in the layout of DHP_CNN.model, with the weights of a random network."""
     torch.manual_seed(3)
@@ -234,8 +249,6 @@ def test_pose_network_starts_from_the_published_file(tmp_path):
     )
     assert pose2d.input_files(options) == [tmp_path / "DHP_CNN.h5"]
     model = train(pose2d, frames_of(2), points(2, 13), options, tmp_path)
-    from safetensors.torch import load_file
-
     for name, tensor in load_file(model / "model.safetensors").items():
         torch.testing.assert_close(tensor, network.state_dict()[name])
 
