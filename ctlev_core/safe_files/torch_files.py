@@ -16,7 +16,7 @@ import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 from ctlev_core.safe_files.bounded_reader import BoundedReader
 from ctlev_core.safe_files.plain_unpickler import Marker, PlainUnpickler
@@ -68,7 +68,7 @@ def _rebuild_tensor(storage: object, offset: object, shape: object, strides: obj
         or not all(type(n) is int and n >= 0 for n in numbers)
     ):
         raise DataError(f"it holds a tensor of shape {shape} with strides {strides}")
-    return _Tensor(storage, int(str(offset)), shape, strides)
+    return _Tensor(storage, cast(int, offset), shape, strides)
 
 
 def _rebuild_parameter(tensor: object, *_: object) -> _Tensor:
