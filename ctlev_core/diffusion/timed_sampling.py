@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from ctlev_core.diffusion.prior import choose_device, load_prior
-from ctlev_core.diffusion.sampling import sample_frames
+from ctlev_core.diffusion.sampling import _load, sample_frames
 from ctlev_core.diffusion.sampling_devices import device_names
 from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
 from data_contracts.labels import Conditions
@@ -47,16 +45,11 @@ def sample_timed(
     Args:
         checkpoint: a diffusers folder with what the conditions need.
         conditions: N prompts, with N condition images where the checkpoint has a ControlNet.
-        options: solver, steps, precision of the networks (the autoencoder stays in float32), batch size; of several
-            devices the first.
+        options: solver, steps, precision, batch size; of several devices the first.
         seeds: N non-negative integers.
         work: for files that are deleted again: a time may not come from a shard of an earlier run.
     """
-    device = choose_device(device_names(options.device)[0])
-    prior = load_prior(checkpoint, with_controlnet=conditions.images is not None, device=device)
-    for network in (prior.unet, prior.controlnet, prior.text_encoder):
-        if network is not None:
-            network.to(getattr(torch, options.precision))
+    prior = _load(checkpoint, options, device_names(options.device)[0], conditions.images is not None)
     seeds = noise_seeds(seeds, options)  # before batches are cut: shared noise is that of the first row of all
     made: list[np.ndarray] = []
     costs: list[list[float]] = []
