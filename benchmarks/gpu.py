@@ -1,0 +1,262 @@
+"""Training and sampling at the size of Stable Diffusion v1 on a GPU: beside diffusers, and beside the card's own limit.
+
+    python benchmarks/gpu.py                                    # random weights, nothing is downloaded; bf16
+    python benchmarks/gpu.py --device cpu --size tiny --image-size 64 --batch-size 2 --rounds 1 --ddpm-steps 20
+
+Both sides have the same networks, batch, precision and image size and take turns in one process: fine-tuning beside
+the loops of diffusers' examples (`diffusers_loop.py`), sampling beside `StableDiffusionControlNetPipeline` called
+plainly, with the same solver and 20 steps, and with 1000 steps of DDPM, the paper's. Wall time. The card's limit is a
+bf16 matrix product of 8192 x 8192, measured here; operations are counted by torch.
+
+Lines marked `as an experiment` change our networks from outside to see what an option would gain; targets are not for
+them. With the defaults, batches of 8 at 512 px, expect some 80 GB for the text route, whose two loops hold weights,
+gradients, moments and averages of a U-Net in float32 each, and half of that for the others; what it took is printed.
+A part that fails, for want of memory perhaps, is reported, and the others go on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import dataclasses
+import gc
+import statistics
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import sampling
+import torch
+import training
+from interleaved import Comparison, describe_machine, matmul_flops, print_comparisons, print_targets
+from torch.utils.flop_counter import FlopCounterMode
+
+from ctlev_core.diffusion.prior import Prior, choose_device
+from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
+from ctlev_core.diffusion.prior_parts import read_json
+from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.single_file import CONFIGS
+
+TINY: dict[str, dict[str, Any]] = {
+    "unet": {"block_out_channels": [32, 32, 64, 64], "cross_attention_dim": 32, "attention_head_dim": 2},
+    "controlnet": {
+        "block_out_channels": [32, 32, 64, 64],
+        "cross_attention_dim": 32,
+        "attention_head_dim": 2,
+        "conditioning_embedding_out_channels": [8, 8, 16, 16],
+    },
+    "vae": {"block_out_channels": [32, 32, 32, 32]},
+    "text_encoder": {
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "projection_dim": 32,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+    },
+}
+"""What `--size tiny` changes: every line of this file runs in seconds on a CPU."""
+MATMUL_SIDE = {"cuda": 8192, "cpu": 512}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the parts one after the other; exit status 1 where one of them failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda", help="cuda, cuda:1 ..., or cpu, which makes sense with --size tiny")
+    parser.add_argument("--size", choices=("sd", "tiny"), default="sd")
+    parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=tuple(PARTS))
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="bfloat16")
+    parser.add_argument("--image-size", type=int, default=512, help="px, a multiple of 64")
+    parser.add_argument("--batch-size", type=int, default=8)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=4, help="of training a round")
+    parser.add_argument("--inference-steps", type=int, default=20)
+    parser.add_argument("--ddpm-steps", type=int, default=1000, help="of the paper's sampler")
+    chosen = parser.parse_args(arguments)
+    if chosen.device.startswith("cuda") and not torch.cuda.is_available():
+        print("No CUDA device here: nothing was measured. `--device cpu --size tiny` runs all of it in small.")
+        return
+    device, dtype = choose_device(chosen.device), getattr(torch, chosen.precision)
+    print(describe_machine(device))
+    limit = matmul_flops(device, dtype, MATMUL_SIDE[device.type])
+    print(f"a matrix product of {MATMUL_SIDE[device.type]} in {chosen.precision}: {limit / 1e12:,.3g} TFLOP/s")
+    found: list[Comparison] = []
+    failed = [name for name in chosen.parts if not _run_part(name, chosen, device, limit, found)]
+    if found:
+        print_comparisons(f"batches of {chosen.batch_size}, {chosen.image_size} px", "diffusers", found)
+    print_targets(found)
+    if failed:
+        sys.exit(f"parts that failed: {', '.join(failed)}")
+
+
+def _run_part(name: str, chosen: Any, device: torch.device, limit: float, found: list[Comparison]) -> bool:
+    """Run one part and say what it took; False where it raised."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    start = time.perf_counter()
+    print(f"\n== {name}", flush=True)
+    try:
+        PARTS[name](chosen, device, limit, found)
+    except Exception:  # the other parts are still worth measuring
+        traceback.print_exc()
+        return False
+    finally:
+        gc.collect()
+        peak = ""
+        if device.type == "cuda":
+            peak = f", {torch.cuda.max_memory_allocated(device) / 2**30:.1f} GiB at most"
+            torch.cuda.empty_cache()
+        print(f"  {time.perf_counter() - start:.0f} s{peak}", flush=True)
+    return True
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+def build_prior(
+    size: str, image_size: int, *, with_controlnet: bool, dtype: torch.dtype, device: torch.device, seed: int = 0
+) -> Prior:
+    """Stable Diffusion v1 by its configs, with random weights; the tokenizer, which takes no time, is the bundled one.
+
+    Args:
+        size: `sd`, or `tiny` with the changes of `TINY`.
+        image_size: px.
+        with_controlnet: a ControlNet, too.
+        dtype: of all weights.
+        device: where they are made.
+        seed: equal seeds give equal weights.
+    """
+    from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+    from diffusers.models.controlnets.controlnet import ControlNetModel
+    from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+
+    configs = read_json(CONFIGS)
+    for name, changes in TINY.items() if size == "tiny" else ():
+        configs[name] = {**configs[name], **changes}
+    configs["unet"]["sample_size"] = image_size // 8
+    tokenizer = CLIPTokenizer.from_pretrained(str(BUNDLED_PRIOR / "tokenizer"), local_files_only=True)
+    tokenizer.model_max_length = configs["text_encoder"]["max_position_embeddings"]
+    torch.manual_seed(seed)
+    with torch.device(device):
+        networks: dict[str, Any] = {
+            "text_encoder": CLIPTextModel(CLIPTextConfig.from_dict(configs["text_encoder"])),
+            "vae": AutoencoderKL.from_config(configs["vae"]),
+            "unet": UNet2DConditionModel.from_config(configs["unet"]),
+            "controlnet": ControlNetModel.from_config(configs["controlnet"]) if with_controlnet else None,
+        }
+    for network in networks.values():
+        if network is not None:
+            network.to(device, dtype).eval().requires_grad_(False)
+    return Prior(
+        tokenizer=tokenizer, scheduler_config=configs["scheduler"], image_size=(image_size, image_size), **networks
+    )
+
+
+def count_parameters(prior: Prior) -> str:
+    """Millions of weights, network by network."""
+    counts = []
+    for name in ("unet", "controlnet", "vae", "text_encoder"):
+        network = getattr(prior, name)
+        if network is not None:
+            counts.append(f"{name} {sum(weight.numel() for weight in network.parameters()) / 1e6:,.1f} M")
+    return ", ".join(counts)
+
+
+def use_channels_last(prior: Prior) -> Prior:
+    """The same networks; convolutions then take images as tensor cores like them."""
+    for network in (prior.unet, prior.controlnet, prior.vae):
+        if network is not None:
+            network.to(memory_format=torch.channels_last)
+    return prior
+
+
+def compile_networks(prior: Prior) -> Prior:
+    """The same networks, compiled when they are first called, with images as tensor cores like them."""
+    for network in (use_channels_last(prior).unet, prior.controlnet):
+        if network is not None:
+            network.compile()
+    return prior
+
+
+# Parts ----------------------------------------------------------------------------------------------------------------
+
+
+Change = Callable[[Prior], Prior]
+
+
+def measure_sampling(
+    change: Change | None, chosen: Any, device: torch.device, limit: float, found: list[Comparison]
+) -> None:
+    """The ControlNet route with few steps; with unchanged networks beside the paper's thousand, too."""
+    prior = build_prior(
+        chosen.size, chosen.image_size, with_controlnet=True, dtype=getattr(torch, chosen.precision), device=device
+    )
+    print(f"  {count_parameters(prior)}")
+    options = SamplingOptions(num_inference_steps=chosen.inference_steps, precision=chosen.precision)
+    options = options.model_copy(update={"batch_size": chosen.batch_size})
+    _, conditions = training.make_rows(prior, chosen.batch_size, with_images=True)
+    with FlopCounterMode(display=False) as counter:
+        sampling.sample_ours(prior, conditions, options)
+    flops = counter.get_total_flops()
+    compare = partial(sampling.compare, prior, options, count=chosen.batch_size, rounds=chosen.rounds)
+    if change is None:
+        of_part = compare("sampling", paper_steps=chosen.ddpm_steps, in_full=True)
+    else:
+        copies = {part: copy.deepcopy(getattr(prior, part)) for part in ("unet", "controlnet", "vae")}
+        of_part = compare(
+            f"sampling, {EXPERIMENTS[change]}", ours=change(dataclasses.replace(prior, **copies)), paper_steps=0
+        )
+    found += of_part
+    rate = flops / statistics.median(of_part[0].ours)
+    print(f"  {flops / 1e12:.3g} TFLOP, {rate / 1e12:.3g} TFLOP/s, {rate / limit:.0%} of the matrix product")
+
+
+def measure_training(
+    route: training.Route,
+    changed: Sequence[str],
+    change: Change | None,
+    chosen: Any,
+    device: torch.device,
+    _limit: float,
+    found: list[Comparison],
+) -> None:
+    """One route with options of ours, or with networks changed from outside."""
+    build = partial(
+        build_prior,
+        chosen.size,
+        chosen.image_size,
+        with_controlnet=route == "controlnet",
+        dtype=torch.float32,
+        device=device,
+    )
+    prior, same = build(), build()
+    print(f"  {count_parameters(prior)}")
+    if change is not None:
+        prior = change(prior)
+    options = training.make_options(chosen.batch_size, chosen.precision, [f"device={chosen.device}", *changed])
+    name = ", ".join([f"training, {route}", *changed, *([EXPERIMENTS[change]] if change else [])])
+    comparison = training.compare(prior, same, options, route, chosen.rounds, chosen.steps, name)
+    if change is not None:
+        comparison.wanted = None
+    found.append(comparison)
+
+
+EXPERIMENTS: dict[Change, str] = {
+    use_channels_last: "channels_last, as an experiment",
+    compile_networks: "channels_last and compiled, as an experiment",
+}
+PARTS: dict[str, Callable[[Any, torch.device, float, list[Comparison]], None]] = {
+    "sampling": partial(measure_sampling, None),
+    "sampling_channels_last": partial(measure_sampling, use_channels_last),
+    "sampling_compiled": partial(measure_sampling, compile_networks),
+    "controlnet": partial(measure_training, "controlnet", (), None),
+    "controlnet_channels_last": partial(measure_training, "controlnet", (), use_channels_last),
+    "controlnet_compiled": partial(measure_training, "controlnet", ("compile_networks=true",), None),
+    "text": partial(measure_training, "text", (), None),
+}
+
+if __name__ == "__main__":
+    main()
