@@ -59,7 +59,7 @@ def steps(frames: Manifest, frame_conditions: Manifest, conditions: Manifest, ma
         Step(
             "3. A new label",
             _condition(conditions, asked[made.column("condition_id")[second]]),
-            "One for which there is no event image to learn from.",
+            "Another one: no event image of it need exist.",
         ),
         Step(
             "4. A synthetic event image",

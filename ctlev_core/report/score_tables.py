@@ -174,15 +174,15 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
         if first is not None and first.is_certain:
             bold.add((len(body), len(metrics) + 1))
         cells: list[Cell] = [cell_text([row for row in of_setting if row["metric"] == metric]) for metric in metrics]
-        counts = [len({_training(row) for row in of_setting}), of_setting[0]["num_train"], of_setting[0]["num_samples"]]
+        counts = [len({_training(row) for row in of_setting}), of_setting[0]["num_train"]]
         body.append([setting, *cells, "" if first is None else first.text(), *counts])
     columns = ["trained on", *map(_heading, metrics), f"{metrics[0]}: minus real"]
-    columns += ["trainings", "frames trained on", "frames scored"]
+    columns += ["trainings", "frames trained on"]
     caption = (
-        "Scores on held-out real test data; equal optimiser steps for every row. Each number is the mean over the "
-        "row's trainings, which differ in their seeds; in brackets the 95 % interval over test recordings and "
-        "trainings. Bold: better than `real`, or a difference from it that is not 0, as the interval of the difference "
-        "says that compares sample by sample."
+        f"Scores on {rows[0]['num_samples']:,} held-out real test frames; equal optimiser steps for every row. Each "
+        "number is the mean over the row's trainings, which differ in their seeds; in brackets the 95 % interval over "
+        "test recordings and trainings. Bold: better than `real`, or a difference from it that is not 0, as the "
+        "interval of the difference says that compares sample by sample."
     )
     notes = [f"`{name}`: {text}" for name, text in _SETTINGS.items() if any(name in s.split("+") for s in settings)]
     explained = {text: name for name in metrics for start, text in _METRICS.items() if name.startswith(start)}

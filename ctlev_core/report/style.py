@@ -28,7 +28,7 @@ a:hover { text-decoration: underline; }
 .verdict { border-left: 3px solid var(--accent); padding: .1rem 0 .1rem 1rem; margin: 1.1rem 0; font-size: 1.08rem; }
 .verdict p:last-child { margin-bottom: 0; }
 .empty { color: var(--soft); font-style: italic; }
-.steps { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: 1.2rem 2.2rem;
+.steps { display: grid; grid-template-columns: repeat(4, 1fr); gap: 1.2rem 2.2rem;
   margin: 1.6rem 0; padding: 0; list-style: none; max-width: 58rem; }
 .steps .picture { position: relative; }
 .steps figure { margin: 0; }
@@ -79,12 +79,13 @@ svg text { font-family: inherit !important; }
   font-size: .85rem; color: var(--soft); }
 .legend i { display: inline-block; width: 1.5rem; margin-right: .45rem; vertical-align: middle; }
 footer { margin-top: 3rem; padding-top: .8rem; border-top: 1px solid var(--line); font-size: .85rem; }
+@media (max-width: 44rem) { .steps { grid-template-columns: 1fr 1fr; } }
 @media (max-width: 34rem) {
   body { font-size: 15px; }
   main { padding: 1.3rem 1rem 3rem; }
   h1 { font-size: 1.4rem; }
   th, td { padding: .34rem .55rem; }
-  .steps { grid-template-columns: 1fr 1fr; gap: 1rem 1.9rem; }
+  .steps { gap: 1rem 1.9rem; }
   .steps .follows .picture::before { left: -1.9rem; width: 1.9rem; }
 }
 @media print { .scroll { overflow: visible; } section { break-inside: avoid; } nav { display: none; } }

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctlev_core.report.figures import animation_webp, curves_svg, image_grid_png, series_style
-from ctlev_core.report.html import Animation, Curves, ImageGrid, Table, Text, render_report
+from ctlev_core.report.html import Animation, Curves, Folded, ImageGrid, Step, Table, Text, render_report
 from ctlev_core.report.tables import format_column
 
 HOSTILE = "<script>alert(\"1\")</script> & 'x' http://example.org"
@@ -235,3 +235,35 @@ def test_animations_stand_in_the_page_with_their_labels():
 def test_what_is_no_animation_is_refused(frames, rate_hz):
     with pytest.raises(ValueError, match="must be"):
         animation_webp(frames, rate_hz)
+
+
+def test_folded_sections_are_closed_and_have_headings_of_their_own_where_there_are_several():
+    one, two = Table("One", ["a"], [[1]]), Text("Two", "words")
+    page = render_report(
+        title="t", lead="", verdict="", sections=[Folded("Both", [one, two], "why"), Folded("B", [one])]
+    )
+    reader = read(page)
+    assert reader.texts["h2"] == ["Both", "B"] and reader.texts["h3"] == ["One", "Two"]
+    assert reader.texts["summary"] == ["Both", "B"] and not any(name == "open" for _, name, _ in reader.attributes)
+
+
+def test_steps_are_pictures_or_words_with_arrows_where_one_leads_to_another():
+    steps = [
+        Step("1. <Label>", "“A photo of a cat”", "What is known."),
+        Step("2. Image", np.full((4, 4, 3), 9, np.uint8), "What is made.", follows=True),
+    ]
+    reader = read(render_report(title="t", lead="", verdict="v", sections=[], steps=steps))
+    assert reader.texts["figcaption"] == ["1. <Label> What is known.", "2. Image What is made."]
+    assert "“A photo of a cat”" in reader.texts["p"] and len(reader.texts["li"]) == 2
+    assert [value for tag, name, value in reader.attributes if tag == "li" and name == "class"] == ["follows"]
+    pictures = [value for tag, name, value in reader.attributes if tag == "img" and name == "src"]
+    assert len(pictures) == 1 and pictures[0].startswith("data:image/png;base64,")
+
+
+def test_intervals_of_points_are_bars_where_they_are_known():
+    series = {"a": ([0, 1, 2], [0.0, 2.0, 4.0])}
+    nowhere, nan = (np.nan, np.nan, np.nan), np.nan
+    bare = curves_svg(series, "x", "y", spans={"a": (nowhere, nowhere)})
+    barred = curves_svg(series, "x", "y", spans={"a": ((nan, 1.5, 3.0), (nan, 2.5, 4.0))})
+    # Within the range of the points, so that axes and grid stay as they are.
+    assert barred.count("\nL ") == bare.count("\nL ") + 2

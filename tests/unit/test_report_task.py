@@ -1,6 +1,97 @@
-"""What the report picks out of manifests."""
+"""The report of a tiny experiment: its page, its tables, and where its numbers come from."""
 
-from ctlev_core.report.pictures import runs
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from report_artefacts import SETTINGS, Experiment
+
+from ctlev_core.provenance import read_provenance
+from ctlev_core.report.pictures import runs, sample_grid, steps
+from ctlev_core.run_comparison import compare_runs, read_run
+from ctlev_core.traced_scores import PAIRED_SAMPLES, TRACED_SCORES
+from data_contracts.manifest import ManifestRef
+from data_contracts.tables import check_table
+from tasks.report import publish_report, report
+from tasks.stage import Output
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    return Experiment(tmp_path_factory.mktemp("home"))
+
+
+@pytest.fixture(scope="module")
+def published(experiment):
+    """The folder of reports."""
+    folder = experiment.home / "made"
+    folder.mkdir()
+    report.function(Output(folder, folder), **experiment.arguments)
+    publish_report(ManifestRef(key="k", path=folder), experiment.home, "tiny")
+    return experiment.home / "reports"
+
+
+def test_the_page_says_first_what_data_it_is_then_the_verdict_then_what_was_done(published):
+    page = (published / "tiny.html").read_text()
+    texts = ("Data: <code>made up", "Adding synthetic data made it better", "1. A label")
+    places = [page.index(text) for text in texts]
+    places += [page.index(f"{text}</h2>") for text in ("Does synthetic data help?", "where does it help?")]
+    places += [page.index(f"{text}</h2>") for text in ("Asked for, and sampled", "by the amount of synthetic data")]
+    folded = ("Where the time went", "The paper&#x27;s own numbers, on other data")
+    places += [page.index(f"{text}</h2></summary>") for text in folded]
+    assert places == sorted(places)
+    for expected in ("real+more_real", "synthetic ones give 50% [", "15.000 on them with shuffled labels"):
+        assert expected in page
+    assert "http://" not in page and "https://" not in page
+
+
+def test_every_number_can_be_traced(published, experiment):
+    folder = published / "tiny"
+    scores = check_table(pq.read_table(folder / "scores.parquet"), TRACED_SCORES, "scores").to_pylist()
+    assert {row["setting"] for row in scores} >= set(SETTINGS)
+    records = {record.digest: record for record in read_provenance(folder / "provenance.json")}
+    for row in scores:
+        assert records[row["score_digest"]].stage == "score_model"
+        assert [records[digest].role for digest in row["training_digests"]] == ["frames"]
+        assert [records[digest].role for digest in row["recordings_digests"]] == ["recordings"]
+        assert row["model_digest"] in records and row["data_digest"] in records
+    samples = check_table(pq.read_table(folder / "samples.parquet"), PAIRED_SAMPLES, "samples")
+    assert len(samples) == len(SETTINGS) * 2 * 6 and len(set(samples["samples_digest"].to_pylist())) == 1
+
+
+def test_tables_hold_what_the_page_holds(published):
+    markdown, latex = ((published / "tiny" / name).read_text() for name in ("tables.md", "tables.tex"))
+    for text in ("Does synthetic data help?", "Beside the baselines", "How far from real frames?", "Does it copy?"):
+        assert text in markdown and text in latex
+    assert latex.count("{table}") == 2 * latex.count(r"\toprule") and "Data: `made up`." in markdown
+
+
+def test_a_report_differs_from_itself_in_nothing(published):
+    scores, *others = compare_runs(read_run("a", published / "tiny"), read_run("b", published / "tiny"))
+    assert not scores.bold and all(not table.rows for table in others)
+    assert {row[-1] for row in scores.rows} == {"paired", "intervals"}
+
+
+def test_the_four_pictures_are_of_median_activity(experiment):
+    frames, made = experiment.frames, experiment.generated[0]
+    label, real, new, synthetic = steps(frames, experiment.frame_conditions, experiment.conditions, made, "skeleton")
+    # Picture i has i + 1 active rows; the middle one of 6 training frames is the third, that of 12 made the sixth.
+    np.testing.assert_array_equal(real.picture, frames.array("frames")[2])
+    np.testing.assert_array_equal(label.picture, experiment.frame_conditions.array("images")[2])
+    np.testing.assert_array_equal(synthetic.picture, made.array("frames")[5])
+    np.testing.assert_array_equal(new.picture, experiment.conditions.array("images")[5])
+    assert "a skeleton" in label.sentence and "20 ms, white" in real.sentence
+    assert [step.follows for step in (label, real, new, synthetic)] == [False, True, False, True]
+
+
+def test_grids_show_the_real_frame_of_the_same_moment(experiment):
+    grid = sample_grid(experiment.conditions, {"synthetic": experiment.generated[0]}, [experiment.frames])
+    labels = [label for label, _ in grid.rows]
+    assert labels == ["condition", "real, same moment", "synthetic"]
+    real = dict(grid.rows)["real, same moment"]
+    # Every condition names recording r0, of which there is one frame.
+    assert all(np.array_equal(image, experiment.frames.array("frames")[0]) for image in real)
+    without = sample_grid(experiment.conditions, {"synthetic": experiment.generated[0]}, [])
+    assert [label for label, _ in without.rows] == ["condition", "synthetic"]
 
 
 def test_runs_are_rows_that_follow_in_the_time_of_one_recording():
