@@ -1,8 +1,8 @@
 """From a prior on disk to a fine-tuned checkpoint on disk, in this process or in several that train together.
 
 Several processes are started here, by torchrun, and not by wrapping a flow in a launcher: one flow, one lock in the
-store and one cache key, however many GPUs compute. A flow that was started by `accelerate launch` or `torchrun` all the
-same runs in every one of their processes; the one that gets the store's lock trains, with as many processes of its own.
+store and one cache key, however many GPUs compute. Where `accelerate launch` or `torchrun` started the process all the
+same, as many are started as the launcher was asked for; its other processes have nothing to do.
 
 Arrays and options reach them as files in the work folder, and results come back the same way.
 """
