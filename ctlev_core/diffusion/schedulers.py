@@ -29,6 +29,14 @@ PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
 MIN_ALPHA_BAR = 2.0**-24
 """Stands for no signal at all where a solver divides by it; what diffusers takes."""
 
+THIRD_ORDER_FROM = 20
+"""Steps from which UniPC is of order 3; with fewer its long steps overshoot.
+
+Root mean square distance, in grey levels, of the bundled prior's images from those of 60 steps, order 3 and 2: 48 and
+11 with 6 Karras steps, 21 and 2.9 with 8, 3.0 and 1.9 with 10, 1.2 and 0.8 with 15, 0.7 and 0.7 with 20. With a
+denoiser in closed form order 3 is the better one with 20 steps.
+"""
+
 _NOISE_SCHEDULE = (
     "num_train_timesteps",
     "beta_start",
@@ -119,6 +127,8 @@ def make_scheduler(name: str, config: dict[str, Any], num_inference_steps: int, 
         # A single step must be the first, and all steps must be each once: rounding would get both wrong.
         spacing = "trailing"
     solver, settings = _SOLVERS[name]
+    if name == "unipc" and num_inference_steps < THIRD_ORDER_FROM:
+        settings = {**settings, "solver_order": 2}
     if name in ("deis", "sa_solver") and schedule.pop("rescale_betas_zero_snr", False):
         schedule["trained_betas"] = _betas_without_signal(config)
     scheduler = solver(**schedule, **settings, **_SPACING_SETTINGS[spacing])
