@@ -235,12 +235,12 @@ def numbered(label: str, number: int) -> str:
     return f"{label}, {number + 1}" if number else label
 
 
-def files_of(folders: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Every file of some folders, named by the folder's number and the path inside, for `raw_files`."""
+def files_of(places: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Files, and every file of folders, named by the place's number and the path inside it, for `raw_files`."""
     return [
-        (f"{number}/{path.relative_to(folder).as_posix()}", path)
-        for number, folder in enumerate(folders)
-        for path in sorted(folder.rglob("*"))
+        (str(number) if path == place else f"{number}/{path.relative_to(place).as_posix()}", path)
+        for number, place in enumerate(places)
+        for path in ([place] if place.is_file() else sorted(place.rglob("*")))
         if path.is_file()
     ]
 

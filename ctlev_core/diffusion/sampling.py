@@ -25,7 +25,14 @@ from tqdm import tqdm
 from ctlev_core.diffusion.controlnet_reuse import EveryKthStep
 from ctlev_core.diffusion.controlnet_reuse import cached_condition_embedding as cached_condition_embedding
 from ctlev_core.diffusion.denoising import Denoiser
-from ctlev_core.diffusion.prior import Prior, choose_device, conditions_to_tensor, encode_prompts, load_prior
+from ctlev_core.diffusion.prior import (
+    Prior,
+    choose_device,
+    conditions_to_tensor,
+    decode_latents,
+    encode_prompts,
+    load_prior,
+)
 from ctlev_core.diffusion.sampling_devices import device_names, run_on_devices
 from ctlev_core.diffusion.sampling_memory import ShrinkingBatches
 from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions, noise_seeds
@@ -96,12 +103,7 @@ def sample_latents(
 @torch.no_grad()
 def decode_frames(prior: Prior, latents: Tensor, options: SamplingOptions) -> np.ndarray:
     """Frames [B, H, W, 3] uint8 of scaled latents; dark values become exactly 0."""
-    latents = latents / prior.scaling_factor
-    images = prior.vae.decode(latents.to(prior.vae.dtype)).sample.float()
-    if prior.vae.dtype == torch.float16 and not bool(torch.isfinite(images).all()):
-        logger.warning("the autoencoder overflows in float16; decoding in float32 from here on")
-        images = prior.vae.float().decode(latents).sample
-    values = ((images + 1) * 127.5).clamp(0, 255)
+    values = ((decode_latents(prior, latents) + 1) * 127.5).clamp(0, 255)
     if options.palette == "grey":
         values = values.mean(dim=1, keepdim=True).expand_as(values)
     elif options.palette == "red_blue":

@@ -80,7 +80,7 @@ class FineTuningOptions(TrainingOptions):
     prior: Path | None = Field(
         default=None,
         json_schema_extra=RUN_SETTING,
-        description="diffusers folder of the prior; the bundled small prior when null",
+        description="diffusers folder, or a file of Stable Diffusion v1; the bundled small prior when null",
     )
     random_init: bool = Field(
         default=False, description="ablation: forget the prior's U-Net and ControlNet weights first"

@@ -42,16 +42,14 @@ class SampleOptions(SamplingOptions):
 
 
 def prior_folders(options: Options) -> list[Path]:
-    """The diffusers folders the weights come from: the prior, and the ControlNet where it lies apart.
+    """The folders and files the weights come from: the prior, and the ControlNet where it lies apart.
 
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder, find_controlnet
+    from ctlev_core.diffusion.prior_files import prior_places
 
-    prior = check_prior_folder(options.prior or BUNDLED_PRIOR, controlnet=options.controlnet, needs_controlnet=True)
-    chosen = find_controlnet(prior, options.controlnet) if options.controlnet else None
-    return [prior] if chosen is None else [prior, chosen]
+    return prior_places(options.prior, controlnet=options.controlnet, needs_controlnet=True)
 
 
 def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:

@@ -33,14 +33,14 @@ class SampleOptions(SamplingOptions):
 
 
 def prior_folders(options: Options) -> list[Path]:
-    """The diffusers folder the weights come from.
+    """The folder, or the files, the weights come from.
 
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder
+    from ctlev_core.diffusion.prior_files import prior_places
 
-    return [check_prior_folder(options.prior or BUNDLED_PRIOR)]
+    return prior_places(options.prior)
 
 
 def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:

@@ -219,7 +219,7 @@ def test_an_autoencoder_that_overflows_is_run_in_float32(caplog):
     prior = dataclasses.replace(shared_prior(), vae=Decoder())
     with caplog.at_level(logging.WARNING), torch.no_grad():
         frames = decode_frames(prior, torch.ones(1, 48, 4, 4) * prior.scaling_factor, SamplingOptions())
-    assert (frames == 255).all() and "decoding in float32" in caplog.text
+    assert (frames == 255).all() and "decodes them again in float32" in caplog.text
 
 
 def test_latents_that_are_not_finite_are_an_error():
