@@ -29,7 +29,7 @@ class SupervisedOptions(Frozen):
     )
     channels_last: bool = Field(
         default=False,
-        description="keep the channels of a pixel side by side in training: the pose network is up to 1.4 times as "
+        description="keep the channels of a pixel side by side in training: the pose network is about 1.3 times as "
         "fast on a CPU; sums are rounded in another order",
     )
     validation_share: float = Field(
