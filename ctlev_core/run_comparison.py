@@ -60,9 +60,12 @@ def read_run(name: str, folder: Path) -> Run:
     Raises:
         DataError: a file of it is missing, or is of another version.
     """
+    if not (folder / "provenance.json").is_file():
+        raise DataError(f"{folder}: holds no provenance.json; a report of an earlier version must be made again")
+    records = read_provenance(folder / "provenance.json")
     scores = _read(folder / "scores.parquet", TRACED_SCORES)
     samples = _read(folder / "samples.parquet", PAIRED_SAMPLES)
-    return Run(name, read_provenance(folder / "provenance.json"), scores.to_pylist(), read_trainings(samples))
+    return Run(name, records, scores.to_pylist(), read_trainings(samples))
 
 
 def _read(path: Path, schema: TableSchema) -> pa.Table:

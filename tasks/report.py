@@ -23,6 +23,7 @@ from ctlev_core.report.costs import cost_table, options_table, versions_table
 from ctlev_core.report.html import Curves, Folded, Section, render_report
 from ctlev_core.report.paper_numbers import paper_section
 from ctlev_core.report.realism import realism_sections
+from ctlev_core.report.refusals import refusal_sections
 from ctlev_core.report.scaling import scaling_figure, scaling_points
 from ctlev_core.report.score_tables import (
     PairedScores,
@@ -44,7 +45,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=8, schema=tables.REPORT)
+@stage(version=9, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -94,6 +95,7 @@ def report(
     results = _results(rows, settings, list(shown), paired)
     copied = copy_sections(frames, generated, copies)
     looks = realism_sections(realism.table.to_pylist(), realism.attached(DISTRIBUTIONS).to_pylist())
+    refused = refusal_sections(shown)
     sheet = contact_sheet_sections(frames, frame_conditions, conditions)
     _, by_class = group_tables(rows, settings)
     words = _verdict(rows, settings, list(shown), paired)
@@ -105,6 +107,7 @@ def report(
         sections=[
             *results,
             *copied[:1],
+            *refused,
             *_figures(rows, frames, conditions, shown, more_real),
             *looks[:1],
             *_training_of_generators(checkpoints, checkpoint_names),
@@ -120,7 +123,7 @@ def report(
         ],
     )
     (out.folder / PAGE).write_text(page, encoding="utf-8")
-    kept = [table for table in (*results, *by_class, *copied) if isinstance(table, Table)]
+    kept = [table for table in (*results, *by_class, *copied, *refused) if isinstance(table, Table)]
     (out.folder / LATEX).write_text(render_latex(kept, title=title, lead=notice), encoding="utf-8")
     (out.folder / MARKDOWN).write_text(render_markdown(kept, title=title, lead=notice, verdict=words), encoding="utf-8")
     write_provenance(out.folder / PROVENANCE, records)

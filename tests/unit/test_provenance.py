@@ -207,6 +207,19 @@ def test_without_scores_of_samples_intervals_are_joined(store):
     assert scores.rows[0][4:] == ["-1.000 [-1.141, -0.859]", "intervals"]
 
 
+def test_what_is_no_report_of_this_version_is_refused(store, tmp_path):
+    with pytest.raises(DataError, match="a report of an earlier version must be made again"):
+        read_run("old", tmp_path)
+    run_of(store, "a", 5.0)
+    folder = store.parent / "reports" / "a"
+    pq.write_table(score_rows(5.0), folder / "scores.parquet")
+    with pytest.raises(DataError, match=r"scores.parquet: table 'traced_scores': missing columns"):
+        read_run("a", folder)
+    (folder / "scores.parquet").write_bytes(b"no table")
+    with pytest.raises(DataError, match=r"scores.parquet: is not a table of a report"):
+        read_run("a", folder)
+
+
 def test_runs_are_found_by_name_key_and_path(store, tmp_path):
     home = tmp_path / "home"
     run_of(store, "demo", 5.0)

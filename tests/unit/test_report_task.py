@@ -65,6 +65,17 @@ def test_tables_hold_what_the_page_holds(published):
     assert latex.count("{table}") == 2 * latex.count(r"\toprule") and "Data: `made up`." in markdown
 
 
+def test_several_sets_of_a_generator_and_more_real_frames_are_taken(experiment, tmp_path):
+    arguments = experiment.arguments
+    arguments |= {"generated": [*experiment.generated, experiment.generated[0]], "more_real": experiment.frames}
+    arguments |= {"copies": [*experiment.copies, experiment.copies[0]], "generator_names": ["synthetic", "gan", "gan"]}
+    report.function(Output(tmp_path, tmp_path), **arguments)
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<span>gan</span>") == 1 and "real, same moment" in page
+    roles = [record.role for record in read_provenance(tmp_path / "provenance.json")]
+    assert "frames of gan" in roles and len(roles) == len(set(roles))
+
+
 def test_a_report_differs_from_itself_in_nothing(published):
     scores, *others = compare_runs(read_run("a", published / "tiny"), read_run("b", published / "tiny"))
     assert not scores.bold and all(not table.rows for table in others)
