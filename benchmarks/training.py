@@ -216,7 +216,8 @@ def print_parts(
     print(
         f"  networks: {flops / 1e9:.1f} GFLOP, {rate / 1e9:,.0f} GFLOP/s, {rate / limit:.0%} of the {limit / 1e9:,.0f} "
         f"of a matrix product of {side} in {options.precision}; {max(0.0, for_one - slope):.0f} ms of a step do not "
-        f"depend on the batch\n  ratio were everything but the networks free: {its_step / for_many:.2f}",
+        f"depend on the batch; the whole step: {flops / step * 1e3 / limit:.0%}\n"
+        f"  ratio were everything but the networks free: {its_step / for_many:.2f}",
         flush=True,
     )
 
