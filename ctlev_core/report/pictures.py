@@ -104,13 +104,14 @@ def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: l
         members = [asked[synthetic.column("condition_id")[row]] for row in chosen]
         rows.append(("condition", [np.asarray(conditions.array("images")[row]) for row in members]))
     found = [matches[row] for row in chosen]
+    caption = "One column a sample, evenly spread, none chosen by eye."
     if any(match is not None for match in found):
-        blank = np.zeros_like(synthetic.array("frames")[0])
+        blank = np.full_like(synthetic.array("frames")[0], 128)
+        caption += " Grey: no real frame shows that moment." if any(match is None for match in found) else ""
         rows.append(("real, same moment", [blank if match is None else match for match in found]))
     for name, frames in generated.items():
         rows.append((name, [np.asarray(frames.array("frames")[row]) for row in chosen if row < len(frames)]))
     captions = [synthetic.column("class_name")[row] for row in chosen]
-    caption = "One column a sample, evenly spread, none chosen by eye."
     return ImageGrid("Asked for, and sampled", rows, column_labels=captions, caption=caption)
 
 

@@ -101,6 +101,7 @@ def test_grids_show_the_real_frame_of_the_same_moment(experiment):
     real = dict(grid.rows)["real, same moment"]
     # Every condition names recording r0, of which there is one frame.
     assert all(np.array_equal(image, experiment.frames.array("frames")[0]) for image in real)
+    assert "Grey" not in grid.caption
     without = sample_grid(experiment.conditions, {"synthetic": experiment.generated[0]}, [])
     assert [label for label, _ in without.rows] == ["condition", "synthetic"]
 
@@ -109,3 +110,28 @@ def test_runs_are_rows_that_follow_in_the_time_of_one_recording():
     sources = ["a:0", "a:100", "a:200", "b/c:50", "b/c:150", "b/c:20", "d", "d", "a:300"]
     found = [(name, rows.tolist(), step) for name, rows, step in runs(sources)]
     assert found == [("a", [0, 1, 2], 100.0), ("b/c", [3, 4], 100.0)]
+
+
+def test_moments_that_no_real_frame_shows_are_grey():
+    frames = np.zeros((2, 4, 4, 3), np.uint8)
+    columns = {
+        "sample_id": ["made0", "made1"], "condition_id": ["asked0", "asked1"], "source_id": ["a:5", "a:50"],
+        "class_name": ["x", "y"], "recording_id": ["a", "b"], "t_start_us": [0, 0], "t_end_us": [10, 90],
+    }  # fmt: skip
+
+    class Frames:
+        files = ()
+
+        def column(self, name):
+            return columns[name]
+
+        def array(self, _):
+            return frames
+
+        def __len__(self):
+            return 2
+
+    grid = sample_grid(Frames(), {"synthetic": Frames()}, [Frames()])
+    (label, (first, second)), _ = grid.rows
+    # Recording a is seen until 10 us; at 50 us there is no frame of it, but one of b.
+    assert label == "real, same moment" and not first.any() and (second == 128).all() and "Grey" in grid.caption
