@@ -19,6 +19,9 @@ FD, KID = "fd_event", "kid"
 OF_HALVES = "_halves"
 """Ends the name of a distance between halves of the sets, which compares with the floor: that of the reference's own
 halves, as small and as biased."""
+EXCESS = "_excess"
+"""Ends the name of a distance minus that of the reference, over the same conditions, seeds and real frames: what these
+have in common falls out, so that its interval is much narrower than that of either distance."""
 PIXEL_RMS, PIXEL_MAX = "pixel_rms_levels", "pixel_max_levels"
 LATENT_ERROR = "relative_latent_error"
 WASSERSTEIN, TRAJECTORY = "wasserstein_1", "trajectory_rms"
@@ -50,7 +53,8 @@ def feature_errors(sampled: FeatureSet, real: FeatureSet, reference: FeatureSet 
     """Frechet and kernel distances to held-out real frames and, unless None, to the frames of the reference.
 
     Distances to the reference are given between halves too, since those between the reference's own halves, `floors`,
-    are what a sampler of the same distribution would get.
+    are what a sampler of the same distribution would get; and where the rows are those of the reference's first rows,
+    how much farther they are from real frames than the reference, in pairs.
     """
     found = []
     for against, target in ((HELD_OUT, real), (REFERENCE, reference)):
@@ -61,7 +65,26 @@ def feature_errors(sampled: FeatureSet, real: FeatureSet, reference: FeatureSet 
             found.append(Measurement(name, against, estimate.value, count, estimate.low, estimate.high))
             if against == REFERENCE and not np.isnan(estimate.halved):
                 found.append(Measurement(name + OF_HALVES, against, estimate.halved, count))
+    if reference is not None and np.array_equal(sampled.groups, reference.groups[: len(sampled.groups)]):
+        found += _excess(sampled, reference, real)
     return found
+
+
+def _excess(sampled: FeatureSet, reference: FeatureSet, real: FeatureSet) -> list[Measurement]:
+    """Distances to real frames minus those of the reference, every half cut through both alike."""
+    width = sampled.features.shape[1]
+
+    def compute(first: np.ndarray, second: np.ndarray) -> dict[str, float]:
+        own, other = (_distances(first[:, side], second[:, side]) for side in (slice(width), slice(width, None)))
+        return {name: own[name] - other[name] for name in own}
+
+    beside = np.concatenate([sampled.features, reference.features[: len(sampled.features)]], axis=1)
+    targets = np.tile(real.features, 2)
+    estimates = estimate_distances(compute, beside, targets, predicted_groups=sampled.groups, target_groups=real.groups)
+    return [
+        Measurement(name + EXCESS, HELD_OUT, estimate.value, estimate.num_predicted, estimate.low, estimate.high)
+        for name, estimate in estimates.items()
+    ]
 
 
 def floors(reference: FeatureSet) -> list[Measurement]:
@@ -74,16 +97,15 @@ def floors(reference: FeatureSet) -> list[Measurement]:
 
 
 def _estimates(sampled: FeatureSet, target: FeatureSet) -> Mapping[str, DistanceEstimate]:
-    metrics = [plugins.load("metrics", name) for name in ("frechet", "kid")]
-    options = [metric.Options() for metric in metrics]
-
-    def compute(first: np.ndarray, second: np.ndarray) -> dict[str, float]:
-        fd, kid = (metric.compute(first, second, chosen) for metric, chosen in zip(metrics, options, strict=True))
-        return {FD: fd["fd"], KID: kid["kid"]}
-
     return estimate_distances(
-        compute, sampled.features, target.features, predicted_groups=sampled.groups, target_groups=target.groups
+        _distances, sampled.features, target.features, predicted_groups=sampled.groups, target_groups=target.groups
     )
+
+
+def _distances(first: np.ndarray, second: np.ndarray) -> dict[str, float]:
+    frechet, kernel = (plugins.load("metrics", name) for name in ("frechet", "kid"))
+    fd = frechet.compute(first, second, frechet.Options())["fd"]
+    return {FD: fd, KID: kernel.compute(first, second, kernel.Options())["kid"]}
 
 
 def pixel_error(frames: np.ndarray, solution: np.ndarray, groups: Sequence[str]) -> Measurement:

@@ -23,6 +23,7 @@ from ctlev_core.sampling_errors import (
     CONTROLNET,
     CONVERGED,
     CPU,
+    EXCESS,
     FD,
     HELD_OUT,
     KID,
@@ -58,15 +59,16 @@ class Recommendation:
 def recommend(rows: Sequence[Row]) -> Recommendation:
     """What to use, from rows of the table `speed_vs_error`.
 
-    A single point within the interval may be there by luck, so all points of its line with more evaluations must be
-    too. Below the interval is not worse than the reference, and counts as within.
+    Within: not above the interval's upper end, and by the paired difference, which tells more apart, not shown to be
+    farther from real frames than the reference. A single point may be there by luck, so all points of its line with
+    more evaluations must be too. Below the interval is not worse than the reference, and counts as within.
     """
     points = [row for row in rows_of(rows, FD, HELD_OUT) if row["line"] not in (REFERENCE_LINE, CONVERGED_LINE)]
     upper = next((row["high"] for row in rows_of(rows, FD, HELD_OUT) if row["line"] == REFERENCE_LINE), None)
     enough: list[Row] = []
     for line in dict.fromkeys(row["line"] for row in points):
         of_line = sorted((row for row in points if row["line"] == line), key=lambda row: -row["evaluations"])
-        beyond = [number for number, row in enumerate(of_line) if upper is None or row["value"] > upper]
+        beyond = [number for number, row in enumerate(of_line) if upper is None or _is_farther(rows, row, upper)]
         within = of_line[: beyond[0]] if beyond else of_line
         enough += within[-1:]
     quick = [row for row in points if QUICK[0] <= row["evaluations"] <= QUICK[1]]
@@ -74,6 +76,11 @@ def recommend(rows: Sequence[Row]) -> Recommendation:
         default=min(enough, key=lambda row: (row["evaluations"], row["value"]), default=None),
         quick=min(quick, key=lambda row: row["value"], default=None),
     )
+
+
+def _is_farther(rows: Sequence[Row], row: Row, upper: float) -> bool:
+    excess = find_row(rows, row["line"], row["num_inference_steps"], FD + EXCESS, HELD_OUT)
+    return row["value"] > upper or (excess is not None and excess["low"] is not None and excess["low"] > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,25 +190,27 @@ class SpeedPage:
             distance = self._at(point, FD, HELD_OUT)
             numbers = [
                 self._at(point, *what)
-                for what in ((KID, HELD_OUT), (FD + OF_HALVES, REFERENCE), (KID, REFERENCE), (PIXEL_RMS, CONVERGED))
+                for what in ((KID, HELD_OUT), (FD + OF_HALVES, REFERENCE), (PIXEL_RMS, CONVERGED))
             ]
-            scales = (1000, 1, 1000, 1)
+            scales = (1000, 1, 1)
             cells = [_digits(row, scale) for row, scale in zip(numbers, scales, strict=True)]
             cells += [_digits(self._at(point, label, LABELS))] if label else []
             networks = [f"{evaluations:g}", _digits(self._at(point, CONTROLNET, ""))]
             times = [_digits(self._at(point, seconds, ""), 1000) for seconds in (WALL, CPU)]
-            interval = "" if distance is None else _text(distance)
-            body.append([self._name(point[0]), *networks, *times, interval, *cells])
+            excess = self._at(point, FD + EXCESS, HELD_OUT)
+            intervals = ["" if row is None else _text(row) for row in (distance, excess)]
+            body.append([self._name(point[0]), *networks, *times, *intervals, *cells])
         columns = [
-            "sampler", "U-Net", "Control Net", "ms", "CPU ms", f"{FD}: real", f"{KID}: real", f"{FD}: ref.",
-            f"{KID}: ref.", "RMS",
+            "sampler", "U-Net", "Control Net", "ms", "CPU ms", f"{FD}: real", f"{FD}: excess", f"{KID}: real",
+            f"{FD}: ref.", "RMS",
         ]  # fmt: skip
         columns += [label.replace("_", " ")] if label else []
         caption = (
             "U-Net, ControlNet: evaluations an image, counted. ms: median time an image, batch by batch in one process "
             f"with the networks loaded and warm, on the machine as busy as it was. {FD}: Frechet distance, to "
-            f"{HELD_OUT} with its 95 % interval, and between halves to the reference's samples. {KID}: kernel distance "
-            "times 1,000, which has no bias. RMS: grey levels from the converged solution."
+            f"{HELD_OUT} with its 95 % interval, and between halves to the reference's samples. Excess: that to real "
+            f"frames minus the reference's, paired, with its 95 % interval. {KID}: kernel distance times 1,000, which "
+            "has no bias. RMS: grey levels from the converged solution."
         )
         caption += f" {label}: of a model trained on real frames, against the labels asked for." if label else ""
         return Table("Every setting", columns, body, caption=f"{caption} Bold: recommended.", bold=bold)

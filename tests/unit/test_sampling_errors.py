@@ -7,6 +7,7 @@ from scipy.linalg import sqrtm
 from ctlev_core.sampling_errors import (
     CONVERGED,
     CPU,
+    EXCESS,
     FD,
     HELD_OUT,
     KID,
@@ -49,6 +50,24 @@ def test_a_sampler_of_the_references_distribution_lies_within_its_floor_and_anot
     same = by_name(feature_errors(features(200, seed=5), real, reference))[FD + OF_HALVES, REFERENCE]
     other = by_name(feature_errors(features(200, 0.5, seed=6), real, reference))[FD + OF_HALVES, REFERENCE]
     assert floor.low < same.value < floor.high < other.value
+
+
+def test_in_pairs_a_small_difference_is_seen_that_the_distances_themselves_do_not_show():
+    """Noise of the rows, common to both, falls out; what is left is a shift that every row has."""
+    reference, real = features(100, 0.4, seed=9), features(200, seed=10)
+    worse = FeatureSet(reference.features + 0.05, reference.groups)
+    found = by_name(feature_errors(worse, real, reference))
+    alone, excess = found[FD, HELD_OUT], found[FD + EXCESS, HELD_OUT]
+    own = by_name(feature_errors(reference, real, None))[FD, HELD_OUT]
+    assert excess.value == pytest.approx(alone.value - own.value)
+    assert alone.low < own.value and excess.low > 0
+
+
+def test_other_rows_than_the_references_are_not_paired():
+    sampled, reference, real = features(40, seed=1), features(40, seed=2, per_group=4), features(60, seed=3)
+    assert (FD + EXCESS, HELD_OUT) not in by_name(feature_errors(sampled, real, reference))
+    first = FeatureSet(reference.features[:20], reference.groups[:20])
+    assert by_name(feature_errors(first, real, reference))[FD + EXCESS, HELD_OUT].num_samples == 20
 
 
 def test_rows_of_one_condition_are_not_independent():

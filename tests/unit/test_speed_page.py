@@ -7,7 +7,17 @@ import numpy as np
 from ctlev_core.report.html import Curves, render_report
 from ctlev_core.report.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
 from ctlev_core.report.speed_vs_error import SpeedPage, recommend
-from ctlev_core.sampling_errors import CONTROLNET, CONVERGED, FD, HELD_OUT, OF_HALVES, PIXEL_RMS, REFERENCE, WALL
+from ctlev_core.sampling_errors import (
+    CONTROLNET,
+    CONVERGED,
+    EXCESS,
+    FD,
+    HELD_OUT,
+    OF_HALVES,
+    PIXEL_RMS,
+    REFERENCE,
+    WALL,
+)
 
 
 def row(line, steps, value, metric=FD, against=HELD_OUT, low=None, high=None, study="generator"):
@@ -34,6 +44,12 @@ def test_a_lucky_point_is_not_recommended():
     """Within the interval at 5, but not at 10: more evaluations cannot be worse."""
     rows = [row("a", 5, 3.4), row("a", 10, 3.8), row("a", 20, 3.1), row("a", 30, 3.2)]
     assert chosen(rows) == [("a", 20), ("a", 5)]
+
+
+def test_what_is_farther_in_pairs_is_not_recommended():
+    rows = [row("a", 10, 3.1), row("a", 20, 3.0), row("a", 10, 0.2, FD + EXCESS, low=0.1, high=0.3)]
+    rows.append(row("a", 20, 0.1, FD + EXCESS, low=-0.1, high=0.3))
+    assert chosen(rows) == [("a", 20), ("a", 10)]
 
 
 def test_below_the_interval_is_not_worse():
