@@ -82,7 +82,8 @@ class Experiment(Frozen):
     )
     round_to_counts: bool = Field(
         False,
-        description="sampled frames become renderings of whole event counts, as real ones are; event histograms only",
+        description="sampled frames become, by dithering, renderings of whole event counts, as real ones are; of "
+        "event histograms only",
     )
     num_generators: int = Field(
         1,

@@ -179,7 +179,7 @@ def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manife
             raise DataError(f"{data.ref.path}: sample {shared[0]!r} is in the training data and in split {split!r}")
 
 
-@stage(version=3, schema=tables.SCORES)
+@stage(version=4, schema=tables.SCORES)
 def score_distance(
     out: Output,
     extractor: Manifest,
@@ -194,10 +194,10 @@ def score_distance(
 ) -> pa.Table:
     """Distances between the features of real training frames and of another set of frames.
 
-    The features are those of a classifier trained on real events, so a score is named after that classifier and never
-    `fid`. Values depend on the number of samples: compare rows of equal `num_samples` only, and read them against the
-    row of held-out real frames. Intervals come from halves by recording, for a bootstrap is biased. `seed` is that of
-    the generator.
+    A score is named after the classifier trained on real events whose features are compared, or as a ready-made
+    extractor asks: `fid` is that of the verified network alone. Values depend on the number of samples: compare rows of
+    equal `num_samples` only, and read them against the row of held-out real frames. Intervals come from halves by
+    recording, for a bootstrap is biased. `seed` is that of the generator.
     """
     plugin = plugins.load_options(downstream)
     folder = extractor.ref.path / "model"
@@ -218,12 +218,13 @@ def score_distance(
             target_groups=groups[1],
         )
         for name, estimate in estimates.items():
+            named = f"{name}_event_{plugin.name}_{extractor.ref.digest[:8]}"
             row = {
                 "task": "distance",
                 "setting": setting,
                 "seed": seed,
                 "group": "all",
-                "metric": f"{name}_event_{plugin.name}_{extractor.ref.digest[:8]}",
+                "metric": plugin.module.name_score(folder, name) if hasattr(plugin.module, "name_score") else named,
                 "value": estimate.value,
                 "low": None if np.isnan(estimate.low) else estimate.low,
                 "high": None if np.isnan(estimate.high) else estimate.high,

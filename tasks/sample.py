@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.condition_sources import sensor_size_of
+from ctlev_core.dithering import dither_counts
 from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
 from ctlev_core.row_seeds import row_seeds
 from ctlev_core.windows import spread, window_around
@@ -43,7 +44,7 @@ def sample(
 
     A row whose frame cannot be an event image, beside the training frames among `frames`, is sampled again, in all
     `max_tries` times. If the last is refused as well it is kept, and says why. With `rounding`, the encoding of the
-    training frames, each frame becomes the rendering of the event counts that it most probably shows.
+    training frames, each frame becomes the rendering of event counts that it is the expectation of.
     """
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
     folder = checkpoint.ref.path / "checkpoint"
@@ -57,13 +58,13 @@ def sample(
 
 
 def _rounded(made: GatedImages, frames: Manifest, encoding: EncodingChoice) -> np.ndarray:
-    """The frames as renderings of whole event counts."""
-    from ctlev_core.image_counts import estimate_counts, fit_counts  # here, because a cached run needs no numba
-
+    """The frames as renderings of whole event counts, as many as some window of training has."""
+    encoder = plugins.load_options(encoding)
     learnt = frames.rows_where(split="train")
-    learnt = learnt[spread(len(learnt), MAX_GATE_FRAMES)]
-    model = fit_counts(np.asarray(frames.array("histograms")[learnt]), plugins.load_options(encoding).options)
-    return estimate_counts(made.frames, model, seeds=made.seeds).frames
+    histograms = frames.array("histograms")
+    num_events = np.array([histograms[row].sum(dtype=np.int64) for row in learnt])
+    counts = dither_counts(made.frames, num_events, polarity=encoder.options.polarity, seeds=made.seeds)
+    return encoder.module.render_image(counts, encoder.options)
 
 
 def gate_of(frames: Manifest) -> ImageGate:

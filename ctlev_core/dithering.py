@@ -1,0 +1,47 @@
+"""Whole event counts from the grey values of a sampled image, by dithering.
+
+A decoder spreads what it is unsure of: where every other real window has one event it gives half of one, and such
+values no real image has. Dithering keeps the expected count of each pixel, so that sparse noise stays as dense as it
+was; the most probable count, which `ctlev_core.image_counts` finds, would remove it. The number of events is that of a
+real window drawn at random: normalised images say nothing about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def dither_counts(frames: np.ndarray, num_events: np.ndarray, *, polarity: bool, seeds: Sequence[int]) -> np.ndarray:
+    """Counts of each image: floor(expected count + u), u uniform between 0 and 1.
+
+    Args:
+        frames: [N, H, W, 3] uint8; with polarity red = positive and blue = negative (green is not looked at), without
+            the mean of the channels counts.
+        num_events: [R] events in each of R >= 1 real windows.
+        polarity: of the event histogram.
+        seeds: N seeds; a row depends on its own alone.
+    Returns:
+        [N, C, H, W] uint16, two channels with polarity. A black image stays without events.
+    Raises:
+        ValueError: another shape or dtype, another number of seeds, or no real window.
+    """
+    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
+        raise ValueError(f"frames must be [N, H, W, 3] uint8, got {frames.shape} {frames.dtype}")
+    if len(seeds) != len(frames) or not len(num_events):
+        raise ValueError(
+            f"expected one seed a frame and real windows, got {len(seeds)} seeds for {len(frames)} frames and "
+            f"{len(num_events)} windows"
+        )
+    channels = 2 if polarity else 1
+    counts = np.zeros((len(frames), channels, *frames.shape[1:3]), np.uint16)
+    for row, seed in enumerate(seeds):
+        rng = np.random.default_rng(seed)
+        values = frames[row][..., [0, 2]] if polarity else frames[row].mean(axis=2, keepdims=True)
+        total = values.sum(dtype=np.float64)
+        if total == 0:
+            continue
+        expected = values * (rng.choice(num_events) / total)
+        counts[row] = np.minimum(expected + rng.random(expected.shape), 65535).transpose(2, 0, 1)
+    return counts
