@@ -10,6 +10,7 @@ Effect Measures, Statistics in Medicine 2008.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,6 +53,41 @@ class Run:
     records: list[Record]
     scores: list[dict[str, Any]]
     trainings: dict[tuple[str, str], Trainings]
+
+
+def find_run(name: str, home: Path) -> Path:
+    """The folder with the tables of a run's report.
+
+    Args:
+        name: of a report in the home; the first digits of the key of a report's artefact, six or more; or the path of a
+            report, of its folder, or of a file in it.
+        home: folder of all state.
+    Raises:
+        DataError: there is no such run, or more than one.
+    """
+    path = Path(name)
+    if path.suffix == ".html" and path.is_file():
+        return path.with_suffix("")
+    for folder in (path, path.parent, home / "reports" / name):
+        if (folder / "provenance.json").is_file() and (folder != path.parent or path.is_file()):
+            return folder
+    keys = []
+    if re.fullmatch(r"[0-9a-f]{6,32}", name):
+        keys = [folder for folder in (home / "artefacts" / "report").glob(f"{name}*") if folder.is_dir()]
+    if len(keys) == 1:
+        return keys[0]
+    if keys:
+        raise DataError(f"run {name!r}: {len(keys)} reports have keys that start so; give more digits")
+    raise DataError(
+        f"run {name!r}: is neither the path of a report nor one of {home}, which has {_known(home)}; reports of "
+        "earlier versions, without provenance.json, must be made again"
+    )
+
+
+def _known(home: Path) -> str:
+    names = sorted(path.parent.name for path in (home / "reports").glob("*/provenance.json"))
+    keys = sorted(path.name[:12] for path in (home / "artefacts" / "report").glob("*") if path.is_dir())
+    return f"reports {', '.join(names) or '(none)'} and keys {', '.join(keys) or '(none)'}"
 
 
 def read_run(name: str, folder: Path) -> Run:

@@ -18,11 +18,10 @@ from ctlev_core.provenance import (
     write_provenance,
 )
 from ctlev_core.report.costs import cost_table, options_table, versions_table
-from ctlev_core.run_comparison import Run, compare_runs, read_run
+from ctlev_core.run_comparison import Run, compare_runs, find_run, read_run
 from ctlev_core.traced_scores import TRACED_SCORES, paired_samples, trace_scores
 from data_contracts import tables
 from data_contracts.errors import DataError
-from flows.compare import find_run
 
 PLUGIN = {"plugin": "datasets/studio", "version": 3, "options": {"seed": 0, "sizes": [64, 64]}}
 NAMES = [f"s{number}" for number in range(30)]
