@@ -13,7 +13,6 @@ import torch
 from torch import nn
 
 from ctlev_core.supervised_options import SupervisedOptions
-from ctlev_core.training_rows import batch_rows as batch_rows
 from data_contracts.errors import DataError
 from data_contracts.manifest import file_digest
 

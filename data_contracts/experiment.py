@@ -56,7 +56,7 @@ class Experiment(Frozen):
     compared; None leaves the comparison out.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9._-]+$", description="names the experiment and its report")
+    name: str = Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", description="names the experiment and its report")
     data_notice: str = Field("", description="first line of the report: what data this is")
     seed: int = Field(0, ge=0, description="seed of conditions, fine-tuning and sampling")
     dataset: DatasetChoice

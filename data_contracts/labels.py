@@ -197,7 +197,7 @@ class BodyMotions:
     def __len__(self) -> int:
         return len(self.moment_us)
 
-    def take(self, rows: slice) -> BodyMotions:
+    def take(self, rows: slice | np.ndarray) -> BodyMotions:
         """Some of the rows."""
         return BodyMotions(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
@@ -251,11 +251,12 @@ class Conditions:
     def __len__(self) -> int:
         return len(self.prompts)
 
-    def take(self, rows: slice) -> Conditions:
+    def take(self, rows: slice | np.ndarray) -> Conditions:
         """Some of the rows."""
         images = None if self.images is None else self.images[rows]
         motions = None if self.motions is None else self.motions.take(rows)
-        return Conditions(self.prompts[rows], images, motions)
+        prompts = np.array(self.prompts, object)[rows]
+        return Conditions(tuple(prompts), images, motions)
 
 
 @dataclass

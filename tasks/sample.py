@@ -19,7 +19,6 @@ from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events
-from data_contracts.labels import Conditions
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, conditions_of
 from tasks.stage import Output, input_files_of, stage
 
@@ -50,9 +49,12 @@ def sample(
     folder = checkpoint.ref.path / "checkpoint"
 
     def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
-        return plugin.module.sample(folder, _take(asked, rows), plugin.options, seeds=seeds, work=out.work)
+        return plugin.module.sample(folder, asked.take(rows), plugin.options, seeds=seeds, work=out.work)
 
-    made = sample_until_accepted(sample_rows, row_seeds(seed, len(asked)), gate_of(frames), max_tries=max_tries)
+    seeds = row_seeds(seed, len(asked))
+    if getattr(plugin.options, "noise", None) == "shared":
+        seeds = seeds[:1] * len(seeds)  # said here, so that every row is told the seed it was made from
+    made = sample_until_accepted(sample_rows, seeds, gate_of(frames), max_tries=max_tries)
     out.write_array("frames", made.frames if rounding is None else _rounded(made, frames, rounding))
     return _table(conditions, plugin, checkpoint.ref.digest, made)
 
@@ -72,12 +74,6 @@ def gate_of(frames: Manifest) -> ImageGate:
     rows = frames.rows_where(split="train")
     real = np.asarray(frames.array("frames")[rows[spread(len(rows), MAX_GATE_FRAMES)]])
     return fit_gate(real, polarity=not real[..., 1].any())
-
-
-def _take(conditions: Conditions, rows: np.ndarray) -> Conditions:
-    """Some of the rows, which are text or images: bodies in motion are filmed, not sampled."""
-    images = None if conditions.images is None else np.asarray(conditions.images[rows])
-    return Conditions(tuple(conditions.prompts[row] for row in rows), images)
 
 
 @stage(version=2, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"))

@@ -26,7 +26,8 @@ from ctlev_core.event_gan.local_statistics import local_statistics_error
 from ctlev_core.event_gan.networks import EventVolumeUNet, build_discriminator, generator_arguments
 from ctlev_core.event_gan.options import SamplingOptions, TrainingOptions
 from ctlev_core.event_gan.sampling import sample_frames
-from ctlev_core.supervised import batch_rows, build_seeded, resolve_device
+from ctlev_core.supervised import build_seeded, resolve_device
+from ctlev_core.training_rows import batch_rows
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
