@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core import supervised
+from ctlev_core import supervised, training_rows
 from ctlev_core.event_gan import batches, training
 from ctlev_core.event_gan.event_images import pairs_to_tensor
 from ctlev_core.generators import event_gan
@@ -248,7 +248,7 @@ def test_augmentation_mirrors_pair_and_events_alike():
     data, cpu = square_pairs(8), torch.device("cpu")
     straight = batches.make_batch(data, event_gan.Options(batch_size=8, flip=0, appearance=0), 0, 3, cpu)
     mirrored = batches.make_batch(data, event_gan.Options(batch_size=8, flip=1, appearance=0.2), 0, 3, cpu)
-    rows = supervised.batch_rows(8, 8, 0, 3)
+    rows = training_rows.batch_rows(8, 8, 0, 3)
     assert torch.equal(straight.pairs, pairs_to_tensor(data.conditions[rows]))
     assert torch.equal(straight.seen, straight.pairs)
     assert torch.equal(mirrored.pairs, straight.pairs.flip(-1, -2))
