@@ -121,6 +121,9 @@ class SpeedPage:
                 f"Recommended: {_named(found.default)}, {fewer:.0f} times fewer than the reference's. Frechet distance "
                 f"to {HELD_OUT} {found.default['value']:.3g}; {band}."
             ]
+            pixels = self._row(found.default["line"], PIXEL_RMS, CONVERGED, found.default["num_inference_steps"])
+            if pixels is not None:
+                sentences.append(f"Its images differ from the converged solution by {pixels['value']:.2g} grey levels.")
         if found.quick is not None:
             sentences.append(
                 f"Of {QUICK[0]} to {QUICK[1]} evaluations: {_named(found.quick)}, {found.quick['value']:.3g}, "

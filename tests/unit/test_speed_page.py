@@ -99,6 +99,7 @@ def test_the_verdict_says_what_was_found():
     text = page(ROWS, own=("UniPC", 5)).verdict()
     assert text.startswith("Recommended: UniPC in 10 evaluations, 25 times fewer than the reference's.")
     assert "the reference, ddpm in 250 steps, has 3 [2.5, 3.5]" in text
+    assert "differ from the converged solution by 12 grey levels" in text
     assert "The experiment's own setting, UniPC in 5 evaluations: 8, above the interval." in text
     worse = [*ROWS, row("UniPC", 20, 4.0)]
     assert page(worse).verdict().startswith("No setting stays within the interval")
