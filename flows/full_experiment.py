@@ -73,6 +73,7 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
         evaluation.models,
         looks,
         copies,
+        dataset.more_frames,
         title=experiment.name,
         notice=experiment.data_notice,
         settings=experiment.trained_settings,
