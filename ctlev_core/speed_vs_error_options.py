@@ -20,6 +20,11 @@ class SamplerLine(Frozen):
     )
     steps: tuple[int, ...] = Field(min_length=1, description="num_inference_steps, one measurement each")
 
+    def over(self, options: dict[str, Any], num_inference_steps: int) -> dict[str, Any]:
+        """Sampling options of one point, over others; their spacing is not kept where the line chooses a solver."""
+        kept = {name: value for name, value in options.items() if name != "spacing" or "scheduler" not in self.options}
+        return kept | self.options | {"num_inference_steps": num_inference_steps}
+
 
 class SamplerSetting(Frozen):
     """One point of a line."""

@@ -47,8 +47,7 @@ class SpeedVsError(BaseModel):
     def sampling(self, line: SamplerLine, steps: int) -> SamplingChoice:
         """The experiment's sampling, changed by a line."""
         choice = self.experiment.sampling_choice
-        changed = choice.options | line.options | {"num_inference_steps": steps}
-        return choice.model_copy(update={"options": changed})
+        return choice.model_copy(update={"options": line.over(choice.options, steps)})
 
     def points(self) -> Iterator[tuple[SamplerSetting, SamplingChoice]]:
         """Reference, converged solution, then every point of every line."""

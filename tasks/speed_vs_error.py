@@ -218,10 +218,7 @@ def precision_errors(
     _, asked, seeds = _asked(conditions, options.num_images, seed)
     own = plugins.load_options(sampling).options
     settings = [(name, line, steps) for name, line in options.lines.items() for steps in line.steps]
-    chosen = [
-        type(own).model_validate(own.model_dump() | line.options | {"num_inference_steps": steps})
-        for _, line, steps in settings
-    ]
+    chosen = [type(own).model_validate(line.over(own.model_dump(), steps)) for _, line, steps in settings]
     found = core_precision_errors(checkpoint.ref.path / "checkpoint", asked, chosen, seeds=seeds)
     rows: list[dict[str, Any]] = []
     for (name, _, steps), errors in zip(settings, found, strict=True):
