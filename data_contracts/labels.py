@@ -242,11 +242,13 @@ class Conditions:
         prompts: N text prompts.
         images: [N, H, W, 3] uint8 condition images, or None for the text route.
         motions: what N bodies do, for a generator that films them; else None.
+        class_names: N classes, whose names may take turns while a generator learns; else None.
     """
 
     prompts: tuple[str, ...]
     images: np.ndarray | None = None
     motions: BodyMotions | None = None
+    class_names: tuple[str, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.prompts)
@@ -255,8 +257,8 @@ class Conditions:
         """Some of the rows."""
         images = None if self.images is None else self.images[rows]
         motions = None if self.motions is None else self.motions.take(rows)
-        prompts = np.array(self.prompts, object)[rows]
-        return Conditions(tuple(prompts), images, motions)
+        names = None if self.class_names is None else tuple(np.array(self.class_names, object)[rows])
+        return Conditions(tuple(np.array(self.prompts, object)[rows]), images, motions, names)
 
 
 @dataclass

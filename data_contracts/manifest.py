@@ -261,7 +261,7 @@ def conditions_of(manifest: Manifest) -> Conditions:
     motions = None
     if all(f"{array}.npy" in manifest.files for array in arrays.values()):
         motions = BodyMotions(**{name: np.asarray(manifest.array(array)) for name, array in arrays.items()})
-    return Conditions(tuple(manifest.column("prompt")), images, motions)
+    return Conditions(tuple(manifest.column("prompt")), images, motions, tuple(manifest.column("class_name")))
 
 
 def condition_arrays(conditions: Conditions) -> dict[str, np.ndarray]:

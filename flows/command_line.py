@@ -143,6 +143,8 @@ def main(
     Returns:
         Exit status: 0 done, 2 wrong input, 130 interrupted.
     """
+    if os.environ.get("LOCAL_RANK", "0") != "0":
+        return 0  # under `accelerate launch` one process runs the flow; training starts the others itself
     arguments = _parse(flow, default_preset)
     started = time.perf_counter()
     try:

@@ -19,7 +19,7 @@ from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.labels import Conditions, History
 
-VERSION = 1
+VERSION = 2
 
 
 class Options(FineTuningOptions):
@@ -64,7 +64,15 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
 
     _check_text_only(conditions)
     return train_checkpoint(
-        frames, conditions, options, tune=options.tune, with_controlnet=False, seed=seed, out=out, work=work
+        frames,
+        conditions,
+        options,
+        tune=options.tune,
+        with_controlnet=False,
+        class_names=conditions.class_names,
+        seed=seed,
+        out=out,
+        work=work,
     )
 
 
