@@ -197,7 +197,7 @@ def sample_checkpoint(
     _check_scheduler(checkpoint, options)
     devices, identity = device_names(options.device), _checkpoint_digest(checkpoint)
     if len(devices) == 1 or not len(conditions):
-        prior = _load(checkpoint, options, devices[0], with_controlnet)
+        prior = load_for_sampling(checkpoint, options, devices[0], with_controlnet)
         return sample_frames(prior, conditions, options, seeds=seeds, work=work, identity=identity)
     _check_seeds(conditions, seeds)
     shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
@@ -219,13 +219,13 @@ def _sample_share(
     report: Callable[[int], None],
 ) -> None:
     """What the process of one device does."""
-    prior = _load(checkpoint, options, device, with_controlnet)
+    prior = load_for_sampling(checkpoint, options, device, with_controlnet)
     for shard in shards:
         _check_conditions(prior, shard.conditions, shard.seeds)
     sample_shards(prior, prompts, shards, options, report)
 
 
-def _load(checkpoint: Path, options: SamplingOptions, device: str, with_controlnet: bool) -> Prior:
+def load_for_sampling(checkpoint: Path, options: SamplingOptions, device: str, with_controlnet: bool) -> Prior:
     """The networks in the precision asked for. The patch code stays in float32, where it is exact and takes no time."""
     from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 

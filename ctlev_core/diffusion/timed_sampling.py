@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.diffusion.sampling import _load, sample_frames
+from ctlev_core.diffusion.sampling import load_for_sampling, sample_frames
 from ctlev_core.diffusion.sampling_devices import device_names
 from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
 from data_contracts.labels import Conditions
@@ -49,7 +49,7 @@ def sample_timed(
         seeds: N non-negative integers.
         work: for files that are deleted again: a time may not come from a shard of an earlier run.
     """
-    prior = _load(checkpoint, options, device_names(options.device)[0], conditions.images is not None)
+    prior = load_for_sampling(checkpoint, options, device_names(options.device)[0], conditions.images is not None)
     seeds = noise_seeds(seeds, options)  # before batches are cut: shared noise is that of the first row of all
     made: list[np.ndarray] = []
     costs: list[list[float]] = []
