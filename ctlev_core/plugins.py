@@ -408,6 +408,8 @@ def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: s
             option = ".".join(str(part) for part in problem["loc"])
             if problem["type"] == "extra_forbidden":
                 lines.append(f"unknown option {option!r}; known: {known}")
+            elif problem["type"] == "path_type":
+                lines.append(f"option {option!r} must be a path, got {problem['input']!r}; --set ...{option}=PATH")
             else:
                 lines.append(f"option {option!r}: {problem['msg'].lower()}, got {problem['input']!r}")
         raise PluginError(f"{where}: " + "; ".join(lines)) from None

@@ -2,8 +2,8 @@
 
 Source: ControlEvents (Hu et al., WACV 2026), class-conditioned route: Stable Diffusion v1.4, U-Net trained,
 autoencoder and text encoder frozen, prompts "A photo of {class}". The bundled small prior stands in for Stable
-Diffusion unless a folder is given. Differences: averaged weights and min-SNR loss weights, both can be switched off; a
-20-step solver instead of 1000 DDPM steps.
+Diffusion unless a folder is given. Differences: averaged weights, which can be switched off; a 20-step solver instead
+of 1000 DDPM steps.
 """
 
 from __future__ import annotations
