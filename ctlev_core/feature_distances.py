@@ -19,10 +19,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from ctlev_core.intervals import MIN_RECORDINGS
+from ctlev_core.plugins import Plugin
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,20 @@ def estimate_distances(
             num_features=predicted.shape[1],
         )
     return found
+
+
+def name_distance(plugin: Plugin, folder: Path, digest: str, score: str) -> str:
+    """What a distance is called: as a ready-made extractor asks, else `fd_event_<plug-in>_<digest>`, never `fid`.
+
+    Args:
+        plugin: the feature extractor.
+        folder: its model.
+        digest: of the extractor's artefact; two classifiers trained on other frames are two scores.
+        score: as `compute` of the metric names it, such as `fd`.
+    """
+    if hasattr(plugin.module, "name_score"):
+        return plugin.module.name_score(folder, score)
+    return f"{score}_event_{plugin.name}_{digest[:8]}"
 
 
 def _members(rows: np.ndarray, groups: Sequence[str] | np.ndarray | None) -> list[np.ndarray]:

@@ -32,7 +32,7 @@ def check_gates(
     """
     checks: list[GateCheck] = []
     if gates.max_distance_ratio is not None:
-        floor, value = (_find(scores, "distance", setting, "fd_event_") for setting in (HELD_OUT, SYNTHETIC))
+        floor, value = (_find(scores, "distance", setting, ("fd_event_", "fid")) for setting in (HELD_OUT, SYNTHETIC))
         score = "Frechet distance to the real training frames"
         checks.append(_check("max_distance_ratio", score, value["value"], gates.max_distance_ratio * floor["value"]))
     if gates.max_label_error_ratio is not None:
@@ -42,9 +42,12 @@ def check_gates(
             _check("max_label_error_ratio", score, _error(value), gates.max_label_error_ratio * _error(floor))
         )
     if gates.max_copies_share is not None:
-        shares = [row["value"] for row in scores if row["task"] == "copies" and row["metric"] == "close_share"]
+        copies = [row for row in scores if row["task"] == "copies"]
+        shares = [row["value"] for row in copies if row["metric"] == "close_share"]
         if not shares:
             raise DataError("gate max_copies_share: nothing was searched for copies")
+        # Where many real frames are alike the threshold of `close_share` is 0, which no distance is below.
+        shares += [row["value"] / row["num_samples"] for row in copies if row["metric"] == "duplicates"]
         checks.append(_check("max_copies_share", "share of copies", max(shares), gates.max_copies_share))
     if gates.max_refused_share is not None:
         score = "share of frames that are no event images"
@@ -56,7 +59,9 @@ def _check(gate: str, score: str, value: float, limit: float) -> GateCheck:
     return GateCheck(gate=gate, score=score, value=float(value), limit=float(limit))
 
 
-def _find(scores: Sequence[dict[str, Any]], task: str, setting: str, metric: str = "") -> dict[str, Any]:
+def _find(
+    scores: Sequence[dict[str, Any]], task: str, setting: str, metric: str | tuple[str, ...] = ""
+) -> dict[str, Any]:
     """The first score of a task and setting, of all data, whose name starts so."""
     for row in scores:
         if (row["task"], row["setting"], row["group"]) == (task, setting, "all") and row["metric"].startswith(metric):

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.feature_distances import estimate_distances
+from ctlev_core.feature_distances import estimate_distances, name_distance
 from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
@@ -218,13 +218,12 @@ def score_distance(
             target_groups=groups[1],
         )
         for name, estimate in estimates.items():
-            named = f"{name}_event_{plugin.name}_{extractor.ref.digest[:8]}"
             row = {
                 "task": "distance",
                 "setting": setting,
                 "seed": seed,
                 "group": "all",
-                "metric": plugin.module.name_score(folder, name) if hasattr(plugin.module, "name_score") else named,
+                "metric": name_distance(plugin, folder, extractor.ref.digest, name),
                 "value": estimate.value,
                 "low": None if np.isnan(estimate.low) else estimate.low,
                 "high": None if np.isnan(estimate.high) else estimate.high,

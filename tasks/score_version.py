@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.feature_distances import name_distance
 from ctlev_core.version_gates import HELD_OUT, SYNTHETIC
 from ctlev_core.windows import spread
 from data_contracts import tables
@@ -56,7 +57,7 @@ def score_beside_real(
                     "setting": setting,
                     "seed": 0,
                     "group": "all",
-                    "metric": f"{name}_event_{plugin.name}_{extractor.ref.digest[:8]}",
+                    "metric": name_distance(plugin, folder, extractor.ref.digest, name),
                     "value": value,
                     "low": None,
                     "high": None,

@@ -12,7 +12,7 @@ from ctlev_core.paired_differences import Difference
 
 __all__ = ["Difference", "lower_is_better", "verdict"]
 
-_LOWER = ("mpjpe", "pve", "fd_", "kid", "error", "calibration_error")
+_LOWER = ("mpjpe", "pve", "fd_", "fid", "kid", "error", "calibration_error")
 
 
 def lower_is_better(metric: str) -> bool:

@@ -12,7 +12,7 @@ DIGEST = "0123abcd"
 
 
 def row(task, setting, metric, value, group="all"):
-    return {"task": task, "setting": setting, "metric": metric, "value": value, "group": group}
+    return {"task": task, "setting": setting, "metric": metric, "value": value, "group": group, "num_samples": 1000}
 
 
 def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px"):
@@ -107,3 +107,10 @@ def test_a_distance_that_cannot_be_measured_is_refused_unless_it_is_not_asked_fo
         Regeneration.model_validate(WITH_FEATURES | {"distances": [{"name": "kid"}]})
     assert Regeneration.model_validate(WITH_FEATURES).gates == Gates()
     assert Regeneration.model_validate(EXPERIMENT | {"gates": {"max_distance_ratio": None}}).new_poses
+
+
+def test_exact_copies_count_even_where_real_frames_are_alike():
+    found = [r for r in scores() if r["metric"] != "duplicates"]
+    found.append(row("copies", "synthetic", "duplicates", 100.0, "small pictures"))
+    (judged,) = check({"max_copies_share": 0.05}, found)
+    assert judged.value == 0.1 and judged.value > judged.limit
