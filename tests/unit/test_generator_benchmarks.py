@@ -189,6 +189,7 @@ def test_gpu_benchmark_says_that_there_is_no_gpu(benchmarks, capsys, monkeypatch
 TOY = ["--device", "cpu", "--size", "tiny", "--image-size", "64", "--batch-size", "1", "--rounds", "1", "--steps", "1"]
 
 
+@pytest.mark.slow
 def test_gpu_benchmark_in_small(benchmarks, capsys, monkeypatch):
     """Every function of it; compiling takes minutes and is switched off, the lines around it run."""
     parts = ["sampling", "sampling_compiled", "controlnet_compiled", "text"]

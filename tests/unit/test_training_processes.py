@@ -58,10 +58,10 @@ def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder):
     for name in ("unet", "controlnet"):
         states = [getattr(prior, name).state_dict() for prior in (one, two, start)]
         for key, value in states[0].items():
-            # Sums in another order. Adam divides by the gradient's size, which makes more of rounding where that is 0.
-            torch.testing.assert_close(
-                value, states[1][key], rtol=0, atol=1e-5, msg=lambda text, key=key: f"{key} {text}"
-            )
+            # Sums in another order: rounding, 1e-7 of weights of about 1. Adam divides by the gradient's size, so that
+            # where it is nothing but rounding a single weight goes elsewhere, by less than a step.
+            difference = (value - states[1][key]).abs()
+            assert difference.mean() < 1e-6 and difference.max() < OPTIONS.learning_rate / 10, key
         assert max((states[0][key] - states[2][key]).abs().max().item() for key in states[0]) > 1e-3
     assert together.step == alone.step and together.kept_step == alone.kept_step
     for name in ("loss", "validation_loss", "shuffled_loss"):
