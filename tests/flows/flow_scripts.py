@@ -41,7 +41,7 @@ def script(name: str, *arguments: str, home: Path, **popen) -> subprocess.Popen:
     )
 
 
-def run_script(name: str, *arguments: str, home: Path, timeout: float = 300) -> Finished:
+def run_script(name: str, *arguments: str, home: Path, timeout: float = 500) -> Finished:
     """Run a flow script to its end."""
     process = script(name, *arguments, home=home)
     output, errors = process.communicate(timeout=timeout)
