@@ -7,13 +7,12 @@ steps and not in epochs. Everything a step does is a function of (seed, step, da
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +22,7 @@ from tqdm import tqdm
 from ctlev_core.supervised import digest
 from ctlev_core.supervised_options import SupervisedOptions
 from ctlev_core.training_rows import TrainingRows
+from ctlev_core.training_state import read_training_state, write_training_state
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
@@ -221,7 +221,7 @@ class _Run:
         return Training(state.history, record)
 
     def save(self, path: Path) -> None:
-        """Write everything needed to go on; a kill at any moment leaves the old file or the new one."""
+        """Write everything needed to go on, atomically."""
         content = {
             "identity": self.identity,
             "model": self.model.state_dict(),
@@ -229,21 +229,13 @@ class _Run:
             "best": self.best,
             "state": asdict(self.state),
         }
-        temporary = path.with_suffix(".tmp")
-        with temporary.open("wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        write_training_state(path, content)
 
     def restore(self, path: Path) -> None:
         """Go on from a saved state, if there is one of this run."""
         if not path.exists():
             return
-        try:
-            content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:
-            raise TrainingError(f"{path}: saved state cannot be read, delete it to start anew: {error}") from error
+        content = read_training_state(path, "cpu")
         if content.get("identity") != self.identity:
             return
         self.model.load_state_dict(content["model"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from ctlev_core.diffusion.muon import Muon
 from ctlev_core.diffusion.training_options import TrainingOptions
+from ctlev_core.training_state import read_training_state, write_training_state
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
@@ -168,7 +168,6 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write everything needed to go on, atomically."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         state = {
             "identity": self.identity,
             "step": self.step,
@@ -183,9 +182,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "scaler": self.scaler.state_dict(),
         }
-        temporary = path.with_suffix(".tmp")
-        torch.save(state, temporary)
-        os.replace(temporary, path)
+        write_training_state(path, state)
 
     def restore(self, path: Path) -> None:
         """Go on from a saved state.
@@ -193,12 +190,7 @@ class Trainer:
         Raises:
             TrainingError: the state is of another run or cannot be read.
         """
-        try:
-            state = torch.load(path, map_location=self.parameters[0].device, weights_only=True)
-        except Exception as error:
-            raise TrainingError(
-                f"{path}: saved training state cannot be read, delete it to start anew: {error}"
-            ) from error
+        state = read_training_state(path, self.parameters[0].device)
         if state["identity"] != self.identity:
             raise TrainingError(
                 f"{path}: saved training state is of another run, delete it to start anew; "

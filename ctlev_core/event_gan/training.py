@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +26,7 @@ from ctlev_core.event_gan.options import SamplingOptions, TrainingOptions
 from ctlev_core.event_gan.sampling import sample_frames
 from ctlev_core.supervised import build_seeded, resolve_device
 from ctlev_core.training_rows import batch_rows
+from ctlev_core.training_state import read_training_state, write_training_state
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
@@ -191,13 +190,10 @@ class EventGAN:
 
     def save(self, path: Path) -> None:
         """Write everything needed to go on, atomically."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         state = {"identity": self.identity, "step": self.step, "pending": self.pending, "best": self.best}
         state["curves"] = asdict(self.curves)
         state |= {name: getattr(self, name).state_dict() for name in _STATEFUL}
-        temporary = path.with_suffix(".tmp")
-        torch.save(state, temporary)
-        os.replace(temporary, path)
+        write_training_state(path, state)
 
     def restore(self, path: Path) -> None:
         """Go on from a saved state.
@@ -205,12 +201,7 @@ class EventGAN:
         Raises:
             TrainingError: the state is of another run or cannot be read.
         """
-        try:
-            state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
-        except Exception as error:
-            raise TrainingError(
-                f"{path}: saved training state cannot be read, delete it to start anew: {error}"
-            ) from error
+        state = read_training_state(path, self.device)
         if state["identity"] != self.identity:
             raise TrainingError(f"{path}: saved training state is of another run, delete it to start anew")
         for name in _STATEFUL:
