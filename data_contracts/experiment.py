@@ -23,6 +23,10 @@ from data_contracts.event_export import EventExport
 Setting = Literal["real", "synthetic", "real+synthetic"]
 PoseOrder = Literal["random", "in_time"]
 PoseViews = Literal["labelled", "new"]
+LABELS_OF = "labels of"
+"""Settings that start so score frames of a generator against the labels they were made from."""
+SHUFFLED = f"shuffled {LABELS_OF}"
+"""Settings that start so score the same frames against the labels of others: how bad no faithfulness at all is."""
 RESERVED = ("real", "synthetic", "more_real", "faithful")
 
 

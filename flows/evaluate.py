@@ -6,7 +6,7 @@ import sys
 from functools import partial
 
 from data_contracts.config import DownstreamChoice, Frozen
-from data_contracts.experiment import Experiment, share_name
+from data_contracts.experiment import LABELS_OF, SHUFFLED, Experiment, share_name
 from data_contracts.manifest import ManifestRef
 from flows.baselines import BaselineFrames, baselines
 from flows.command_line import main
@@ -14,7 +14,7 @@ from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from flows.synthesize import synthesize
 from tasks.downstream import train_downstream
-from tasks.evaluate import LABELS_OF, SHUFFLED, score_distance, score_model
+from tasks.evaluate import score_distance, score_model
 from tasks.stage import call_flow, call_together, numbered
 from tasks.subset import take_faithful, take_share
 
@@ -74,7 +74,7 @@ def _train_and_score(
         for name, sets in generated.items():
             made = _of_seed(experiment, sets, seed)
             tested += [(made, "train", f"{LABELS_OF} {name}", [])]
-            tested += [(made, "train", f"{SHUFFLED} {LABELS_OF} {name}", [])] * (name == "synthetic")
+            tested += [(made, "train", f"{SHUFFLED} {name}", [])] * (name == "synthetic")
     scores = [
         score_model(
             model,

@@ -16,6 +16,7 @@ import numpy as np
 from ctlev_core.report.refusals import count_refusals
 from ctlev_core.version_gates import check_gates
 from data_contracts.config import Frozen
+from data_contracts.experiment import LABELS_OF
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.published import StoredArtefact, Version, published_folder, version_file
 from data_contracts.regeneration import Regeneration
@@ -25,7 +26,7 @@ from flows.settings import flow
 from flows.train_generator import train_generator
 from tasks.copy_check import copy_check
 from tasks.downstream import train_downstream
-from tasks.evaluate import LABELS_OF, score_model
+from tasks.evaluate import score_model
 from tasks.publish import claimed, next_number
 from tasks.sample import sample
 from tasks.score_version import score_beside_real

@@ -15,13 +15,10 @@ from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
+from data_contracts.experiment import SHUFFLED
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
-LABELS_OF = "labels of"
-"""Settings that start so score frames of a generator against the labels they were made from."""
-SHUFFLED = "shuffled"
-"""Settings that start so score the same frames against the labels of others: how bad no faithfulness at all is."""
 SHUFFLE_STREAM = 40
 
 

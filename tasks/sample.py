@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.condition_sources import sensor_size_of
+from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
 from ctlev_core.dithering import dither_counts
 from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
 from ctlev_core.row_seeds import row_seeds
@@ -52,8 +53,8 @@ def sample(
         return plugin.module.sample(folder, asked.take(rows), plugin.options, seeds=seeds, work=out.work)
 
     seeds = row_seeds(seed, len(asked))
-    if getattr(plugin.options, "noise", None) == "shared":
-        seeds = seeds[:1] * len(seeds)  # said here, so that every row is told the seed it was made from
+    if isinstance(plugin.options, SamplingOptions):
+        seeds = noise_seeds(seeds, plugin.options)  # here, so that every row is told the seed it was made from
     made = sample_until_accepted(sample_rows, seeds, gate_of(frames), max_tries=max_tries)
     out.write_array("frames", made.frames if rounding is None else _rounded(made, frames, rounding))
     return _table(conditions, plugin, checkpoint.ref.digest, made)

@@ -16,10 +16,9 @@ import pyarrow as pa
 from ctlev_core.paired_differences import Difference, Trainings, paired_difference, read_trainings
 from ctlev_core.report.tables import Cell, Table
 from ctlev_core.report.verdict import lower_is_better
+from data_contracts.experiment import LABELS_OF, SHUFFLED
 
 Row = dict[str, Any]
-LABELS_OF, SHUFFLED = "labels of ", "shuffled "
-"""Settings that begin so score frames of a generator against their own labels, or against those of other frames."""
 ORIGINS = "classes with"
 """Groups that begin so are classes by where they were to be learnt from."""
 _METRICS = {
@@ -64,7 +63,7 @@ class PairedScores:
 
 def is_about_labels(row: Row) -> bool:
     """Does the row score synthetic frames against labels, rather than a model on real test data?"""
-    return row["setting"].removeprefix(SHUFFLED).startswith(LABELS_OF)
+    return row["setting"].startswith((LABELS_OF, SHUFFLED))
 
 
 def trained_rows(rows: Iterable[Row]) -> list[Row]:

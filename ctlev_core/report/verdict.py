@@ -11,6 +11,7 @@ import numpy as np
 from ctlev_core.paired_differences import Difference
 
 __all__ = ["Difference", "lower_is_better", "verdict"]
+from data_contracts.experiment import LABELS_OF, SHUFFLED
 
 _LOWER = ("mpjpe", "pve", "fd_", "fid", "kid", "error", "calibration_error")
 
@@ -104,7 +105,7 @@ def _beside(name: str, value: float, difference: Difference, metric: str) -> str
 
 def _labels(values: Mapping[str, float]) -> str:
     """Whether synthetic frames show their labels, as the model trained on real frames sees them."""
-    own, shuffled = values.get("labels of synthetic"), values.get("shuffled labels of synthetic")
+    own, shuffled = (values.get(f"{begin} synthetic") for begin in (LABELS_OF, SHUFFLED))
     if own is None:
         return ""
     control = "" if shuffled is None else f", and {shuffled:.3f} on them with shuffled labels"
