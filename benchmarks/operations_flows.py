@@ -1,0 +1,95 @@
+"""Flows that do nothing, or sleep, so that what is left is what running them costs; for `operations.py`.
+
+Each function runs in a process of its own, for a private server serves one script, and returns what it measured.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from data_contracts import tables
+from data_contracts.manifest import ManifestRef, read_manifest
+from tasks.stage import Output, call_together, stage
+from tasks.store import Store
+
+
+@stage(version=1, schema=tables.TRAINING)
+def sleep_shards(out: Output, *, first: int, count: int, seconds: float) -> pa.Table:
+    """Sleep once a shard; `loss` is the clock when the shard was done, which all processes of a machine share."""
+    done = []
+    for _ in range(count):
+        time.sleep(seconds)
+        done.append(time.monotonic())
+    return _table(first, done)
+
+
+def _table(first: int, done: list[float]) -> pa.Table:
+    steps = pa.array(range(first, first + len(done)), pa.int64())
+    columns = [pa.array(["training"] * len(done)), steps, pa.array(done, pa.float64())]
+    return pa.table(columns, names=[column.name for column in tables.TRAINING.columns])
+
+
+def run_nothing(home: Path) -> dict[str, float]:
+    """One flow without a stage: what Prefect takes to start and to end."""
+    _in_a_flow(home, lambda: None)
+    return {}
+
+
+def time_stages(home: Path, count: int) -> dict[str, float]:
+    """Milliseconds for a stage that does nothing: computed, found in the store, and both without Prefect."""
+    shards = [{"first": number, "count": 1, "seconds": 0.0} for number in range(2 * count)]
+    with_prefect, without = shards[:count], shards[count:]
+
+    def run_all() -> list[float]:
+        return [_time_ms(lambda: [sleep_shards(**given) for given in with_prefect]) / count for _ in range(2)]
+
+    computed, found = _in_a_flow(home, run_all)
+    names = ("computed, without Prefect", "found, without Prefect")
+    alone = {name: _time_ms(lambda: [_run_alone(given) for given in without]) / count for name in names}
+    return {"computed": computed, "found": found, **alone}
+
+
+def _run_alone(given: dict[str, Any]) -> None:
+    sleep_shards.run(sleep_shards.key(given, Store()), given)
+
+
+def time_task_runs(home: Path, shards: int, seconds: float, groups: int, workers: int) -> dict[str, float]:
+    """Sleeping shards as `groups` task runs, in `workers` processes: the seconds it took, and those of starting up."""
+    os.environ["CTLEV_WORKERS"] = str(workers)
+    os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the processes must find this file
+    edges = np.linspace(0, shards, groups + 1).astype(int).tolist()
+    calls = [partial(sleep_shards, first=first, count=last - first, seconds=seconds) for first, last in pairwise(edges)]
+
+    def run_all() -> tuple[float, list[ManifestRef]]:
+        return time.monotonic(), call_together(*calls)
+
+    started, made = _in_a_flow(home, run_all)
+    done = np.concatenate([read_manifest(ref).table["loss"].to_numpy() for ref in made])
+    if len(done) != shards:
+        raise RuntimeError(f"expected {shards} shards, got {len(done)}")
+    return {"seconds": float(done.max() - started), "start_s": float(done.min() - seconds - started)}
+
+
+def _in_a_flow(home: Path, run: Callable[[], Any]) -> Any:
+    """What a script does around its flow."""
+    from flows import local_server
+    from flows.settings import flow  # before Prefect, which reads its settings when it is imported
+
+    local_server.start(home)
+    with local_server.connected():
+        return flow(name="benchmark")(run)()
+
+
+def _time_ms(run: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    run()
+    return 1000 * (time.perf_counter() - start)
