@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.frame_sequences import name_recordings
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
 from data_contracts.errors import DataError
@@ -19,7 +22,8 @@ def train_downstream(
 ) -> pa.Table:
     """Train on the rows of split `train` of all given sets; the artefact's `model/` holds the weights.
 
-    The number of optimiser steps is an option of the model, so that it is the same for every setting.
+    The number of optimiser steps is an option of the model, so that it is the same for every setting. A model that can
+    look at several frames at once (`train_sequences`) is told which follow one another.
     """
     plugin = plugins.load_options(downstream)
     rows = [manifest.rows_where(split="train") for manifest in training_sets]
@@ -29,7 +33,11 @@ def train_downstream(
     frames = np.concatenate([m.array("frames")[r] for m, r in zip(training_sets, rows, strict=True)])
     # Bodies of another dataset may carry more labels than the frames do.
     labels = concat_labels([m.labels.take(r) for m, r in zip(training_sets, rows, strict=True)], common=True)
-    history = plugin.module.train(
+    train = plugin.module.train
+    if hasattr(plugin.module, "train_sequences"):
+        named = [name_recordings(m, r) for m, r in zip(training_sets, rows, strict=True)]
+        train = partial(plugin.module.train_sequences, recordings=[name for names in named for name in names])
+    history = train(
         frames,
         labels,
         plugin.options,

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.feature_distances import estimate_distances, name_distance
+from ctlev_core.frame_sequences import name_recordings
 from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
@@ -48,7 +49,10 @@ def score_model(
     if len(rows) == 0:
         raise DataError(f"{data.ref.path}: no rows in split {split!r} to score on")
     _refuse_overlap(data, rows, training_sets, split)
-    prediction = plugin.module.predict(model.ref.path / "model", np.asarray(data.array("frames")[rows]))
+    predict = plugin.module.predict
+    if hasattr(plugin.module, "predict_sequences"):
+        predict = partial(plugin.module.predict_sequences, recordings=name_recordings(data, rows))
+    prediction = predict(model.ref.path / "model", np.asarray(data.array("frames")[rows]))
     labels = data.labels.take(rows)
     if setting.startswith(SHUFFLED):
         labels = labels.take(_others(len(rows), seed))

@@ -1,22 +1,30 @@
-"""3D body from one event image: SMPL pose, shape and place in the camera frame.
+"""3D bodies from event images: SMPL pose, shape and place in the camera frame.
 
-Source: Event-HPE (Zou et al., ICCV 2021), the model of the paper's Table 3: residual features, 6D rotations, losses on
-rotations, joints in 3D and 2D and translation. Here one image at a time, without its recurrent unit and optical flow,
-and the shape is predicted rather than given. The default is a small network that two CPU cores train in minutes.
+Source: Event-HPE (Zou et al., ICCV 2021), the model of the paper's Table 3, and its published code: residual features,
+a gated recurrent unit over 8 frames whose output is added to them, 6D rotations, losses on rotations, joints in 3D and
+2D and translation. Here without its optical flow; shape and pose are predicted rather than given for the first frame
+and followed from there. By default each image is seen alone, by a small network that two CPU cores train in minutes;
+`sequence_length` adds the recurrent unit.
+
+A sequence is up to `sequence_length` consecutive frames of one recording. In training every frame is the last of one,
+and the loss is the mean over all frames of the sequences, as in Event-HPE's code, which draws 8 of the next 16 frames.
+In prediction every frame is again the last of its own sequence, so that each but the first few of a recording knows
+as much of the past as in training, whatever else is predicted with it; Event-HPE cuts recordings into pieces.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from ctlev_core.image_shifts import shift_images
+from ctlev_core.body_samples import BodySamples, mirror_half, shift
+from ctlev_core.frame_sequences import find_sequences
 from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
-from ctlev_core.skeletons import JOINT_SETS, joint_indices
+from ctlev_core.skeletons import joint_indices
 from ctlev_core.supervised_options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
@@ -58,16 +66,20 @@ class Options(SupervisedOptions):
     shift_px: int = Field(
         default=0, ge=0, description="move training images by up to so many px in x and y; black moves in"
     )
+    sequence_length: int = Field(
+        default=1,
+        ge=1,
+        description="frames of a recording, one after another, that a recurrent unit looks back over; batch_size then "
+        "counts sequences; 1 = no such unit; Event-HPE: 8",
+    )
 
-
-class _TrainingSet(NamedTuple):
-    """Frames and bodies as arrays: rotations [N, 24, 3, 3], betas [N, 10], transl [N, 3] m, intrinsics [N, 4] px."""
-
-    frames: np.ndarray
-    rotations: np.ndarray
-    betas: np.ndarray
-    transl: np.ndarray
-    intrinsics: np.ndarray
+    @model_serializer(mode="wrap")
+    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Models of single images are the same models, of the same keys, as before there were sequences."""
+        values = serialize(self)
+        if self.sequence_length == 1:
+            values.pop("sequence_length", None)
+        return values
 
 
 def input_files(options: Options) -> list[Path]:
@@ -90,22 +102,43 @@ def train(
     parts: Sequence[int] = (),
     groups: Sequence[str] = (),
 ) -> History:
+    """`train_sequences` on frames that follow from no others: each is a recording of its own."""
+    return train_sequences(
+        frames, labels, options, seed=seed, out=out, work=work, parts=parts, groups=groups, recordings=()
+    )
+
+
+def train_sequences(
+    frames: np.ndarray,
+    labels: Labels,
+    options: Options,
+    *,
+    seed: int,
+    out: Path,
+    work: Path,
+    parts: Sequence[int],
+    groups: Sequence[str],
+    recordings: Sequence[str],
+) -> History:
     """Train on frames with SMPL labels and write `model.safetensors` and `config.json` to `out`.
 
     Args:
-        frames: [N, H, W, 3] uint8.
+        frames: [N, H, W, 3] uint8, those of a recording in time order.
         labels: N rows with SMPL parameters, intrinsics and a joint set.
         options: see `Options`.
         seed: of the initial weights, the order of the samples and the augmentation.
         out: model folder.
         work: folder of the resumable state.
         parts: rows of each training set, in order; empty = one set.
-        groups: N subjects or recordings, held back whole for validation; empty = each row is its own.
+        groups: N subjects or recordings, held back whole for validation; empty = the recordings.
+        recordings: N names; no sequence crosses from one recording, group or training set to the next. Empty = each
+            frame is a recording of its own.
     Returns:
         The training loss per logged step, and the loss of rows held back.
     Raises:
         DataError: numbers of rows disagree, the labels have no SMPL parameters or no intrinsics, or the weights do not
             fit.
+        ValueError: `parts`, `groups` or `recordings` do not fit the number of rows.
     """
     import torch
 
@@ -119,7 +152,10 @@ def train(
     data = _check_training_set(frames, labels)
     check_batch(options.batch_size, frames.shape[1], frames.shape[2], f"train {NAME}")
     weights = supervised.file_digests(input_files(options))
-    rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
+    rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups or recordings)
+    sets = [number for number, size in enumerate(parts) for _ in range(size)]
+    apart = [names for names in (groups, sets) if names]
+    sequences = find_sequences(len(frames), options.sequence_length, recordings, *apart)
     device = supervised.resolve_device(options.device)
     model: Any = supervised.build_seeded(lambda: _build(options), seed)
     if options.weights:
@@ -129,17 +165,22 @@ def train(
     body = BodyLayer(load_body()).to(device)
 
     def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
-        batch = _TrainingSet(*(array[rows] for array in data))
+        chosen, lengths = sequences.ending_at(rows)
+        batch = BodySamples(*(array[chosen] for array in data))
         if generator is not None:
-            batch = _shift(batch, options.shift_px, generator)
+            sequence = np.repeat(np.arange(len(rows)), lengths)
+            batch = shift(batch, options.shift_px, sequence, generator)
             if options.flip:
-                batch = _flip_half(batch, generator)
+                batch = mirror_half(batch, sequence, generator)
         images = _to_input(torch.from_numpy(np.ascontiguousarray(batch.frames)).to(device))
         wanted = [torch.from_numpy(array).float().to(device) for array in batch[1:]]
         with supervised.mixed_precision(options, device):
-            found = model(images)
+            found = model(images, torch.from_numpy(lengths))
         return _loss(found, wanted, body, frames.shape[2], options)
 
+    identity = [NAME, VERSION, cache_material(options), weights, seed, *data]
+    if options.sequence_length > 1:
+        identity.append(sequences.starts)
     history, record = train_model(
         model,
         compute_loss,
@@ -147,7 +188,7 @@ def train(
         options,
         seed=seed,
         work=work,
-        run_digest=supervised.digest(NAME, VERSION, cache_material(options), weights, seed, *data),
+        run_digest=supervised.digest(*identity),
         description="train smpl_regressor",
     )
     config = {
@@ -164,14 +205,23 @@ def train(
 
 
 def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
-    """The body of each frame.
+    """`predict_sequences` of frames that follow from no others: each is a recording of its own."""
+    return predict_sequences(model, frames, ())
+
+
+def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+    """The body of each frame, from it and the frames of its recording just before it.
 
     Args:
         model: folder written by `train`.
-        frames: [N, H, W, 3] uint8, of the size the model was trained on.
+        frames: [N, H, W, 3] uint8, of the size the model was trained on, those of a recording in time order.
+        recordings: N names; empty = each frame is a recording of its own.
     Returns:
         `smpl_pose` [N, 72] rad, `smpl_betas` [N, 10], `smpl_transl` [N, 3] m, `joints3d` [N, J, 3] mm, all float32 and
         in the camera frame, and `joints2d` [N, J, 2] px as the mean training camera sees them.
+    Raises:
+        DataError: the folder has no such model, or frames are no images.
+        ValueError: `recordings` do not fit the number of frames.
     """
     import torch
 
@@ -182,21 +232,27 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
 
     supervised.check_frames(frames, f"predict {NAME}")
     config = supervised.read_config(model, NAME)
-    network = _build(Options(**config["options"]))
+    options = Options(**config["options"])
+    network = _build(options)
     supervised.read_weights(model, network)
     device = supervised.resolve_device("auto")
     network.to(device)
     body = BodyLayer(load_body()).to(device)
     indices = joint_indices("smpl", config["joint_set"])
     intrinsics = torch.tensor(config["intrinsics_px"], device=device)
+    sequences = find_sequences(len(frames), options.sequence_length, recordings)
+    seen = supervised.predict_in_batches(network, lambda images: network.features(_to_input(images)).cpu(), frames)
+    features = torch.cat(seen) if seen else torch.zeros(0)
 
-    def bodies(images: torch.Tensor) -> list[torch.Tensor]:
-        found = network(_to_input(images))
+    def bodies(rows: torch.Tensor) -> list[torch.Tensor]:
+        chosen, lengths = (torch.from_numpy(array) for array in sequences.ending_at(rows.cpu().numpy()))
+        known = network.over_time(features[chosen].to(device), lengths)
+        found = network.bodies(known[lengths.cumsum(0).to(device) - 1])
         joints = body.pose_joints(*found)[:, indices]
         pose = axis_angle_from_matrix(found.rotations).flatten(1)
         return [pose, found.betas, found.transl, 1000 * joints, _project(joints, intrinsics)]
 
-    batches = supervised.predict_in_batches(network, bodies, frames)
+    batches = supervised.predict_in_batches(network, bodies, np.arange(len(frames)))
     count = len(indices)
     shapes = {
         "smpl_pose": (72,),
@@ -210,7 +266,7 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
     return empty | {name: np.concatenate([part.cpu().numpy() for part in parts]) for name, parts in columns}
 
 
-def _check_training_set(frames: np.ndarray, labels: Labels) -> _TrainingSet:
+def _check_training_set(frames: np.ndarray, labels: Labels) -> BodySamples:
     from ctlev_core.body.rotations import matrix_from_axis_angle
     from ctlev_core.supervised import check_frames
 
@@ -224,51 +280,19 @@ def _check_training_set(frames: np.ndarray, labels: Labels) -> _TrainingSet:
     if len(labels) != len(frames) or len(frames) == 0:
         raise DataError(f"{where}: {len(frames)} frames but {len(labels)} labels")
     rotations = matrix_from_axis_angle(labels.smpl_pose.reshape(-1, 24, 3)).astype(np.float32)
-    return _TrainingSet(frames, rotations, labels.smpl_betas, labels.smpl_transl, labels.intrinsics)
+    return BodySamples(frames, rotations, labels.smpl_betas, labels.smpl_transl, labels.intrinsics)
 
 
 def _build(options: Options) -> Any:
     from ctlev_core.networks.smpl_regressor import SmplRegressor
 
-    return SmplRegressor(ARCHITECTURES[options.architecture], options.pool_grid, options.head_width)
+    shape = ARCHITECTURES[options.architecture]
+    return SmplRegressor(shape, options.pool_grid, options.head_width, recurrent=options.sequence_length > 1)
 
 
 def _to_input(images: torch.Tensor) -> torch.Tensor:
     """[N, H, W, 3] uint8 -> [N, 3, H, W] float32 in [0, 1]."""
     return images.permute(0, 3, 1, 2).float() / 255
-
-
-def _flip_half(batch: _TrainingSet, generator: np.random.Generator) -> _TrainingSet:
-    """Mirror each image and its body with probability one half: x changes sign, left and right change places.
-
-    The pelvis of the rest pose lies on the mirror plane, so translations are mirrored like points.
-    """
-    flip = generator.random(len(batch.frames)) < 0.5
-    mirror = np.diag([-1.0, 1.0, 1.0]).astype(np.float32)
-    rotations = mirror @ batch.rotations[:, JOINT_SETS["smpl"].mirror] @ mirror
-    intrinsics = batch.intrinsics * np.array([1, 1, -1, 1], np.float32)
-    intrinsics[:, 2] += batch.frames.shape[2]
-    return _TrainingSet(
-        np.where(flip[:, None, None, None], batch.frames[:, :, ::-1], batch.frames),
-        np.where(flip[:, None, None, None], rotations, batch.rotations),
-        batch.betas,
-        np.where(flip[:, None], batch.transl * np.array([-1, 1, 1], np.float32), batch.transl),
-        np.where(flip[:, None], intrinsics, batch.intrinsics),
-    )
-
-
-def _shift(batch: _TrainingSet, shift_px: int, generator: np.random.Generator) -> _TrainingSet:
-    """Shift each image and its body, at its own depth, by its own whole number of px.
-
-    A body that moves aside is also seen from a little further round: shift_px / focal length, 2.4 degrees at 4 of
-    96 px, which the label does not follow.
-    """
-    if not shift_px:
-        return batch
-    shifts = generator.integers(-shift_px, shift_px + 1, size=(len(batch.frames), 2))
-    transl = batch.transl.copy()
-    transl[:, :2] += batch.transl[:, 2:] * shifts.astype(np.float32) / batch.intrinsics[:, :2]
-    return batch._replace(frames=shift_images(batch.frames, shifts), transl=transl)
 
 
 def _project(joints: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:

@@ -7,6 +7,7 @@ import pytest
 
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from ctlev_core.body_samples import BodySamples, mirror_half, shift
 from ctlev_core.body_views import with_joints
 from ctlev_core.conditions import normals
 from ctlev_core.downstream import smpl_regressor
@@ -111,9 +112,7 @@ def test_a_run_goes_on_where_it_stopped(trained, tmp_path):
 
 def batch_of(labels):
     rotations = matrix_from_axis_angle(labels.smpl_pose.reshape(-1, 24, 3)).astype(np.float32)
-    return smpl_regressor._TrainingSet(
-        pictures(labels), rotations, labels.smpl_betas, labels.smpl_transl, labels.intrinsics
-    )
+    return BodySamples(pictures(labels), rotations, labels.smpl_betas, labels.smpl_transl, labels.intrinsics)
 
 
 def rerendered(batch, labels):
@@ -134,7 +133,7 @@ class Always:
 
 def test_a_mirrored_sample_is_the_mirrored_body():
     labels = people(6)
-    mirrored = smpl_regressor._flip_half(batch_of(labels), Always())
+    mirrored = mirror_half(batch_of(labels), np.arange(6), Always())
     silhouettes = [frames.any(axis=-1) for frames in (mirrored.frames, rerendered(mirrored, labels))]
     # The body is symmetric, so only pixels whose centres the outline all but touches may differ.
     assert (silhouettes[0] != silhouettes[1]).mean() < 0.002
@@ -143,7 +142,7 @@ def test_a_mirrored_sample_is_the_mirrored_body():
 
 def test_a_shifted_sample_is_the_shifted_body():
     labels = people(6)
-    shifted = smpl_regressor._shift(batch_of(labels), 2, Always())
+    shifted = shift(batch_of(labels), 2, np.arange(6), Always())
     silhouettes = [frames.any(axis=-1) for frames in (shifted.frames, rerendered(shifted, labels))]
     # The view turns by 2 / 45 rad: a few pixels of the outline change.
     assert (silhouettes[0] != silhouettes[1]).mean() < 0.02

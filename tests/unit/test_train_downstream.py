@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 import torch
 
-from ctlev_core.downstream import classifier
+from ctlev_core.downstream import classifier, smpl_regressor
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
 from data_contracts.errors import DataError
@@ -86,6 +86,20 @@ def test_an_empty_set_is_named_and_one_of_several_may_be_empty(tmp_path, given):
         run(tmp_path, [empty], DownstreamChoice(name="classifier"))
     run(tmp_path, [empty, frame_set(tmp_path / "made", MADE)], DownstreamChoice(name="classifier"))
     assert given[0]["parts"] == [0, 2] and given[0]["groups"] == ["S1", "S9"]
+
+
+def test_a_model_of_sequences_is_told_the_recordings(tmp_path, monkeypatch):
+    told: list[dict[str, Any]] = []
+
+    def train(frames, labels, options, **settings):
+        told.append(settings)
+        return History([1], [0.5], [], [])
+
+    monkeypatch.setattr(smpl_regressor, "train_sequences", train)
+    sets = [frame_set(tmp_path / "real", REAL), frame_set(tmp_path / "made", MADE)]
+    run(tmp_path, sets, DownstreamChoice(name="smpl_regressor"))
+    assert told[0]["recordings"] == ["S1/a", "S2/a", "S2/b", "made/0", "made/1"]
+    assert told[0]["groups"] == ["S1", "S2", "S2", "S1", "S9"] and told[0]["parts"] == [3, 2]
 
 
 class Means(torch.nn.Module):
