@@ -89,7 +89,7 @@ prepare_dataset = _deployable(
     publish=lambda made, folder, name: publish_contact_sheet(made.contact_sheet, folder, name),
 )
 train_generator = _deployable(of_train_generator.train_generator)
-synthesize = _deployable(of_synthesize.synthesize)
+synthesize = _deployable(of_synthesize.synthesize, load=of_synthesize.load_synthesis)
 regenerate = _deployable(of_regenerate.regenerate, load=of_regenerate.load_regeneration)
 baselines = _deployable(of_baselines.baselines)
 evaluate = _deployable(of_evaluate.evaluate)

@@ -1,16 +1,23 @@
-"""Sample labelled synthetic event images from a fine-tuned generator."""
+"""Sample labelled synthetic event images from a fine-tuned generator, and write them as a plain folder where asked to.
+
+python flows/synthesize.py --preset folder --set dataset.options.root=PATH --set export_folder=mine
+"""
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from ctlev_core.report.refusals import count_refusals
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef, read_manifest
-from flows.command_line import main
+from data_contracts.synthesis import Synthesis
+from flows.command_line import load_experiment, main
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from flows.train_generator import train_generator
+from tasks.export_events import export_events
+from tasks.export_images import check_export_folder, export_images
 from tasks.sample import sample
 from tasks.stage import call_flow, numbered
 
@@ -22,12 +29,15 @@ def synthesize(
     checkpoint: ManifestRef | None = None,
     number: int = 0,
 ) -> ManifestRef:
-    """Sample the frames of the `number`-th generator; dataset and checkpoint are made unless they are given."""
+    """Sample labelled synthetic event images, and write them as a plain folder where `export_folder` asks for one.
+
+    The frames are those of the `number`-th generator; dataset and checkpoint are made unless they are given.
+    """
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     if checkpoint is None:
         checkpoint = call_flow(train_generator, experiment, dataset, number)
-    return sample(
+    synthetic = sample(
         checkpoint,
         dataset.frames,
         dataset.sample_conditions,
@@ -37,9 +47,40 @@ def synthesize(
         seed=experiment.seed + number,
         label=numbered(experiment.generator.name, number),
     )
+    if isinstance(experiment, Synthesis) and experiment.export_folder is not None:
+        _export(experiment, experiment.export_folder, dataset, synthetic)
+    return synthetic
+
+
+def _export(synthesis: Synthesis, folder: Path, dataset: PreparedDataset, synthetic: ManifestRef) -> None:
+    """Write the folder; while planning, only say whether it could be written."""
+    artefacts = {"synthetic": synthetic, "conditions": dataset.sample_conditions}
+    if synthesis.export is not None:
+        artefacts["event streams"] = export_events(
+            synthetic,
+            dataset.frames,
+            dataset.recordings,
+            encoding=synthesis.encoding,
+            export=synthesis.export,
+            label="event streams",
+        )
+    if not synthetic.digest:  # only planned
+        check_export_folder(artefacts, folder)
+        return
+    export_images(artefacts, folder, name=synthesis.name, notice=synthesis.data_notice)
+
+
+def load_synthesis(preset: str, overrides: list[str]) -> Synthesis:
+    """The experiment a preset describes, and where its frames are exported to."""
+    return load_experiment(preset, overrides, Synthesis)
+
+
+def _describe(made: ManifestRef, synthesis: Synthesis) -> str:
+    lines = [f"synthetic: {count_refusals(read_manifest(made))}", f"frames: {made.path}"]
+    if synthesis.export_folder is not None:
+        lines.append(f"exported: {synthesis.export_folder}, see its README.md")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    sys.exit(
-        main(synthesize, lambda made, _: f"synthetic: {count_refusals(read_manifest(made))}\nframes: {made.path}"),
-    )
+    sys.exit(main(synthesize, _describe, load=load_synthesis))
