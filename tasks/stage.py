@@ -44,6 +44,7 @@ from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
+from tasks.runners import asked_runner
 from tasks.store import RawFileDigests, Store
 from tasks.workers import current_workers, together
 
@@ -77,7 +78,12 @@ _in_one_run: ContextVar[bool] = ContextVar("ctlev_in_one_run", default=False)
 
 @contextlib.contextmanager
 def planning() -> Iterator[list[PlannedStage]]:
-    """Inside this block stages and flows only note what they would do; nothing is computed or written."""
+    """Inside this block stages and flows only note what they would do; nothing is computed or written.
+
+    Raises:
+        DataError: there is no such runner as is asked for, so that nothing could be run either.
+    """
+    asked_runner()
     plan = _Plan()
     token = _plan.set(plan)
     try:

@@ -1,9 +1,10 @@
-"""Calls side by side, and processes that do their work: one a core.
+"""Calls side by side, processes that do their work, one a core, and shards of one stage spread over a runner.
 
 Small networks gain little from a second thread: two trainings with a core each are done almost twice as soon as one
 after the other with both. They run in processes of their own, because in one process they would wait for each other's
 Python, and draw from each other's random numbers. A process is started when there is work for it, serves until the
-calls are done, and ends with the process that started it, whatever ends that.
+calls are done, and ends with the process that started it, whatever ends that. Clusters can take the place of these
+processes, and do the shards of a stage (`map_shards`): see `tasks.runners`.
 """
 
 from __future__ import annotations
@@ -16,22 +17,24 @@ import signal
 import subprocess
 import sys
 import threading
-import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar, copy_context
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
-R = TypeVar("R")
+from tasks.runners import ALONE, Runner, WorkerError, asked_cluster, asked_runner, reply_to, reply_with
 
+R = TypeVar("R")
+S = TypeVar("S")
 
 END_TIMEOUT_S = 10.0
 """After being asked to end, a process has so long to clear away what it was writing."""
-
-
-class WorkerError(RuntimeError):
-    """A process that did our work is gone."""
+MAX_GROUP = 16
+"""Shards that travel together; what they return is held until the first of them is wanted."""
+WAITING = 2
+"""Groups a process that may be ahead of the one that is wanted."""
 
 
 class Worker:
@@ -44,7 +47,9 @@ class Worker:
 
     def __init__(self, position: int, threads: int) -> None:
         root = str(Path(__file__).resolve().parents[1])
-        environment = os.environ | {
+        environment = {
+            **os.environ,
+            **ALONE,
             "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")])),
             "OMP_NUM_THREADS": str(threads),
             "TQDM_POSITION": str(position),
@@ -96,6 +101,7 @@ class Workers:
     """A few processes; each is started by the first call that finds the others busy."""
 
     def __init__(self, count: int, threads: int) -> None:
+        self.count = count
         self._threads = threads
         self._workers: list[Worker | None] = [None] * count
         self._lock = threading.Lock()
@@ -116,6 +122,10 @@ class Workers:
         finally:
             self._free.put(number)
 
+    def release(self) -> None:
+        """As `close`: to start processes anew takes little."""
+        self.close()
+
     def close(self) -> None:
         """End all processes; calls that wait for one raise `WorkerError`."""
         with self._lock:
@@ -127,10 +137,27 @@ class Workers:
                 worker.close()
 
 
-_current: ContextVar[Workers | None] = ContextVar("ctlev_workers", default=None)
+class Threads:
+    """Threads of this process, for shards that leave Python's lock alone most of the time."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def call(self, function: Callable[..., R], *arguments: Any) -> R:
+        """`function(*arguments)`, in the thread that asks."""
+        return function(*arguments)
+
+    def release(self) -> None:
+        """There is nothing to release."""
+
+    def close(self) -> None:
+        """There is nothing to close: what has begun ends by itself."""
 
 
-def current_workers() -> Workers | None:
+_current: ContextVar[Runner | None] = ContextVar("ctlev_workers", default=None)
+
+
+def current_workers() -> Runner | None:
     """The processes of the innermost `together` that we are in."""
     return _current.get()
 
@@ -154,8 +181,7 @@ def together(calls: Sequence[Callable[[], R]]) -> list[R]:
     Called within itself, it shares the processes that there are. With one core, or one call, everything runs here and
     in order. The first call that raises ends the processes; what they have stored is kept.
     """
-    count = min(num_workers(), len(calls)) if current_workers() is None else len(calls)
-    if count < 2:
+    if len(calls) < 2 or (current_workers() is None and not _has_several()):
         return [call() for call in calls]
     with _processes() as workers, ThreadPoolExecutor(len(calls)) as threads:
         futures = [threads.submit(copy_context().run, call) for call in calls]
@@ -172,21 +198,75 @@ def together(calls: Sequence[Callable[[], R]]) -> list[R]:
         return [future.result() for future in futures]
 
 
+def map_shards(function: Callable[[S], R], shards: Sequence[S]) -> Generator[R, None, None]:
+    """`function` of every shard, in their order, computed where CTLEV_RUNNER says.
+
+    Args:
+        function: one that can travel: of a module, or a `functools.partial` of such. It depends on the shard alone.
+        shards: what to do, such as paths and row numbers; data is better read where it is needed.
+    """
+    if len(shards) < 2 or not _has_several():
+        yield from map(function, shards)
+        return
+    runner = _shard_runner()
+    with ThreadPoolExecutor(runner.count) as threads:
+        pending: deque[Future[list[R]]] = deque()
+        try:
+            for group in _groups(shards, runner.count):
+                pending.append(threads.submit(runner.call, _call_each, function, group))
+                if len(pending) > WAITING * runner.count:
+                    yield from pending.popleft().result()
+            while pending:
+                yield from pending.popleft().result()
+        except BaseException:  # also where nobody wants the rest
+            for future in pending:
+                future.cancel()
+            runner.close()
+            raise
+    runner.release()
+
+
+def _groups(shards: Sequence[S], count: int) -> Iterator[Sequence[S]]:
+    """Consecutive shards, fewer and fewer towards the end, so that all processes end at about the same time."""
+    start = 0
+    while start < len(shards):
+        size = min(max((len(shards) - start) // (2 * count), 1), MAX_GROUP)
+        yield shards[start : start + size]
+        start += size
+
+
+def _call_each(function: Callable[[S], R], shards: Sequence[S]) -> list[R]:
+    return [function(shard) for shard in shards]
+
+
+def _has_several() -> bool:
+    """Is more than one process or thread to be had? Of a cluster that runs elsewhere we assume it."""
+    return num_workers() > 1 or bool(asked_runner()[1])
+
+
+def _shard_runner() -> Runner:
+    count = num_workers()
+    cluster = asked_cluster(count)
+    if cluster is not None:
+        return cluster
+    return Threads(count) if asked_runner()[0] == "threads" else Workers(count, max(1, num_cores() // count))
+
+
 @contextlib.contextmanager
-def _processes() -> Iterator[Workers]:
-    """The processes there are, or new ones that end here."""
+def _processes() -> Iterator[Runner]:
+    """The processes there are, or new ones that end here, or those of a cluster."""
     shared = current_workers()
     if shared is not None:
         yield shared
         return
     count = num_workers()
-    workers = Workers(count, max(1, num_cores() // count))
+    workers = asked_cluster(count) or Workers(count, max(1, num_cores() // count))
     token = _current.set(workers)
     try:
         yield workers
     finally:
         _current.reset(token)
-        workers.close()
+        workers.release()
 
 
 def _serve() -> None:
@@ -202,10 +282,9 @@ def _serve() -> None:
             received = calls.get()
             if isinstance(received, Exception):
                 raise received
-            function, arguments = received
-            reply = pickle.dumps((True, function(*arguments)))
+            reply = reply_to(*received)
         except Exception as error:
-            reply = _as_pickle(error)
+            reply = reply_with(error)
         replies.write(reply)
         replies.flush()
 
@@ -224,17 +303,6 @@ def _listen(requests: BinaryIO, calls: queue.SimpleQueue[Any]) -> None:
             os._exit(0)
         except Exception as error:
             calls.put(error)
-
-
-def _as_pickle(error: Exception) -> bytes:
-    """A failure as a reply; errors that cannot travel become one that says what they said."""
-    error.add_note("".join(traceback.format_exception(error)))
-    try:
-        reply = pickle.dumps((False, error))
-        pickle.loads(reply)
-        return reply
-    except Exception:
-        return pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}")))
 
 
 if __name__ == "__main__":

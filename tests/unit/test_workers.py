@@ -61,7 +61,7 @@ def test_an_error_keeps_its_type_and_its_message_and_says_where_it_was_raised():
     # int("x") raises there; the note is the traceback of that process.
     with pytest.raises(ValueError, match="invalid literal for int") as error:
         together([lambda: elsewhere(int, "x"), lambda: elsewhere(time.sleep, 30)])
-    assert "in _serve" in "".join(error.value.__notes__)
+    assert "in reply_to" in "".join(error.value.__notes__)
 
 
 def test_the_first_error_ends_the_other_calls_at_once():

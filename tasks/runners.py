@@ -1,0 +1,221 @@
+"""Which processes compute: the variable CTLEV_RUNNER, and the clusters of Dask and Ray that it may ask for.
+
+    CTLEV_RUNNER   shards of a stage    stages of branches
+    threads        threads here         processes here        the default
+    processes      processes here       processes here
+    dask           a local cluster      the same; `dask:tcp://HOST:8786` = one that runs already
+    ray            a local cluster      the same; `ray:HOST:6379`, `ray:auto` = one that runs already
+
+A runner calls a function elsewhere and waits for it; results never depend on which. Machines of a cluster need the same
+version of ctlev and the home under the same path, on a disk whose `flock` works across them. A cluster that we started
+serves until this process ends, for to start one takes seconds.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib
+import importlib.util
+import logging
+import os
+import pickle
+import traceback
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+from data_contracts.errors import DataError
+
+R = TypeVar("R")
+KINDS = ("threads", "processes", "dask", "ray")
+ALONE = {"CTLEV_WORKERS": "1", "CTLEV_RUNNER": "threads"}
+"""Environment of a process that does our work: it starts none of its own."""
+CONNECT_TIMEOUT_S = 60
+
+
+class WorkerError(RuntimeError):
+    """A process that did our work is gone."""
+
+
+class Runner(Protocol):
+    """Something that computes for us; `count` calls at once."""
+
+    count: int
+
+    def call(self, function: Callable[..., R], *arguments: Any) -> R:
+        """`function(*arguments)`; what it raises is raised here.
+
+        Raises:
+            WorkerError: the process that did it is gone.
+        """
+        ...
+
+    def release(self) -> None:
+        """Nothing more is to be done for now."""
+        ...
+
+    def close(self) -> None:
+        """End what is being done; calls that wait raise `WorkerError`."""
+        ...
+
+
+def asked_runner() -> tuple[str, str]:
+    """Kind and address, from CTLEV_RUNNER.
+
+    Raises:
+        DataError: no such kind, an address where none belongs, or a package that is not installed.
+    """
+    asked = os.environ.get("CTLEV_RUNNER", "") or KINDS[0]
+    kind, _, address = asked.partition(":")
+    if kind not in KINDS or (address and kind not in _CLUSTERS):
+        raise DataError(f"CTLEV_RUNNER must be one of {', '.join(KINDS)}, dask:ADDRESS or ray:ADDRESS, got {asked!r}")
+    if kind in _CLUSTERS and importlib.util.find_spec(_CLUSTERS[kind].package) is None:
+        raise DataError(
+            f"CTLEV_RUNNER={asked} needs the package {_CLUSTERS[kind].package!r}: pip install 'ctlev[{kind}]'"
+        )
+    return kind, address
+
+
+def asked_cluster(count: int) -> Runner | None:
+    """The cluster of Dask or Ray that is asked for, if one is.
+
+    Args:
+        count: processes of a local one.
+    """
+    kind, address = asked_runner()
+    if kind not in _CLUSTERS:
+        return None
+    cluster = _running.get((kind, address))
+    if cluster is None:
+        cluster = _running[kind, address] = _CLUSTERS[kind](address, count)
+        atexit.register(cluster.close)
+    return cluster
+
+
+def reply_to(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
+    """Whether it succeeded, and what it returned or raised, with the traceback as a note."""
+    try:
+        return pickle.dumps((True, function(*arguments)))
+    except Exception as error:
+        return reply_with(error)
+
+
+def reply_with(error: Exception) -> bytes:
+    """A failure as a reply; errors that cannot travel become one that says what they said."""
+    error.add_note("".join(traceback.format_exception(error)))
+    try:
+        reply = pickle.dumps((False, error))
+        pickle.loads(reply)
+        return reply
+    except Exception:
+        return pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}")))
+
+
+def _compute(environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
+    """In a process of a cluster, which may have started before we did."""
+    os.environ.update(environment)
+    return reply_to(function, arguments)
+
+
+def _environment() -> dict[str, str]:
+    home = os.environ.get("CTLEV_HOME")
+    return ALONE | ({"CTLEV_HOME": os.path.abspath(home)} if home else {})
+
+
+class _Cluster:
+    """What Dask and Ray share."""
+
+    package = ""
+    count = 1
+
+    def __init__(self, address: str) -> None:
+        self._name = type(self).__name__.lower() + (f":{address}" if address else "")
+
+    def call(self, function: Callable[..., R], *arguments: Any) -> R:
+        try:
+            succeeded, result = pickle.loads(self._reply(function, arguments))
+        except Exception as error:
+            raise WorkerError(f"{self._name}: a call was lost: {type(error).__name__}: {error}") from error
+        if not succeeded:
+            raise result
+        return result
+
+    def _reply(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
+        raise NotImplementedError
+
+    def release(self) -> None:
+        pass
+
+    def close(self) -> None:
+        for key in [key for key, cluster in _running.items() if cluster is self]:
+            del _running[key]
+        atexit.unregister(self.close)
+
+
+class Dask(_Cluster):
+    """A cluster of Dask. Its workers have one thread each: two stages in a process would share random numbers."""
+
+    package = "distributed"
+
+    def __init__(self, address: str, count: int) -> None:
+        super().__init__(address)
+        distributed = importlib.import_module(self.package)
+        self._local = None
+        if not address:
+            self._local = distributed.LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+            )
+        self._client = distributed.Client(self._local or address, timeout=CONNECT_TIMEOUT_S)
+        self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+        threads = list(self._client.nthreads().values())
+        if set(threads) != {1}:
+            self.close()
+            raise DataError(
+                f"{self._name}: workers must have one thread each, got {sorted(threads)}: "
+                "dask worker --nworkers N --nthreads 1"
+            )
+        self.count = len(threads)
+
+    def _reply(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
+        return self._client.submit(_compute, _environment(), function, arguments, pure=False).result()
+
+    def close(self) -> None:
+        """End the local cluster, or take leave of one that runs elsewhere, which ends what we asked for."""
+        super().close()
+        for part in (self._client, self._local):
+            if part is not None:
+                with contextlib.suppress(Exception):  # it may be gone already
+                    part.close()
+
+
+class Ray(_Cluster):
+    """A cluster of Ray; this process is its driver."""
+
+    package = "ray"
+
+    def __init__(self, address: str, count: int) -> None:
+        super().__init__(address)
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        # Ray would hide the GPUs of a machine from calls that reserve none.
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        ray = self._ray = importlib.import_module(self.package)
+        own = {} if address else {"num_cpus": count, "include_dashboard": False}
+        ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **own)
+        self._compute = ray.remote(num_cpus=1)(_compute)
+        self.count = max(int(ray.cluster_resources().get("CPU", 1)), 1)
+
+    def _reply(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
+        return self._ray.get(self._compute.remote(_environment(), function, arguments))
+
+    def close(self) -> None:
+        """As Dask's."""
+        super().close()
+        self._ray.shutdown()
+
+
+_CLUSTERS: dict[str, type[Dask] | type[Ray]] = {"dask": Dask, "ray": Ray}
+_running: dict[tuple[str, str], Runner] = {}

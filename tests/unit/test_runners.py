@@ -1,0 +1,179 @@
+"""Shards and stages on threads, processes, Dask and Ray: the same results, whoever computes."""
+
+import importlib.util
+import json
+import os
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from data_contracts import tables
+from data_contracts.errors import DataError
+from tasks import runners
+from tasks.runners import WorkerError, asked_runner
+from tasks.stage import planning, stage
+from tasks.store import Store
+from tasks.workers import MAX_GROUP, _groups, current_workers, map_shards, together
+
+KINDS = [
+    kind
+    if kind in ("threads", "processes")
+    else pytest.param(
+        kind,
+        marks=[
+            pytest.mark.skipif(importlib.util.find_spec(package) is None, reason=f"{package} is not installed"),
+            pytest.mark.filterwarnings("default"),  # theirs
+        ],
+    )
+    for kind, package in (("threads", ""), ("processes", ""), ("dask", "distributed"), ("ray", "ray"))
+]
+
+
+@pytest.fixture(autouse=True)
+def two_processes_that_know_this_file(monkeypatch):
+    monkeypatch.setenv("CTLEV_WORKERS", "2")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    yield
+    for cluster in list(runners._running.values()):
+        cluster.close()
+
+
+def draw(shard):
+    """A shard's own random numbers: they tell if one was left out, done twice or misplaced."""
+    return np.random.default_rng(shard).normal(size=3)
+
+
+@stage(version=1, schema=tables.TRAINING)
+def spread_losses(out, *, count):
+    """Losses and an array that come from shards."""
+    drawn = np.array(list(map_shards(draw, range(count))))
+    out.write_array("frames", drawn)
+    columns = [pa.array(["training"] * count), pa.array(range(count), pa.int64()), pa.array(drawn.sum(1))]
+    return pa.table(columns, names=["curve", "step", "loss"])
+
+
+@stage(version=1, schema=tables.TRAINING)
+def losses_of_one_process(out, *, seed):
+    """Without shards of its own."""
+    return pa.table({"curve": ["training"], "step": pa.array([seed], pa.int64()), "loss": draw(seed)[:1]})
+
+
+def digests(home):
+    """Of every artefact; all of its files were checked against it."""
+    found = {}
+    for record in sorted(home.glob("artefacts/*/*/run.json")):
+        Store(home).check(record.parent)
+        found[record.parent.name] = json.loads(record.read_text())["digest"]
+    return found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_artefacts_do_not_depend_on_who_computes_them(kind, tmp_path, monkeypatch):
+    def make(home):
+        monkeypatch.setenv("CTLEV_HOME", str(home))
+        arguments = {"count": 37}
+        spread_losses.run(spread_losses.key(arguments, Store()), arguments)
+        together([partial(run_stage, seed) for seed in range(4)])
+        return digests(home)
+
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    found = make(tmp_path / kind)
+    monkeypatch.setenv("CTLEV_WORKERS", "1")
+    monkeypatch.delenv("CTLEV_RUNNER")
+    assert found == make(tmp_path / "alone") and len(found) == 5
+
+
+def run_stage(seed):
+    return losses_of_one_process.run(losses_of_one_process.key({"seed": seed}, Store()), {"seed": seed})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_shards_keep_their_order_and_errors_their_type(kind, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    assert [shard for shard, _ in map_shards(number_and_process, range(50))] == list(range(50))
+    processes = {process for _, process in map_shards(number_and_process, range(50))}
+    assert (processes == {os.getpid()}) == (kind == "threads")
+    with pytest.raises(DataError, match="shard 7 is wrong"):
+        list(map_shards(refuse_seven, range(20)))
+    # What computes for us starts no processes of its own, and serves on after an error.
+    if kind != "threads":
+        assert list(map_shards(environment, ["CTLEV_WORKERS", "CTLEV_RUNNER"])) == ["1", "threads"]
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_a_process_that_dies_is_an_error_that_says_so(kind, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    with pytest.raises(WorkerError):
+        list(map_shards(die, range(2)))
+
+
+def number_and_process(shard):
+    return shard, os.getpid()
+
+
+def refuse_seven(shard):
+    if shard == 7:
+        raise DataError("shard 7 is wrong")
+    return shard
+
+
+def environment(name):
+    return os.environ[name]
+
+
+def die(shard):
+    os._exit(3)
+
+
+def test_the_rest_is_not_computed_where_nobody_wants_it():
+    done = []
+    results = map_shards(done.append, range(1000))
+    next(results)
+    results.close()
+    assert len(done) < 1000
+
+
+@pytest.mark.parametrize(("num_shards", "count"), [(1, 2), (5, 2), (100, 3), (10_000, 16)])
+def test_groups_cover_all_shards_once_and_end_small(num_shards, count):
+    groups = list(_groups(range(num_shards), count))
+    assert [shard for group in groups for shard in group] == list(range(num_shards))
+    sizes = [len(group) for group in groups]
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] <= MAX_GROUP and sizes[-1] == 1
+
+
+def test_one_worker_computes_here(monkeypatch):
+    monkeypatch.setenv("CTLEV_WORKERS", "1")
+    monkeypatch.setenv("CTLEV_RUNNER", "processes")
+    assert {process for _, process in map_shards(number_and_process, range(3))} == {os.getpid()}
+    assert current_workers() is None
+
+
+@pytest.mark.parametrize("asked", ["slurm", "threads:2", "processes:tcp://host:1"])
+def test_an_unknown_runner_is_refused_before_anything_runs(asked, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", asked)
+    with pytest.raises(DataError, match=f"threads, processes, dask, ray, .* got '{asked}'"), planning():
+        pass
+
+
+@pytest.mark.parametrize(("kind", "package"), [("dask", "distributed"), ("ray", "ray")])
+def test_a_missing_package_is_named_with_what_to_install(kind, package, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", f"{kind}:host:1")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else sys)
+    with pytest.raises(DataError, match=rf"needs the package '{package}': pip install 'ctlev\[{kind}\]'"), planning():
+        pass
+
+
+def test_kind_and_address(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: sys)
+    for asked, expected in {
+        "": ("threads", ""),
+        "dask": ("dask", ""),
+        "dask:tcp://host:8786": ("dask", "tcp://host:8786"),
+        "ray:auto": ("ray", "auto"),
+    }.items():
+        monkeypatch.setenv("CTLEV_RUNNER", asked)
+        assert asked_runner() == expected
