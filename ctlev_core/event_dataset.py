@@ -170,12 +170,23 @@ class _Array:
 
 
 class _Files:
-    """Images in files of their own, by their names within a folder."""
+    """Images in files of their own, by their names within a folder; all of the size of the first."""
 
     def __init__(self, folder: Path, names: pa.ChunkedArray) -> None:
         self.folder, self.names = folder, names
+        self.shape: tuple[int, ...] = self._read(0).shape
 
     def read(self, row: int) -> np.ndarray:
+        image = self._read(row)
+        if image.shape != self.shape:
+            (expected_height, expected_width), (height, width) = self.shape[:2], image.shape[:2]
+            raise DataError(
+                f"{self.folder / self.names[row].as_py()}: expected {expected_width} x {expected_height} px, "
+                f"got {width} x {height}"
+            )
+        return image
+
+    def _read(self, row: int) -> np.ndarray:
         path = self.folder / self.names[row].as_py()
         image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB) if path.is_file() else None
         if image is None:
@@ -189,7 +200,9 @@ _Images = _Array | _Files
 def _open_folder(folder: Path, conditions: bool) -> tuple[pa.Table, _Images, _Images | None]:
     """Table, images and condition images of an exported folder."""
     table = read_image_table(folder)
-    has_conditions = conditions and table.num_rows and not table["condition_file_name"].null_count
+    if not table.num_rows:
+        raise DataError(f"{folder}: holds no image, its table has no rows")
+    has_conditions = conditions and not table["condition_file_name"].null_count
     asked = _Files(folder, table["condition_file_name"]) if has_conditions else None
     return table, _Files(folder, table["file_name"]), asked
 
@@ -255,7 +268,7 @@ def _chosen(table: pa.Table, split: str | None, refused: bool, place: Path) -> n
         if not keep.any():
             raise DataError(f"{place}: no image is in split {split!r}; splits are {dict(Counter(splits))}")
     if not keep.any():
-        raise DataError(f"{place}: holds no image; of {table.num_rows} rows the gate refused all")
+        raise DataError(f"{place}: holds no image; the gate refused all {table.num_rows}")
     return np.flatnonzero(keep)
 
 
