@@ -35,18 +35,11 @@ from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.prior import Prior, conditions_to_tensor, encode_prompts, load_prior
 from ctlev_core.diffusion.sampling import make_scheduler, sample_frames
 from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.trajectory_precision import PRECISIONS
 from data_contracts.labels import Conditions
 
 WANTED = 1.3
 PAPER_STEPS, EXTRAPOLATED_FROM = 1000, (10, 40)
-PRECISIONS = (
-    (torch.float32, torch.float32),
-    (torch.bfloat16, torch.float32),
-    (torch.bfloat16, torch.bfloat16),
-    (torch.float16, torch.float32),
-    (torch.float16, torch.float16),
-)
-"""Of the networks and of the state of the solver; ours keeps the state in float32."""
 DOUBLE = torch.float64
 
 
@@ -225,7 +218,7 @@ def print_precisions(prior_folder: Path | None, steps: int, ddpm_steps: int, cou
 def compute_precision_errors(
     load: Any, scheduler: str, num_steps: int, count: int, device: torch.device
 ) -> dict[tuple[torch.dtype, torch.dtype], PrecisionError]:
-    """Errors of each of `PRECISIONS`; `load(dtype=..., device=...)` gives the prior with its networks in that type."""
+    """Errors of each of `PRECISIONS` (ours keeps the state in float32); `load(dtype=, device=)` gives the prior."""
     exact = load(dtype=DOUBLE, device=device)
     reference = run_trajectory(exact, scheduler, num_steps, count, DOUBLE)
     picture = _decode(exact, reference)

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from data_contracts.config import cache_material
 from data_contracts.errors import DataError
+from data_contracts.labels import History, Labels
 from data_contracts.manifest import file_digest
 
 if TYPE_CHECKING:
@@ -47,6 +49,56 @@ def write_extractor(
         "options": options,
     }
     (out / CONFIG_NAME).write_text(json.dumps(config, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def training_of(
+    kind: str,
+    version: int,
+    find_network: Callable[[Any], tuple[str, Mapping[str, Path]]],
+    features: Callable[[Path, np.ndarray, str], np.ndarray],
+) -> Callable[..., History]:
+    """The `train` of an extractor plug-in that is ready-made.
+
+    Args:
+        kind: name of the plug-in.
+        version: of the plug-in.
+        find_network: from options to what scores call the network, and its files by the names they are to have.
+        features: of the plug-in.
+    """
+
+    def train(
+        frames: np.ndarray,
+        labels: Labels,
+        options: Any,
+        *,
+        seed: int,
+        out: Path,
+        work: Path,
+        parts: Sequence[int] = (),
+        groups: Sequence[str] = (),
+    ) -> History:
+        """Keep the network's files and their checksums in `out`; nothing learns.
+
+        Args:
+            frames: [N, H, W, 3] uint8, N >= 1; the first show whether the network runs on such images.
+            labels: not looked at, like `seed`, `work`, `parts` and `groups`.
+            options: of the plug-in.
+            seed: of nothing.
+            out: model folder.
+            work: stays empty.
+            parts: of nothing.
+            groups: of nothing.
+        Returns:
+            No losses.
+        Raises:
+            DataError: as `input_files` and `features`.
+        """
+        architecture, files = find_network(options)
+        write_extractor(out, kind, version, architecture, files, cache_material(options))
+        features(out, frames[:2], options.device)
+        return History()
+
+    return train
 
 
 def read_extractor(folder: Path, kind: str) -> dict[str, Any]:

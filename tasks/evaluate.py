@@ -13,17 +13,35 @@ from ctlev_core import plugins
 from ctlev_core.feature_distances import estimate_distances, name_distance
 from ctlev_core.frame_sequences import name_recordings
 from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
+from ctlev_core.score_requirements import check_distances, check_metrics
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import SHUFFLED
 from data_contracts.manifest import Manifest
-from tasks.stage import Output, stage
+from tasks.stage import Output, Stage
+from tasks.store import Store
 
 SHUFFLE_STREAM = 40
 
 
-@stage(version=6, schema=tables.SCORES)
+class _ModelScores(Stage):
+    """A stage that scores a model, and is refused where it is planned if a metric does not fit the model."""
+
+    def key(self, arguments: dict[str, Any], store: Store) -> str:
+        check_metrics(arguments["downstream"], arguments["metrics"])
+        return super().key(arguments, store)
+
+
+class _DistanceScores(Stage):
+    """A stage that compares sets of frames, and is refused where it is planned if it has nothing to do so with."""
+
+    def key(self, arguments: dict[str, Any], store: Store) -> str:
+        check_distances(arguments["downstream"], arguments["distances"])
+        return super().key(arguments, store)
+
+
+@partial(_ModelScores, version=6, schema=tables.SCORES, raw_files=None)
 def score_model(
     out: Output,
     model: Manifest,
@@ -180,7 +198,7 @@ def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manife
             raise DataError(f"{data.ref.path}: sample {shared[0]!r} is in the training data and in split {split!r}")
 
 
-@stage(version=4, schema=tables.SCORES)
+@partial(_DistanceScores, version=4, schema=tables.SCORES, raw_files=None)
 def score_distance(
     out: Output,
     extractor: Manifest,
@@ -205,13 +223,13 @@ def score_distance(
     compared, learnt = (other, other.rows_where(split=split)), (real, real.rows_where(split="train"))
     features, groups = [], []
     for data, rows in (compared, learnt):
+        if len(rows) == 0:
+            raise DataError(f"{data.ref.path}: no rows in split {split if data is other else 'train'!r} to compare")
         features.append(plugin.module.features(folder, np.asarray(data.array("frames")[rows])))
         groups.append(np.array(data.column("recording_id"))[rows])
     found = []
     for choice in distances:
         metric = plugins.load_options(choice)
-        if metric.module.INPUT != "features":
-            raise DataError(f"distances: {choice.name!r} compares {metric.module.INPUT}, not the features of two sets")
         estimates = estimate_distances(
             partial(metric.module.compute, options=metric.options),
             *features,

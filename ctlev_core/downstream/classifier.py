@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 VERSION = 1
 NAME = "classifier"
+PREDICTS = ("classes",)
 
 
 class Options(SupervisedOptions):

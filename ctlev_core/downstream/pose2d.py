@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 VERSION = 1
 NAME = "pose2d"
+PREDICTS = ("joints2d",)
 
 
 class Options(SupervisedOptions):

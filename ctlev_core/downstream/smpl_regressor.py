@@ -35,13 +35,14 @@ if TYPE_CHECKING:
 
 VERSION = 1
 NAME = "smpl_regressor"
+PREDICTS = ("joints2d", "joints3d", "smpl")
 
 
 class Options(SupervisedOptions):
     """Network, loss weights and training budget."""
 
-    architecture: Literal["resnet10-quarter", "resnet10-half", "resnet18", "resnet34"] = Field(
-        default="resnet10-quarter", description="Event-HPE's is a ResNet-50"
+    architecture: Literal["resnet10-quarter", "resnet10-half", "resnet18", "resnet34", "resnet50"] = Field(
+        default="resnet10-quarter", description="Event-HPE's is resnet50"
     )
     weights: Path | None = Field(
         default=None,

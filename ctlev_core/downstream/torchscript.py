@@ -9,7 +9,7 @@ by a Two Time-Scale Update Rule, NeurIPS 2017 (FID).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,13 +17,13 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core import feature_files
-from data_contracts.config import RUN_SETTING, Frozen, cache_material
+from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
-from data_contracts.labels import History, Labels
 from data_contracts.manifest import file_digest
 
 VERSION = 1
 NAME = "torchscript"
+PREDICTS = ()
 _FILE = "network.pt"
 _CHANNELS = {"0..1": ((0.0,) * 3, (1.0,) * 3), "imagenet": ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))}
 
@@ -66,40 +66,6 @@ def input_files(options: Options) -> list[Path]:
     return [options.file]
 
 
-def train(
-    frames: np.ndarray,
-    labels: Labels,
-    options: Options,
-    *,
-    seed: int,
-    out: Path,
-    work: Path,
-    parts: Sequence[int] = (),
-    groups: Sequence[str] = (),
-) -> History:
-    """Keep the file and its checksum in `out`; nothing learns.
-
-    Args:
-        frames: [N, H, W, 3] uint8, N >= 1; the first show whether the network runs on such images.
-        labels: not looked at, like `seed`, `work`, `parts` and `groups`.
-        options: see `Options`.
-        seed: of nothing.
-        out: model folder.
-        work: stays empty.
-        parts: of nothing.
-        groups: of nothing.
-    Returns:
-        No losses.
-    Raises:
-        DataError: as `input_files` and `features`.
-    """
-    (file,) = input_files(options)
-    architecture = "inception" if _is_inception(file) else options.architecture
-    feature_files.write_extractor(out, NAME, VERSION, architecture, {_FILE: file}, cache_material(options))
-    features(out, frames[:2], options.device)
-    return History()
-
-
 def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarray:
     """Features [N, D] float32 of frames [N, H, W, 3] uint8.
 
@@ -138,5 +104,13 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
     return {"features": features(model, frames)}
 
 
+def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
+    (file,) = input_files(options)
+    return "inception" if _is_inception(file) else options.architecture, {_FILE: file}
+
+
 def _is_inception(path: Path) -> bool:
     return file_digest(path) == feature_files.INCEPTION_SHA256
+
+
+train = feature_files.training_of(NAME, VERSION, _find_network, features)

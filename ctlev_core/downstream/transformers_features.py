@@ -9,7 +9,7 @@ happens at the border of an event image counts.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,12 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core import feature_files
-from data_contracts.config import RUN_SETTING, Frozen, cache_material
+from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
-from data_contracts.labels import History, Labels
 
 VERSION = 1
 NAME = "transformers_features"
+PREDICTS = ()
 # model_type -> class of transformers, and the output that holds the features.
 _MODELS = {
     "dinov2": ("Dinov2Model", "pooler_output"),
@@ -68,40 +68,6 @@ def input_files(options: Options) -> list[Path]:
     return [folder / _CONFIG, folder / _PREPROCESSOR, *sorted(folder.glob("model*.index.json")), *weights]
 
 
-def train(
-    frames: np.ndarray,
-    labels: Labels,
-    options: Options,
-    *,
-    seed: int,
-    out: Path,
-    work: Path,
-    parts: Sequence[int] = (),
-    groups: Sequence[str] = (),
-) -> History:
-    """Keep the folder's files and their checksums in `out`; nothing learns.
-
-    Args:
-        frames: [N, H, W, 3] uint8, N >= 1; the first show whether the network runs on such images.
-        labels: not looked at, like `seed`, `work`, `parts` and `groups`.
-        options: see `Options`.
-        seed: of nothing.
-        out: model folder.
-        work: stays empty.
-        parts: of nothing.
-        groups: of nothing.
-    Returns:
-        No losses.
-    Raises:
-        DataError: as `input_files` and `features`.
-    """
-    files = {path.name: path for path in input_files(options)}
-    kind = _read_kind(files[_CONFIG].parent).replace("_", "")
-    feature_files.write_extractor(out, NAME, VERSION, kind, files, cache_material(options))
-    features(out, frames[:2], options.device)
-    return History()
-
-
 def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarray:
     """Features [N, D] float32 of frames [N, H, W, 3] uint8.
 
@@ -134,6 +100,11 @@ def name_score(model: Path, score: str) -> str:
 def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
     """`features` [N, D]: there is nothing else to predict."""
     return {"features": features(model, frames)}
+
+
+def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
+    files = {path.name: path for path in input_files(options)}
+    return _read_kind(files[_CONFIG].parent).replace("_", ""), files
 
 
 def _read_kind(folder: Path) -> str:
@@ -185,3 +156,6 @@ def _load(folder: Path) -> tuple[Any, str]:
     if lost:
         raise DataError(f"{folder}: the weights lack {len(lost)} tensors of {name}, the first {lost[0]}")
     return network.float().eval(), output
+
+
+train = feature_files.training_of(NAME, VERSION, _find_network, features)

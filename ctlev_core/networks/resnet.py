@@ -23,7 +23,8 @@ class ResNetClassifier(nn.Module):
     """A ResNet without its own head, global average pooling, and a linear or one-hidden-layer head.
 
     Args:
-        shape: `depths`, `hidden_sizes`, `embedding_size` as in `ctlev_core.networks.resnet_files.ARCHITECTURES`.
+        shape: `depths`, `hidden_sizes`, `embedding_size` and, unless basic, `layer_type`, as in
+            `ctlev_core.networks.resnet_files.ARCHITECTURES`.
         num_classes: logits.
         head_width: hidden units of the head; 0 makes the head linear.
     """
@@ -33,7 +34,7 @@ class ResNetClassifier(nn.Module):
 
         super().__init__()
         network = ResNetForImageClassification(
-            ResNetConfig.from_dict({**shape, "layer_type": "basic", "num_labels": num_classes})
+            ResNetConfig.from_dict({"layer_type": "basic", **shape, "num_labels": num_classes})
         )
         self.backbone = network.resnet
         self.head: nn.Module = network.classifier[1]

@@ -11,12 +11,19 @@ from typing import Any
 
 from data_contracts.errors import DataError
 
-# Name -> blocks per stage, channels per stage, channels of the first convolution; basic (two-convolution) blocks.
+# Name -> blocks per stage, channels per stage, channels of the first convolution; blocks are basic (two convolutions)
+# unless they say otherwise.
 ARCHITECTURES: dict[str, dict[str, Any]] = {
     "resnet10-quarter": {"depths": [1, 1, 1, 1], "hidden_sizes": [16, 32, 64, 128], "embedding_size": 16},
     "resnet10-half": {"depths": [1, 1, 1, 1], "hidden_sizes": [32, 64, 128, 256], "embedding_size": 32},
     "resnet18": {"depths": [2, 2, 2, 2], "hidden_sizes": [64, 128, 256, 512], "embedding_size": 64},
     "resnet34": {"depths": [3, 4, 6, 3], "hidden_sizes": [64, 128, 256, 512], "embedding_size": 64},
+    "resnet50": {
+        "depths": [3, 4, 6, 3],
+        "hidden_sizes": [256, 512, 1024, 2048],
+        "embedding_size": 64,
+        "layer_type": "bottleneck",
+    },
 }
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 STRIDE = 32

@@ -33,7 +33,7 @@ class SmplRegressor(nn.Module):
     """Images [N, 3, H, W] in [0, 1] to SMPL bodies in the camera frame.
 
     Args:
-        shape: `depths`, `hidden_sizes`, `embedding_size` as in `ctlev_core.networks.resnet_files.ARCHITECTURES`.
+        shape: as in `ctlev_core.networks.resnet_files.ARCHITECTURES`.
         grid: the last feature map is averaged over grid x grid cells; 1 is the usual global mean, which forgets where
             in the image a body is.
         head_width: hidden units of the head; 0 makes it linear.

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from ctlev_core.body_samples import BodySamples, mirror_half, shift
 from ctlev_core.downstream import smpl_regressor
 from ctlev_core.frame_sequences import find_sequences, name_recordings
+from ctlev_core.networks.resnet_files import ARCHITECTURES
 from ctlev_core.networks.smpl_regressor import SmplRegressor
 from ctlev_core.training_rows import TrainingRows
 from data_contracts.config import cache_material
@@ -137,6 +138,15 @@ def test_the_recurrent_unit_is_the_definition(lengths):
     parts = np.split(features.numpy(), np.cumsum(lengths)[:-1])
     expected = np.concatenate([part + slow_gru(network.recurrent.state_dict(), part) for part in parts])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+def test_event_hpe_s_own_size_can_be_chosen():
+    with torch.device("meta"):
+        network = SmplRegressor(ARCHITECTURES["resnet50"], grid=1, head_width=0, recurrent=True)
+    assert network.recurrent is not None
+    # A ResNet-50 has 25,557,032 weights, 2,049,000 of them in the layer of ImageNet's classes.
+    assert sum(weight.numel() for weight in network.network.backbone.parameters()) == 25_557_032 - 2_049_000
+    assert sum(weight.numel() for weight in network.recurrent.parameters()) == 6 * 2048 * (2048 + 1)
 
 
 def test_without_the_option_there_is_no_unit_and_no_other_key():
