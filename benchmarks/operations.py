@@ -10,6 +10,9 @@ stage that does nothing, with Prefect and without. `smoke`: the preset in one pr
 what is spent outside of stages is overhead, start-up apart. `shards`: shards that sleep, so that they need no
 processor, in a hundred task runs; all that processors do is scheduling, the start of our processes included.
 
+`runners`: shards within one stage, in threads, processes, Dask and Ray where they are installed: sleeping ones, and how
+much sooner two workers have counted events and rendered bodies than one has; that needs two idle cores.
+
 By the clock, and in processor seconds of all processes. Targets are judged by the latter, but for `cached`: on a busy
 machine the clock shows what others do.
 """
@@ -17,6 +20,7 @@ machine the clock shows what others do.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import resource
@@ -32,7 +36,10 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 CACHED_S_WANTED, OVERHEAD_WANTED = 5.0, 0.05
 TASK_RUNS = 100
-PARTS = ("cached", "stages", "smoke", "shards")
+PARTS = ("cached", "stages", "smoke", "shards", "runners")
+RUNNERS = {"threads": "tasks", "processes": "tasks", "dask": "distributed", "ray": "ray"}
+"""And the package that each needs."""
+SPEED_UP_WANTED = 1.6
 
 
 @dataclass
@@ -65,6 +72,7 @@ def main() -> None:
     parser.add_argument("--shards", type=int, default=2000)
     parser.add_argument("--seconds", type=float, default=0.1, help="of a shard")
     parser.add_argument("--workers", type=int, default=8, help="processes of `shards`; they sleep")
+    parser.add_argument("--work-shards", type=int, default=32, help="of counting and rendering in `runners`")
     parser.add_argument("--in-process", nargs=2, help=argparse.SUPPRESS)  # a function of operations_flows, arguments
     chosen = parser.parse_args()
     if chosen.in_process:
@@ -82,6 +90,8 @@ def main() -> None:
             missed += smoke(new_home)
         if "shards" in wanted:
             missed += shards(new_home, chosen.shards, chosen.seconds, chosen.workers)
+        if "runners" in wanted:
+            missed += runners(new_home, chosen.shards, chosen.seconds, chosen.workers, chosen.work_shards)
     print("\nTargets missed: " + ("; ".join(missed) or "none"))
 
 
@@ -182,6 +192,37 @@ def shards(new_home: Path, count: int, seconds: float, workers: int) -> list[str
     if share < OVERHEAD_WANTED:
         return []
     return [f"shards: {100 * share:.1f} % scheduling, wanted {100 * OVERHEAD_WANTED:g} %"]
+
+
+def runners(new_home: Path, count: int, seconds: float, workers: int, work_shards: int) -> list[str]:
+    """Shards of one stage on each runner: what waiting costs, and what a second worker gains."""
+    print(f"\nrunners: {count} of {1000 * seconds:g} ms on {workers} workers; {work_shards} with work, on 1 and 2")
+    print(f"{'':10} {'start s':>8} {'beyond sleep':>13} {'processors':>11} {'encode, 1 / 2':>15} {'render, 1 / 2':>15}")
+    missed = []
+    for runner in [name for name, package in RUNNERS.items() if importlib.util.find_spec(package)]:
+        given = {"work": "sleep", "shards": count, "seconds": seconds, "workers": workers, "runner": runner}
+        script = in_process("time_map", new_home / "runners", **given)
+        found, work_s = json.loads(script.run()), count * seconds
+        beyond = (found["seconds"] - found["start_s"]) * workers / work_s - 1
+        ratios = {}
+        for work in ("encode", "render"):
+            took = []
+            for number in (1, 2):
+                given = {"work": work, "shards": work_shards, "seconds": 0.0, "workers": number, "runner": runner}
+                timed = json.loads(in_process("time_map", new_home / "runners", **given).run())
+                # Seconds a shard, without the first of each worker, which compiles and makes what it works on.
+                took.append((timed["seconds"] - timed["start_s"]) / (work_shards - number))
+            ratios[work] = took[0] / took[1]
+            if ratios[work] < SPEED_UP_WANTED:
+                missed.append(f"{work} in two {runner}: {ratios[work]:.2f} x, wanted {SPEED_UP_WANTED:g} x")
+        print(
+            f"{runner:10} {found['start_s']:8.1f} {100 * beyond:11.1f} % {100 * script.cpu_s[0] / work_s:9.1f} %"
+            f" {ratios['encode']:15.2f} {ratios['render']:15.2f}",
+            flush=True,
+        )
+        if script.cpu_s[0] / work_s >= OVERHEAD_WANTED:
+            missed.append(f"shards in {runner}: {100 * script.cpu_s[0] / work_s:.1f} % scheduling")
+    return missed
 
 
 def _children_cpu_s() -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from data_contracts import tables
 from data_contracts.manifest import ManifestRef, read_manifest
 from tasks.stage import Output, call_together, stage
 from tasks.store import Store
+from tasks.workers import map_shards
 
 
 @stage(version=1, schema=tables.TRAINING)
@@ -77,6 +78,69 @@ def time_task_runs(home: Path, shards: int, seconds: float, groups: int, workers
     if len(done) != shards:
         raise RuntimeError(f"expected {shards} shards, got {len(done)}")
     return {"seconds": float(done.max() - started), "start_s": float(done.min() - seconds - started)}
+
+
+def time_map(home: Path, work: str, shards: int, seconds: float, workers: int, runner: str) -> dict[str, float]:
+    """Seconds by the clock of shards within one stage, and how much of that was until each process had done something.
+
+    Args:
+        home: of the store; not used.
+        work: `sleep`, `encode` or `render`.
+        shards: how many.
+        seconds: of sleep.
+        workers: processes or threads.
+        runner: as CTLEV_RUNNER.
+    """
+    os.environ |= {"CTLEV_WORKERS": str(workers), "CTLEV_RUNNER": runner, "PYTHONPATH": str(Path(__file__).parent)}
+    shard = {"sleep": partial(_sleep, seconds), "encode": _encode, "render": _render}[work]
+    start = time.monotonic()
+    done = np.array(list(map_shards(shard, range(shards))))
+    return {"seconds": float(done.max() - start), "start_s": float(done.min() - seconds - start)}
+
+
+def _sleep(seconds: float, number: int) -> float:
+    time.sleep(seconds)
+    return time.monotonic()
+
+
+def _encode(number: int) -> float:
+    """Four million events in windows of 7,500, streamed, so that memory is not what is measured."""
+    from ctlev_core.encodings import event_histogram
+
+    events, ranges = _events()
+    for _ in event_histogram.encode_each(events, ranges, event_histogram.Options()):
+        pass
+    return time.monotonic()
+
+
+@cache
+def _events() -> tuple[Any, np.ndarray]:
+    from data_contracts.events import Events
+
+    rng, count = np.random.default_rng(0), 4_000_000
+    x, y = (rng.integers(0, size, count, dtype=np.uint16) for size in (346, 260))
+    p = rng.integers(0, 2, count, dtype=np.uint8)
+    starts = np.arange(0, count - 7500, 7500)
+    return Events(np.arange(count), x, y, p, (346, 260)), np.stack([starts, starts + 7500], axis=1)
+
+
+def _render(number: int) -> float:
+    """64 normal maps of 256 x 256 px."""
+    from ctlev_core.render.normals import render_normal_maps
+
+    vertices, faces, intrinsics = _bodies()
+    render_normal_maps(vertices, faces, intrinsics, (256, 256), "controlnet", workers=1)
+    return time.monotonic()
+
+
+@cache
+def _bodies() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    from ctlev_core.body.layer import load_body, pose_vertices
+
+    body = load_body(None)
+    rotations = np.broadcast_to(np.eye(3), (64, 24, 3, 3))
+    vertices, _ = pose_vertices(body, rotations, np.zeros((64, 10)), np.broadcast_to([0.0, 0.0, 3.0], (64, 3)))
+    return vertices, body.faces, np.broadcast_to([256.0, 256.0, 128.0, 128.0], (64, 4))
 
 
 def _in_a_flow(home: Path, run: Callable[[], Any]) -> Any:
