@@ -218,6 +218,31 @@ def test_a_run_whose_worker_is_killed_goes_on_with_another(service, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_whole_experiment_is_completed_although_its_worker_was_killed(service, tmp_path):
+    first = service.start_run("full-experiment", tmp_path)
+    deadline = time.monotonic() + 800
+    while not digests(tmp_path, ("encode",)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    before = digests(tmp_path)
+    assert before
+    end(service.worker)
+    service.start_worker()
+    second = service.start_run("full-experiment", tmp_path)
+    state = service.state(second, until=ENDED, timeout=900)
+    assert first != second and state["type"] == "COMPLETED", state
+    after = digests(tmp_path)
+    assert before.items() <= after.items() and (tmp_path / "reports" / "smoke.html").is_file()
+    (plan,) = service.api(
+        "artifacts/filter", {"artifacts": {"flow_run_id": {"any_": [second]}, "key": {"any_": ["plan"]}}}
+    )
+    planned = json.loads(plan["data"])
+    assert {row["key"] for row in planned} == {name.partition("/")[2] for name in after}
+    cached = {row["key"] for row in planned if row["plan"] == "cached"}
+    assert {name.partition("/")[2] for name in before} <= cached
+
+
+@pytest.mark.slow
 def test_a_run_that_would_overlap_is_cancelled_and_says_why(service, tmp_path):
     first = service.start_run("regenerate", tmp_path)
     service.state(first, until={"PENDING", "RUNNING"})
