@@ -71,7 +71,7 @@ def asked_runner() -> tuple[str, str]:
         raise DataError(f"CTLEV_RUNNER must be one of {', '.join(KINDS)}, dask:ADDRESS or ray:ADDRESS, got {asked!r}")
     if kind in _CLUSTERS and importlib.util.find_spec(_CLUSTERS[kind].package) is None:
         raise DataError(
-            f"CTLEV_RUNNER={asked} needs the package {_CLUSTERS[kind].package!r}: pip install 'ctlev[{kind}]'"
+            f"CTLEV_RUNNER={asked} needs the package {_CLUSTERS[kind].package!r}: pip install -e '.[{kind}]'"
         )
     return kind, address
 

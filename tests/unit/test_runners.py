@@ -163,7 +163,7 @@ def test_an_unknown_runner_is_refused_before_anything_runs(asked, monkeypatch):
 def test_a_missing_package_is_named_with_what_to_install(kind, package, monkeypatch):
     monkeypatch.setenv("CTLEV_RUNNER", f"{kind}:host:1")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else sys)
-    with pytest.raises(DataError, match=rf"needs the package '{package}': pip install 'ctlev\[{kind}\]'"), planning():
+    with pytest.raises(DataError, match=rf"needs the package '{package}': pip install -e '.\[{kind}\]'"), planning():
         pass
 
 
