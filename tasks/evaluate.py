@@ -20,7 +20,6 @@ from data_contracts.errors import DataError
 from data_contracts.experiment import SHUFFLED
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, Stage
-from tasks.store import Store
 
 SHUFFLE_STREAM = 40
 
@@ -28,17 +27,15 @@ SHUFFLE_STREAM = 40
 class _ModelScores(Stage):
     """A stage that scores a model, and is refused where it is planned if a metric does not fit the model."""
 
-    def key(self, arguments: dict[str, Any], store: Store) -> str:
+    def check(self, arguments: dict[str, Any]) -> None:
         check_metrics(arguments["downstream"], arguments["metrics"])
-        return super().key(arguments, store)
 
 
 class _DistanceScores(Stage):
     """A stage that compares sets of frames, and is refused where it is planned if it has nothing to do so with."""
 
-    def key(self, arguments: dict[str, Any], store: Store) -> str:
+    def check(self, arguments: dict[str, Any]) -> None:
         check_distances(arguments["downstream"], arguments["distances"])
-        return super().key(arguments, store)
 
 
 @partial(_ModelScores, version=6, schema=tables.SCORES, raw_files=None)

@@ -160,6 +160,7 @@ class Stage:
         bound = self.signature.bind(None, *inputs, **settings)
         bound.apply_defaults()
         arguments = dict(list(bound.arguments.items())[1:])
+        self.check(arguments)
         store = Store()
         key = self.key(arguments, store)
         label = f"{self.name}: {label}" if label else self.name
@@ -169,6 +170,9 @@ class Stage:
             plan.rows.append(PlannedStage(self.name, label, key, cached))
             return ManifestRef(key=key, path=store.folder(self.name, key))
         return _run_as_task(self, label, key, arguments)
+
+    def check(self, arguments: dict[str, Any]) -> None:
+        """Raise `DataError` where the settings do not go together: where a stage is planned, and where it is run."""
 
     def key(self, arguments: dict[str, Any], store: Store) -> str:
         """The cache key: 32 hexadecimal digits of a SHA-256."""
