@@ -29,12 +29,14 @@ from ctlev_core.diffusion.training import check_run, run_training, sample_rows
 from ctlev_core.diffusion.training_log import picture_of_samples
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.config import cache_material
+from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 
 Tune = Literal["unet", "controlnet", "both"]
 SHOWN, SHOWN_STEPS = 6, 10
 """Samples in a picture, and evaluations of the network for each."""
-SPLIT_STREAM, LATENT_STREAM, DROPOUT_STREAM, WEIGHT_STREAM = 1, 2, 3, 4  # entropy that keeps random streams apart
+SPLIT_STREAM, LATENT_STREAM, DROPOUT_STREAM, WEIGHT_STREAM, TURN_STREAM = 1, 2, 3, 4, 5
+"""Entropy that keeps random streams apart."""
 
 
 def forget_weights(prior: Prior, seed: int) -> Prior:
@@ -84,6 +86,8 @@ def fine_tune(
             not fit one another.
     """
     check_training_data(frames, conditions, prior.image_size)
+    if options.turned_share and frames.shape[1] != frames.shape[2]:
+        raise DataError(f"turned_share needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0")
     device = prior.unet.device
     networks = {"unet": (prior.unet,), "controlnet": (prior.controlnet,), "both": (prior.unet, prior.controlnet)}[tune]
     parameters = []
@@ -98,13 +102,15 @@ def fine_tune(
     check_run(trainer, ranks, validated=validated)
     denoiser = Denoiser(prior.unet, prior.controlnet)
     schedule = NoiseSchedule(prior.scheduler_config)
-    cache = cache_latents(prior, frames, conditions, class_names)
+    num_turns = 4 if options.turned_share else 1
+    cache = cache_latents(prior, frames, conditions, class_names, num_turns=num_turns)
     check_cache(cache, conditions)
     prior.text_encoder.to("cpu")
 
     def fetch(number: int) -> Batch:
         rows = training_rows[sample_rows(seed, number, options.batch_size, len(training_rows))]
-        return cache.batch(rows, generator_for(seed, LATENT_STREAM, number), options.prompt_dropout, device)
+        turns = draw_turns(len(rows), options.turned_share, seed, number) if options.turned_share else None
+        return cache.batch(rows, generator_for(seed, LATENT_STREAM, number), options.prompt_dropout, device, turns)
 
     def validate() -> tuple[float, float]:
         batch = cache.batch(validation_rows, generator_for(seed, DROPOUT_STREAM), 0.0, device)
@@ -133,6 +139,12 @@ def split_rows(count: int, options: FineTuningOptions, seed: int) -> tuple[np.nd
     order = np.random.default_rng([seed, SPLIT_STREAM]).permutation(count)
     held_back = min(options.num_validation, count // 10)
     return order[:held_back], order[held_back:][: options.max_frames]
+
+
+def draw_turns(count: int, share: float, seed: int, number: int) -> np.ndarray:
+    """Quarter turns [count] of micro-batch `number`: 0 but for `share` of them, which are 1, 2 or 3 alike."""
+    rng = np.random.default_rng([seed, TURN_STREAM, number])
+    return np.where(rng.random(count) < share, rng.integers(1, 4, count), 0)
 
 
 def draw_samples(prior: Prior, frames: np.ndarray, conditions: Conditions) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
@@ -19,11 +20,11 @@ ENCODE_BATCH = 32
 
 @dataclass(frozen=True, eq=False)
 class LatentCache:
-    """Everything the loop needs of N frames, computed once.
+    """Everything the loop needs of N frames in T quarter turns, computed once.
 
     Attributes:
-        mean: [N, C, h, w] posterior means, not scaled.
-        std: [N, C, h, w] posterior standard deviations; None for a code without noise.
+        mean: [T * N, C, h, w] posterior means, not scaled: all frames as they are, then all turned once, and so on.
+        std: [T * N, C, h, w] posterior standard deviations; None for a code without noise.
         scaling_factor: multiplies sampled latents.
         embeddings: [P, L, D] of the distinct prompts; the last is the empty prompt.
         prompt_rows: for each of N frames the indices into `embeddings` of the prompts it may be shown with.
@@ -39,9 +40,24 @@ class LatentCache:
     conditions: np.ndarray | None
     reversed_condition: bool
 
-    def batch(self, rows: np.ndarray, generator: torch.Generator, prompt_dropout: float, device: torch.device) -> Batch:
-        """The given rows; latents are drawn from their posteriors, and prompts from those of each frame."""
-        index = torch.from_numpy(rows)
+    def batch(
+        self,
+        rows: np.ndarray,
+        generator: torch.Generator,
+        prompt_dropout: float,
+        device: torch.device,
+        turns: np.ndarray | None = None,
+    ) -> Batch:
+        """The given rows; latents are drawn from their posteriors, and prompts from those of each frame.
+
+        Args:
+            rows: [B] of N frames.
+            generator: of latents and prompts.
+            prompt_dropout: share of empty prompts.
+            device: of the batch.
+            turns: [B] quarter turns, less than T, of frame and condition alike; None = none.
+        """
+        index = torch.from_numpy(rows if turns is None else turns * len(self.prompt_rows) + rows)
         latents = self.mean[index]
         if self.std is not None:
             latents = latents + self.std[index] * torch.randn(latents.shape, generator=generator)
@@ -52,27 +68,37 @@ class LatentCache:
         prompts = torch.where(dropped, len(self.embeddings) - 1, prompts)
         conditions = None
         if self.conditions is not None:
-            conditions = conditions_to_tensor(self.conditions[rows], self.reversed_condition).to(device)
+            images = self.conditions[rows]
+            if turns is not None:
+                images = np.stack([np.rot90(image, turn) for image, turn in zip(images, turns, strict=True)])
+            conditions = conditions_to_tensor(images, self.reversed_condition).to(device)
         latents = latents * self.scaling_factor
         return Batch(latents.to(device), self.embeddings[prompts].to(device), conditions)
 
 
 def cache_latents(
-    prior: Prior, frames: np.ndarray, conditions: Conditions, class_names: Sequence[str] | None = None
+    prior: Prior,
+    frames: np.ndarray,
+    conditions: Conditions,
+    class_names: Sequence[str] | None = None,
+    *,
+    num_turns: int = 1,
 ) -> LatentCache:
-    """Run the frozen autoencoder and text encoder, once per frame and once per distinct prompt.
+    """Run the frozen autoencoder and text encoder, once per frame and turn and once per distinct prompt.
 
     Args:
         prior: autoencoder and text encoder.
         frames: [N, H, W, 3] uint8.
         conditions: N prompts and perhaps condition images.
         class_names: N; frames of one class may be shown with the prompt of any of them. None = each with its own.
+        num_turns: 4 also encodes square frames in their three quarter turns.
     """
     device = prior.vae.device
     means, deviations = [], []
     with torch.no_grad():
-        for start in range(0, len(frames), ENCODE_BATCH):
-            images = images_to_tensor(frames[start : start + ENCODE_BATCH]).to(device, prior.vae.dtype)
+        for turn, start in product(range(num_turns), range(0, len(frames), ENCODE_BATCH)):
+            turned = np.rot90(frames[start : start + ENCODE_BATCH], turn, axes=(1, 2))
+            images = images_to_tensor(np.ascontiguousarray(turned)).to(device, prior.vae.dtype)
             posterior = prior.vae.encode(images).latent_dist
             means.append(posterior.mean.float().cpu())
             if hasattr(posterior, "std"):
@@ -121,9 +147,10 @@ def check_cache(cache: LatentCache, conditions: Conditions) -> None:
     for name, values in (("mean", cache.mean), ("standard deviation", cache.std)):
         wrong = None if values is None else ~torch.isfinite(values).flatten(1).all(dim=1)
         if wrong is not None and bool(wrong.any()):
-            row = int(wrong.nonzero()[0])
+            count = len(cache.prompt_rows)
+            row = int(wrong.nonzero()[0]) % count
             raise DataError(
-                f"frame {row} of {len(cache.mean)}: the {name} of its latents must be finite, which the prior's "
+                f"frame {row} of {count}: the {name} of its latents must be finite, which the prior's "
                 "autoencoder did not make it; check that frame and the autoencoder"
             )
     wrong = ~torch.isfinite(cache.embeddings).flatten(1).all(dim=1)

@@ -88,6 +88,14 @@ class FineTuningOptions(TrainingOptions):
     prompt_dropout: float = Field(
         default=0.0, ge=0, le=1, description="share of empty prompts, needed only for guidance_scale > 1"
     )
+    turned_share: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="share of frames shown turned by 90, 180 or 270 degrees, with their condition images, as a rolled "
+        "camera would see them: bodies lie that only stood. Not for normal maps, whose colours are directions of the "
+        "camera",
+    )
     num_validation: int = Field(
         default=64, ge=0, description="frames held back for the validation loss, a tenth at most"
     )

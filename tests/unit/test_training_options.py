@@ -1,5 +1,6 @@
 """Each option of training does what it says, and a killed run ends as an unkilled one whichever are set."""
 
+import dataclasses
 import logging
 import math
 
@@ -12,11 +13,11 @@ from tiny_prior import make_data, make_prior, shared_prior
 
 from ctlev_core.diffusion import acceleration, finetuning, trainer, training
 from ctlev_core.diffusion.denoising import generator_for
-from ctlev_core.diffusion.finetuning import fine_tune, split_rows
+from ctlev_core.diffusion.finetuning import draw_turns, fine_tune, split_rows
 from ctlev_core.diffusion.latent_cache import LatentCache, cache_latents
 from ctlev_core.diffusion.muon import MATRIX_RATE, is_matrix
 from ctlev_core.diffusion.training_options import FineTuningOptions
-from data_contracts.errors import TrainingError
+from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import Conditions
 
 OPTIONS = FineTuningOptions(num_steps=6, batch_size=4, warmup_steps=2, log_every=2, num_validation=0, ema_decay=0.5)
@@ -51,6 +52,7 @@ KILLED_WITH = {
     "best": VALIDATED.model_copy(update={"keep": "best", "patience": 9}),
     "float16": OPTIONS.model_copy(update={"precision": "float16", "gradient_accumulation": 2}),
     "epochs": OPTIONS.model_copy(update={"max_frames": 5}),
+    "turned": OPTIONS.model_copy(update={"turned_share": 0.5}),
 }
 
 
@@ -229,6 +231,39 @@ def test_class_names_change_what_is_learnt_and_belong_to_the_run(tmp_path):
     assert not same(fixed, drawn)
     with pytest.raises(TrainingError, match="of another run"):
         run("fixed", ["thing"] * 40)
+
+
+def test_turned_frames_are_those_of_turned_pictures():
+    prior = shared_prior()
+    frames, conditions = FRAMES[:5], Conditions(CONDITIONS.prompts[:5], images=FRAMES[5:10])
+    rows, turns = np.array([4, 0, 2, 2, 1]), np.array([0, 1, 2, 3, 1])
+    cache = cache_latents(prior, frames, conditions, num_turns=4)
+    batch = cache.batch(rows, generator_for(1), 0.0, torch.device("cpu"), turns)
+    for position, (row, turn) in enumerate(zip(rows, turns, strict=True)):
+        frame = np.rot90(frames[row], turn)[None].copy()
+        condition = np.rot90(conditions.images[row], turn)[None].copy()
+        alone = cache_latents(prior, frame, Conditions(conditions.prompts[row : row + 1], images=condition))
+        expected = alone.batch(np.array([0]), generator_for(1), 0.0, torch.device("cpu"))
+        torch.testing.assert_close(batch.latents[position], expected.latents[0], rtol=1e-5, atol=1e-5)
+        assert torch.equal(batch.conditions[position], expected.conditions[0])
+        assert torch.equal(batch.embeddings[position], expected.embeddings[0])
+
+
+def test_turns_have_their_share_and_a_stream_of_their_own():
+    turns = np.concatenate([draw_turns(16, 0.4, 3, number) for number in range(500)])
+    shares = np.bincount(turns, minlength=4) / len(turns)
+    # Five standard deviations of 8,000 draws.
+    np.testing.assert_allclose(shares, [0.6, 0.4 / 3, 0.4 / 3, 0.4 / 3], atol=5 * (0.24 / 8000) ** 0.5)
+    assert np.array_equal(draw_turns(16, 0.4, 3, 7), draw_turns(16, 0.4, 3, 7))
+    assert not draw_turns(16, 0.0, 3, 7).any()
+
+
+def test_only_square_frames_are_turned(tmp_path):
+    prior, wide = make_prior(), np.zeros((4, 16, 32, 3), np.uint8)
+    prior = dataclasses.replace(prior, image_size=(32, 16))
+    options = OPTIONS.model_copy(update={"turned_share": 0.1})
+    with pytest.raises(DataError, match=r"square frames, got 32 x 16 px"):
+        fine_tune(prior, wide, Conditions(CONDITIONS.prompts[:4]), options, tune="unet", seed=0, work=tmp_path)
 
 
 def test_gradient_checkpointing_saves_memory_and_changes_nothing(tmp_path):
