@@ -3,10 +3,10 @@
 Event images are mostly isolated single pixels on a flat background. Autoencoders trained for minutes blur them away
 (with 8 channels a learned one kept 14 % of a single pixel's brightness), and what the code loses no generator can put
 back. This code loses nothing: each 4 x 4 block of pixels goes through an orthonormal colour transform and an
-orthonormal two-dimensional DCT, which gives 48 latent channels at a quarter of the resolution. Channel k is divided by
-sigma_k ** 0.5, with sigma_k its standard deviation over the pre-training images: half-way whitening. Low frequencies
-stay louder than high ones, as in images, so that the effective dimension the small U-Net must model stays low, yet no
-channel is so quiet that the noise schedule would drown it before the others are formed.
+orthonormal two-dimensional DCT, which gives 48 latent channels at a quarter of the resolution. All channels have one
+scale, so that errors and noise weigh as much in latents as in pixels. Channels whitened half-way over the pre-training
+images were worse: event images are sharper than pictures, and in grey ones the highest frequency then had five times
+the variance of the mean brightness, which left the U-Net with noise to learn before shapes.
 """
 
 from __future__ import annotations
@@ -66,11 +66,10 @@ class DeltaDistribution:
 
 
 class PatchAutoencoder(ModelMixin, ConfigMixin):
-    """Orthonormal 4 x 4 DCT of opponent colours with half-whitened channels; nothing is trained, nothing is lost.
+    """Orthonormal 4 x 4 DCT of opponent colours; nothing is trained, nothing is lost.
 
     Args:
-        channel_mean: 48 means of the raw coefficients over the pre-training images; empty = zeros.
-        channel_scale: 48 positive divisors, sigma ** 0.5 of the raw coefficients; empty = ones.
+        channel_mean: 48 means of the coefficients over the pre-training images; empty = zeros.
         scaling_factor: multiplies the latents in the pipeline so that their overall standard deviation is 1.
         latent_channels: fixed at 48; in the config because pipelines and checks read it there.
         block_out_channels: only the length matters: pipelines take 2 ** (length - 1) = 4 as the down-sampling factor.
@@ -80,7 +79,6 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
     def __init__(
         self,
         channel_mean: tuple[float, ...] = (),
-        channel_scale: tuple[float, ...] = (),
         scaling_factor: float = 1.0,
         latent_channels: int = LATENT_CHANNELS,
         block_out_channels: tuple[int, ...] = (LATENT_CHANNELS,) * 3,
@@ -89,12 +87,8 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
     ) -> None:
         super().__init__()
         mean = torch.tensor(channel_mean or (0.0,) * LATENT_CHANNELS, dtype=torch.float64)
-        scale = torch.tensor(channel_scale or (1.0,) * LATENT_CHANNELS, dtype=torch.float64)
-        for name, values in (("channel_mean", mean), ("channel_scale", scale)):
-            if values.shape != (LATENT_CHANNELS,) or not bool(torch.isfinite(values).all()):
-                raise ValueError(f"{name} must hold {LATENT_CHANNELS} finite numbers, got {values.tolist()}")
-        if not bool((scale > 0).all()):
-            raise ValueError(f"channel_scale must be positive, got {scale.tolist()}")
+        if mean.shape != (LATENT_CHANNELS,) or not bool(torch.isfinite(mean).all()):
+            raise ValueError(f"channel_mean must hold {LATENT_CHANNELS} finite numbers, got {mean.tolist()}")
         if latent_channels != LATENT_CHANNELS or 2 ** (len(block_out_channels) - 1) != PATCH_PX:
             raise ValueError(
                 f"the patch code has {LATENT_CHANNELS} channels and factor {PATCH_PX}, "
@@ -102,9 +96,8 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
             )
         basis = patch_basis()
         # Persistent, although derived from the config: a weights file without tensors cannot be loaded.
-        self.register_buffer("analysis", (basis / scale[:, None]).float())
-        self.register_buffer("offset", (mean / scale).float())
-        self.register_buffer("synthesis", (basis.T * scale[None, :]).float())
+        self.register_buffer("analysis", basis.float())
+        self.register_buffer("offset", mean.float())
 
     def encode(self, x: torch.Tensor, return_dict: bool = True) -> AutoencoderKLOutput | tuple[DeltaDistribution]:
         """Latents of images.
@@ -128,7 +121,7 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
         self, z: torch.Tensor, return_dict: bool = True, generator: torch.Generator | None = None
     ) -> DecoderOutput | tuple[torch.Tensor]:
         """Images [N, 3, H, W] of latents [N, 48, H / 4, W / 4]; the exact inverse of `encode`, not clipped."""
-        patches = torch.einsum("ck,nkhw->nchw", self.synthesis, z + self.offset[:, None, None])
+        patches = torch.einsum("kc,nkhw->nchw", self.analysis, z + self.offset[:, None, None])
         sample = torch.nn.functional.pixel_shuffle(patches, PATCH_PX)
         return DecoderOutput(sample=sample) if return_dict else (sample,)
 
@@ -143,7 +136,7 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
 
 
 def fit_patch_autoencoder(images: torch.Tensor) -> PatchAutoencoder:
-    """Measure the whitening scale on images and return the code.
+    """Measure mean and spread of the coefficients of images and return the code.
 
     Args:
         images: [N, 3, H, W] in [-1, 1], a few hundred of the images the prior will be trained on.
@@ -155,10 +148,7 @@ def fit_patch_autoencoder(images: torch.Tensor) -> PatchAutoencoder:
     if len(images) == 0:
         raise ValueError("the patch code needs at least one image to measure its scale, got none")
     raw = PatchAutoencoder().encode(images)[0].mode().double()
-    mean = raw.mean(dim=(0, 2, 3))
-    sigma = raw.std(dim=(0, 2, 3))
-    # A channel the images never use must not be blown up: floor at a tenth of a grey level of one pixel.
-    scale = sigma.clamp(min=0.1 * 2 / 255).sqrt()
-    # std of the half-whitened latents is sigma / sigma ** 0.5 = sigma ** 0.5, pooled over channels.
-    scaling_factor = 1 / float(((sigma / scale) ** 2).mean().sqrt())
-    return PatchAutoencoder(tuple(mean.tolist()), tuple(scale.tolist()), scaling_factor)
+    variance, mean = torch.var_mean(raw, dim=(0, 2, 3))
+    # Images all alike need a finite scale: no quieter than a tenth of a grey level of one pixel.
+    spread = max(float(variance.mean().sqrt()), 0.1 * 2 / 255)
+    return PatchAutoencoder(tuple(mean.tolist()), 1 / spread)

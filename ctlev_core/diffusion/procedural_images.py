@@ -38,14 +38,14 @@ PEOPLE_SHARE = 0.5
 MOTION_SHARE = 0.55
 """Of the people, how many take their pose from a procedural motion, never a held-out one; the others' is random."""
 POSE_NOISE_RAD = 0.15
-PLAIN_SHARE = {"people": 0.4, "things": 0.6}
+PLAIN_SHARE = {"people": 0.4, "things": 0.75}
 """How many scenes have a plain background, so that their line drawings are clean."""
-COMPOSITION_SHARE = 0.3
+COMPOSITION_SHARE = 0.2
 """How many of the things are two objects in one picture."""
 THING_SIZE = (0.6, 0.95)
 CAMERA = CameraRange(distance_m=(3.0, 4.2), pitch_rad=(-0.3, 0.5), focal_per_side=(1.3, 1.9))
 STYLES = ("photo", "grey", "lines", "coloured lines")
-STYLE_WEIGHTS = (0.3, 0.13, 0.32, 0.25)
+STYLE_WEIGHTS = (0.22, 0.1, 0.34, 0.34)
 SAY_STYLE_SHARE = 0.6
 GRAIN_SHARE = 0.1
 PERSON_CAPTIONS = (
@@ -75,8 +75,9 @@ EXTRA_WORDS = """
     keyboard screen mouse horse cow sheep pig elephant lion tiger bear rabbit turtle snake frog duck chicken owl
     penguin shark dolphin whale crab spider ant bee beetle dragonfly leopard panda kangaroo crocodile dinosaur
     anchor barrel wrench saw pliers axe rocket helicopter balloon kite ball football basketball tennis racket
-    skateboard helmet glove shirt dress trousers small large big tall round square bright dark old new fast slow
-    left right front back side view of the in on with
+    skateboard helmet glove shirt dress trousers moth automobile kitten kitty seat timepiece teacup puppy hound goldfish
+    blossom bloom acoustic mallet cottage latchkey stepladder fir shears sneaker trainer pentagram parasol mill
+    small large big tall round square bright dark old new fast slow left right front back side view of the in on with
 """
 
 
