@@ -48,7 +48,8 @@ def training_log(tensorboard: Path | None, name: str, *, pictures: Path, first_s
         return
     from tensorboardX import SummaryWriter
 
-    writer = SummaryWriter(str(tensorboard / name), purge_step=first_step or None)
+    # Files are named by the second they are opened in: without the step a quick resumption would overwrite the first.
+    writer = SummaryWriter(str(tensorboard / name), purge_step=first_step or None, filename_suffix=f".{first_step}")
     try:
         yield TrainingLog(pictures, writer)
     finally:

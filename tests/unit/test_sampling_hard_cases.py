@@ -154,8 +154,8 @@ def bundled_config() -> Any:
 
 @pytest.mark.parametrize(
     # Grey levels of 255. Sums are accumulated in float32; in bfloat16 they then lose what is below 1 / 256 of them. The
-    # mean of a white block is 11 in latents, rounded by up to 1 / 32: .0045 for each of its 48 values, where half a level
-    # is .0039. A few values in a hundred end on the next level.
+    # mean of a white block is 11 in latents, rounded by up to 1 / 32: .0045 for each of its 48 values, where half a
+    # level is .0039. A few values in a hundred end on the next level.
     ("dtype", "worst_level", "worst_mean"),
     [(torch.float32, 0, 0.0), (torch.float16, 0, 0.0), (torch.bfloat16, 1, 0.04)],
 )
