@@ -21,6 +21,7 @@ import logging
 import os
 import pickle
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
@@ -122,7 +123,7 @@ def _environment() -> dict[str, str]:
     return ALONE | ({"CTLEV_HOME": os.path.abspath(home)} if home else {})
 
 
-class _Cluster:
+class _Cluster(ABC):
     """What Dask and Ray share."""
 
     package = ""
@@ -140,11 +141,13 @@ class _Cluster:
             raise result
         return result
 
+    @abstractmethod
     def _reply(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
-        raise NotImplementedError
+        """What `reply_to` made of the call, in a process of the cluster."""
 
     def release(self) -> None:
-        pass
+        """Nothing: a cluster takes long to start, and stays for the next calls."""
+        return
 
     def close(self) -> None:
         for key in [key for key, cluster in _running.items() if cluster is self]:
