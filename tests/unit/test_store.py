@@ -113,6 +113,39 @@ def test_what_leaves_is_unused_and_nothing_that_stays_was_made_from_it(graph, ke
         assert not list((store.home / "pruned").iterdir())
 
 
+def test_an_artefact_gets_its_name_after_all_of_it_is_on_the_disk_and_the_name_follows(tmp_path, monkeypatch):
+    """What fsync was called for, in the order of the calls: no power failure leaves half an artefact, or none."""
+    done = []
+    sync, rename = os.fsync, Path.rename
+
+    def watched_sync(descriptor):
+        sync(descriptor)
+        done.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")))
+
+    def watched_rename(path, target):
+        found = {path, *path.rglob("*")}
+        assert len(found) == 6 and found <= set(done), "the folder, one below it and four files"
+        # The names of the folders above, which are all new.
+        assert {tmp_path, tmp_path / "home", tmp_path / "home" / "artefacts"} <= set(done)
+        done.clear()
+        return rename(path, target)
+
+    monkeypatch.setattr(os, "fsync", watched_sync)
+    monkeypatch.setattr(Path, "rename", watched_rename)
+    folder = add(Store(tmp_path / "home"), 1)
+    assert done == [folder.parent]
+
+
+def test_what_cannot_be_synced_is_not_published(tmp_path, monkeypatch):
+    def fail(descriptor):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="disk full"):
+        add(Store(tmp_path), 1)
+    assert Store(tmp_path).artefacts() == []
+
+
 def test_an_artefact_whose_path_an_option_names_stays(tmp_path):
     store = Store(tmp_path)
     prior = add(store, 1, stage="pretrain_prior", age_days=99)
