@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -13,6 +14,7 @@ from ctlev_core import plugins
 from ctlev_core.feature_distances import estimate_distances, name_distance
 from ctlev_core.frame_sequences import name_recordings
 from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
+from ctlev_core.score_groups import Group, class_groups, origin_groups, subject_groups
 from ctlev_core.score_requirements import check_distances, check_metrics
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
@@ -22,6 +24,7 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, Stage
 
 SHUFFLE_STREAM = 40
+logger = logging.getLogger(__name__)
 
 
 class _ModelScores(Stage):
@@ -38,7 +41,7 @@ class _DistanceScores(Stage):
         check_distances(arguments["downstream"], arguments["distances"])
 
 
-@partial(_ModelScores, version=6, schema=tables.SCORES, raw_files=None)
+@partial(_ModelScores, version=7, schema=tables.SCORES, raw_files=None)
 def score_model(
     out: Output,
     model: Manifest,
@@ -55,9 +58,13 @@ def score_model(
     """Every metric on one split, for all rows and for each class, with an interval over recordings.
 
     Classes that real training frames show, those that only the label-only recordings of `poses` have, and those
-    that neither has are groups of their own: what synthetic data adds is in the second. Beside the table lie the
-    scores of the single samples, from which two models can be compared in pairs. A setting that starts with `SHUFFLED`
-    gives every frame the labels of another.
+    that neither has are groups of their own: what synthetic data adds is in the second. So are subjects of whom there
+    is nothing to learn from, beside others, and each of a few subjects (`ctlev_core.score_groups`). Beside the table
+    lie the scores of the single samples, from which two models can be compared in pairs. A setting that starts with
+    `SHUFFLED` gives every frame the labels of another.
+
+    Raises:
+        DataError: the split has no rows, or a recording is both learnt from and tested on.
     """
     plugin = plugins.load_options(downstream)
     rows = data.rows_where(split=split)
@@ -83,14 +90,15 @@ def score_model(
     }
     found: list[dict[str, Any]] = []
     sample_scores: list[pa.Table] = []
-    sample_ids = [data.column("sample_id")[row] for row in rows]
+    sample_ids = np.array(data.column("sample_id"))[rows].tolist()
+    groups = _groups(labels.class_names, data, rows, poses, split)
     for choice in metrics:
         metric = plugins.load_options(choice)
         if hasattr(metric.module, "compute_rows"):
             values = metric.module.compute_rows(prediction, labels, metric.options)
             columns = {"sample_id": sample_ids, "recording_id": recordings, "metric": [metric.name] * len(rows)}
             sample_scores.append(pa.table({**columns, "value": pa.array(values, pa.float64(), from_pandas=True)}))
-        for group, members in [*_groups(labels.class_names), *_groups_by_origin(labels.class_names, data, poses)]:
+        for group, members in groups:
             try:
                 scores, low, high = _score(metric, prediction, labels.take(members), members, recordings[members])
             except ValueError:
@@ -114,25 +122,31 @@ def score_model(
     return pa.Table.from_pylist(found, schema=tables.SCORES.arrow())
 
 
-def _groups(class_names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
-    names = np.array(class_names)
-    classes = [name for name in dict.fromkeys(class_names) if name]
-    return [("all", np.arange(len(names))), *((name, np.flatnonzero(names == name)) for name in sorted(classes))]
+def _groups(
+    class_names: Sequence[str], data: Manifest, rows: np.ndarray, poses: list[Manifest], split: str
+) -> list[Group]:
+    """All groups of the given rows; of frames that are not held out, none by subject."""
+    groups = class_groups(class_names) + _groups_by_origin(class_names, data, poses)
+    return groups if split == "train" else groups + _groups_by_subject(data, rows, poses)
 
 
-def _groups_by_origin(
-    class_names: Sequence[str], data: Manifest, poses: list[Manifest]
-) -> list[tuple[str, np.ndarray]]:
-    """Rows by where their class was to be learnt from; nothing where one group has them all."""
-    seen = {data.column("class_name")[row] for row in data.rows_where(split="train")}
-    sampled = {m.column("class_name")[row] for m in poses for row in m.rows_where(splits="condition")} - seen
-    parts = {
-        "classes with real training frames": seen,
-        "classes with synthetic frames only": sampled,
-        "classes without training frames": set(class_names) - seen - sampled,
-    }
-    groups = [(name, np.flatnonzero([c in classes for c in class_names])) for name, classes in parts.items()]
-    return [(name, rows) for name, rows in groups if 0 < len(rows) < len(class_names)]
+def _groups_by_origin(class_names: Sequence[str], data: Manifest, poses: list[Manifest]) -> list[Group]:
+    """Rows by where their class was to be learnt from."""
+    return origin_groups(class_names, _trained(data, "class_name"), _sampled(poses, "class_name"))
+
+
+def _groups_by_subject(data: Manifest, rows: np.ndarray, poses: list[Manifest]) -> list[Group]:
+    """Rows by whether their subject was to be learnt from."""
+    subjects, recordings = (np.array(data.column(name))[rows].tolist() for name in ("subject", "recording_id"))
+    return subject_groups(subjects, recordings, _trained(data, "subject") | _sampled(poses, "subject"))
+
+
+def _trained(data: Manifest, column: str) -> set[str]:
+    return set(np.array(data.column(column))[data.rows_where(split="train")].tolist())
+
+
+def _sampled(poses: list[Manifest], column: str) -> set[str]:
+    return {name for m in poses for name in np.array(m.column(column))[m.rows_where(splits="condition")].tolist()}
 
 
 def _others(count: int, seed: int) -> np.ndarray:
@@ -185,14 +199,32 @@ def _quotients(
 
 
 def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manifest], split: str) -> None:
-    """No row may be both learnt from and tested on."""
+    """No recording may be both learnt from and tested on, but for those that the dataset splits in time.
+
+    That no subject of the dataset itself is, `ingest` has made sure of. Of another dataset, to sample from or to learn
+    from, a subject of the same name may be someone else, which nothing here can tell: that is a warning.
+    """
     if split == "train":
         return
-    tested = {data.column("sample_id")[row] for row in rows}
+    sample_ids, recordings, subjects = (
+        np.array(data.column(name))[rows] for name in ("sample_id", "recording_id", "subject")
+    )
+    whole = ~np.isin(recordings, list(_trained(data, "recording_id")))
+    tested = set(zip(recordings[whole].tolist(), subjects[whole].tolist(), strict=True))
     for training_set in training_sets:
-        learnt = {training_set.column("sample_id")[row] for row in training_set.rows_where(split="train")}
-        if shared := sorted(tested & learnt):
-            raise DataError(f"{data.ref.path}: sample {shared[0]!r} is in the training data and in split {split!r}")
+        learnt = training_set.rows_where(split="train")
+        where = f"is in the training data {training_set.ref.path} and in split {split!r}"
+        if shared := sorted(set(sample_ids.tolist()) & set(np.array(training_set.column("sample_id"))[learnt])):
+            raise DataError(f"{data.ref.path}: sample {shared[0]!r} {where}")
+        # Of a synthetic frame it counts whose pose it shows; what lies behind it is RECORDING:MOMENT.
+        behind = "source_id" if "source_id" in training_set.table.column_names else "recording_id"
+        origins = [name.partition(":")[0] for name in np.array(training_set.column(behind))[learnt].tolist()]
+        people = np.array(training_set.column("subject"))[learnt].tolist()
+        if shared := sorted(tested & set(zip(origins, people, strict=True))):
+            raise DataError(f"{data.ref.path}: recording {shared[0][0]!r} {where}")
+        if shared := sorted(set(subjects[whole].tolist()) & set(people) - _trained(data, "subject")):
+            text = "%s: subject %r %s; if both are one person, scores are not those of an unseen one"
+            logger.warning(text, data.ref.path, shared[0], where)
 
 
 @partial(_DistanceScores, version=4, schema=tables.SCORES, raw_files=None)
