@@ -167,8 +167,12 @@ def test_statistics_of_pytorch_fid_files(tmp_path):
     mean, covariance = read_statistics(tmp_path / "a.npz")
     found = frechet_distance_of_gaussians(gaussian_from_statistics(mean, covariance), fit_gaussian(b))
     assert found == pytest.approx(frechet_distance(a, b), rel=1e-11)
-    # pytorch-fid's own test: N(0, I) against N(1, I) in 2,048 dimensions; smaller here.
-    assert frechet_distance_of_statistics(np.zeros(64), np.eye(64), np.ones(64), np.eye(64)) == 64
+
+
+def test_the_vector_of_pytorch_fid():
+    """Its own test (mseitzer/pytorch-fid, tests/test_fid_score.py): N(0, I) against N(1, I) is their 2,048 dimensions."""
+    identity = np.eye(2048)
+    assert frechet_distance_of_statistics(np.zeros(2048), identity, np.ones(2048), identity) == 2048
 
 
 def test_statistics_stored_in_single_precision_have_its_null_directions_dropped(tmp_path):

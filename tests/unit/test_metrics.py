@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, precision_score, recall_score
 
 from ctlev_core.intervals import bootstrap_interval, cluster_bootstrap, compute_spread
-from ctlev_core.metrics import classification, frechet, mpjpe2d, pck2d
+from ctlev_core.metrics import classification, frechet, mpjpe2d, oks, pck2d
 from data_contracts.labels import Labels
 
 
@@ -45,7 +45,7 @@ def test_rows_without_a_visible_joint_have_no_score():
     assert np.isnan(rows[0]) and rows[1] == pytest.approx(2**0.5)
 
 
-@pytest.mark.parametrize("metric", [mpjpe2d, pck2d])
+@pytest.mark.parametrize("metric", [mpjpe2d, pck2d, oks])
 def test_pose_metrics_refuse_what_they_cannot_score(metric):
     nothing = pose_labels(np.zeros((2, 13, 2)), np.zeros((2, 13), bool))
     with pytest.raises(ValueError, match="no joint is visible in any of the 2 target rows"):
