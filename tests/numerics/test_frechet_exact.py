@@ -170,7 +170,7 @@ def test_statistics_of_pytorch_fid_files(tmp_path):
 
 
 def test_the_vector_of_pytorch_fid():
-    """The distance of N(0, I) and N(1, I) is the number of dimensions (mseitzer/pytorch-fid, tests/test_fid_score.py)."""
+    """Distance of N(0, I) and N(1, I): the number of dimensions (mseitzer/pytorch-fid, tests/test_fid_score.py)."""
     identity = np.eye(2048)
     assert frechet_distance_of_statistics(np.zeros(2048), identity, np.ones(2048), identity) == 2048
 
