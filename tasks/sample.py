@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +17,7 @@ from tqdm import tqdm
 from ctlev_core import plugins
 from ctlev_core.condition_sources import sensor_size_of
 from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
+from ctlev_core.diffusion.sampling_shards import SHARD
 from ctlev_core.dithering import dither_counts
 from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
 from ctlev_core.row_seeds import row_seeds
@@ -19,11 +25,15 @@ from ctlev_core.windows import spread, window_around
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
-from data_contracts.events import Events
-from data_contracts.manifest import LABEL_COLUMNS, Manifest, conditions_of
+from data_contracts.events import Events, SensorSize
+from data_contracts.labels import Conditions
+from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef, conditions_of, read_manifest
 from tasks.stage import Output, input_files_of, stage
+from tasks.workers import map_shards
 
 SHARD_ROWS = 64
+BLOCK_BYTES = 1 << 30
+"""Frames held at a time. For each block the generator reads its checkpoint again, so it is no smaller."""
 MAX_GATE_FRAMES = 2_000
 """Training frames the gate is fitted to, evenly spread: the quantiles of more hardly move."""
 
@@ -55,9 +65,37 @@ def sample(
     seeds = row_seeds(seed, len(asked))
     if isinstance(plugin.options, SamplingOptions):
         seeds = noise_seeds(seeds, plugin.options)  # here, so that every row is told the seed it was made from
-    made = sample_until_accepted(sample_rows, seeds, gate_of(frames), max_tries=max_tries)
-    out.write_array("frames", made.frames if rounding is None else _rounded(made, frames, rounding))
-    return _table(conditions, plugin, checkpoint.ref.digest, made)
+    gate, block, told = gate_of(frames), _block_rows(frames), _Told([], [], [])
+    with out.open_array("frames") as written:
+        for start in range(0, len(seeds), block):
+            rows = np.arange(start, min(start + block, len(seeds)))
+            made = sample_until_accepted(
+                lambda members, seeds, rows=rows: sample_rows(rows[members], seeds),
+                seeds[start : start + block],
+                gate,
+                max_tries=max_tries,
+            )
+            written.append(made.frames if rounding is None else _rounded(made, frames, rounding))
+            told.add(made.seeds, made.num_tries, made.causes)
+    return _table(conditions, plugin, checkpoint.ref.digest, told)
+
+
+class _Told(NamedTuple):
+    """What the table says of each row, as in `GatedImages`."""
+
+    seeds: list[int]
+    num_tries: list[int]
+    causes: list[str]
+
+    def add(self, seeds: Sequence[int], num_tries: Sequence[int], causes: Sequence[str]) -> None:
+        self.seeds.extend(seeds)
+        self.num_tries.extend(num_tries)
+        self.causes.extend(causes)
+
+
+def _block_rows(frames: Manifest) -> int:
+    """Rows that are sampled before their frames are written: whole shards, so that batches are what they were."""
+    return max(BLOCK_BYTES // math.prod(frames.array("frames").shape[1:]) // SHARD, 1) * SHARD
 
 
 def _rounded(made: GatedImages, frames: Manifest, encoding: EncodingChoice) -> np.ndarray:
@@ -94,35 +132,71 @@ def simulate(
     A frame is the window around the labelled moment; a row without events becomes an empty frame. What the gate of
     `sample` would refuse says so, but is not simulated again: a body that keeps still would send no events then either.
     """
-    plugin, encoder = plugins.load_options(sampling), plugins.load_options(encoding)
-    asked, seeds = conditions_of(conditions), row_seeds(seed, len(conditions))
-    if asked.motions is None:
+    plugin = plugins.load_options(sampling)
+    if conditions_of(conditions).motions is None:
         raise DataError(
             f"{conditions.ref.path}: generator {plugin.name!r} needs body motions; use condition 'body_motion'"
         )
-    sensor_size = sensor_size_of(recordings)
-    durations_us = conditions.table["t_end_us"].to_numpy() - conditions.table["t_start_us"].to_numpy()
-    shards: list[np.ndarray] = []
-    with tqdm(total=len(seeds), desc=plugin.name, unit="frame", leave=False, disable=None) as progress:
-        for start in range(0, len(seeds), SHARD_ROWS):
-            rows = slice(start, start + SHARD_ROWS)
-            path = out.work / f"frames_{start:07d}.npy"
-            if not path.exists():  # else by an earlier run that was interrupted
-                simulated = plugin.module.sample_events(
-                    asked.take(rows), sensor_size, plugin.options, seeds=seeds[rows]
-                )
-                moments_us = asked.motions.moment_us[rows]
-                encoded = _encode(simulated, moments_us, durations_us[rows], windows, encoder)
-                temporary = path.with_suffix(".tmp")
-                with temporary.open("wb") as file:
-                    np.save(file, encoded, allow_pickle=False)
-                temporary.replace(path)
-            shards.append(np.load(path, allow_pickle=False))
-            progress.update(len(shards[-1]))
-    made = np.concatenate(shards)
-    out.write_array("frames", made)
-    gated = GatedImages(made, seeds, [1] * len(seeds), find_causes(made, gate_of(frames)))
-    return _table(conditions, plugin, "", gated)
+    asked = _Simulation(conditions.ref, sensor_size_of(recordings), sampling, encoding, windows, out.work)
+    gate, count = gate_of(frames), len(conditions)
+    seeds, causes = row_seeds(seed, count), []
+    shards = [_Shard(start, seeds[start : start + SHARD_ROWS]) for start in range(0, count, SHARD_ROWS)]
+    paths = map_shards(partial(_simulate_shard, asked), shards)
+    with (
+        out.open_array("frames") as written,
+        tqdm(total=count, desc=plugin.name, unit="frame", leave=False, disable=None) as progress,
+    ):
+        for path in paths:
+            made = np.load(path, allow_pickle=False)
+            written.append(made)
+            causes += find_causes(made, gate)
+            progress.update(len(made))
+    return _table(conditions, plugin, "", _Told(seeds, [1] * count, causes))
+
+
+@dataclass(frozen=True)
+class _Simulation:
+    """What a shard of `simulate` needs, small enough to travel with every shard."""
+
+    conditions: ManifestRef
+    sensor_size: SensorSize
+    sampling: SamplingChoice
+    encoding: EncodingChoice
+    windows: Windows
+    work: Path
+
+
+class _Shard(NamedTuple):
+    """Consecutive rows from `start`, one seed each."""
+
+    start: int
+    seeds: list[int]
+
+
+def _simulate_shard(asked: _Simulation, shard: _Shard) -> Path:
+    """The file of the frames of some rows, made unless an interrupted run has left it."""
+    path = asked.work / f"frames_{shard.start:07d}.npy"
+    if path.exists():
+        return path
+    plugin, encoder = plugins.load_options(asked.sampling), plugins.load_options(asked.encoding)
+    conditions, durations_us = _conditions_with_durations(asked.conditions.path, asked.conditions.digest)
+    rows = slice(shard.start, shard.start + len(shard.seeds))
+    part = conditions.take(rows)
+    assert part.motions is not None
+    simulated = plugin.module.sample_events(part, asked.sensor_size, plugin.options, seeds=shard.seeds)
+    frames = _encode(simulated, part.motions.moment_us, durations_us[rows], asked.windows, encoder)
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        np.save(file, frames, allow_pickle=False)
+    temporary.replace(path)
+    return path
+
+
+@lru_cache(maxsize=1)
+def _conditions_with_durations(folder: Path, digest: str) -> tuple[Conditions, np.ndarray]:
+    """Conditions, and the lengths [N] of their windows; read once a process rather than once a shard."""
+    manifest = read_manifest(ManifestRef(key=folder.name, path=folder, digest=digest))
+    return conditions_of(manifest), manifest.table["t_end_us"].to_numpy() - manifest.table["t_start_us"].to_numpy()
 
 
 def _encode(
@@ -141,7 +215,7 @@ def _encode(
     return np.stack(frames)
 
 
-def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str, made: GatedImages) -> pa.Table:
+def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str, made: _Told) -> pa.Table:
     # Generators that are no diffusion models make an image in one step, without scheduler or guidance.
     options: dict[str, Any] = plugin.options.model_dump()
     count = len(made.seeds)

@@ -12,12 +12,12 @@ from tiny_prior import make_data, shared_prior
 from ctlev_core import plugins
 from ctlev_core.diffusion import sampling
 from ctlev_core.diffusion.sampling_options import SamplingOptions
-from ctlev_core.image_gate import find_causes, seed_of_try
+from ctlev_core.image_gate import find_causes, fit_gate, seed_of_try
 from ctlev_core.row_seeds import row_seeds
 from data_contracts import tables
 from data_contracts.config import SamplingChoice
 from data_contracts.labels import Conditions, Labels
-from data_contracts.manifest import Manifest, conditions_of, label_columns, read_manifest, write_manifest
+from data_contracts.manifest import Manifest, conditions_of, file_digest, label_columns, read_manifest, write_manifest
 from tasks import sample as task
 from tasks.stage import Output
 
@@ -143,6 +143,47 @@ def test_a_run_killed_in_a_later_try_goes_on_from_what_it_sampled(tmp_path, inpu
     assert sum(counted) == sum(whole.column("num_tries")) - COUNT, "the first try was not sampled again"
     assert resumed.table.equals(whole.table)
     np.testing.assert_array_equal(resumed.array("frames"), whole.array("frames"))
+
+
+def drawn_alone(folder, conditions, options, *, seeds, work):
+    """As `draw` in what is refused, but every row by itself, whatever it is drawn with."""
+    shape = conditions.images.shape[1:3]
+    noise = [np.random.default_rng(int(seed)).integers(60, 200, shape, dtype=np.uint8) for seed in seeds]
+    return np.stack([grey * np.uint8(seed % 2 == 0) for grey, seed in zip(noise, seeds, strict=True)])[
+        ..., None
+    ].repeat(3, axis=3)
+
+
+def test_frames_written_block_by_block_are_those_written_at_once(tmp_path, inputs, monkeypatch):
+    plugin = plugins.Plugin("generators", "alone", SimpleNamespace(sample=drawn_alone, VERSION=1), OPTIONS)
+    monkeypatch.setattr(task.plugins, "load_options", lambda choice: plugin)
+    loose = fit_gate(
+        drawn_alone(None, conditions_of(inputs[2]), None, seeds=range(0, 2 * COUNT, 2), work=None), polarity=False
+    )
+    monkeypatch.setattr(task, "gate_of", lambda frames: loose)
+    whole = run(tmp_path, inputs, "whole")
+    monkeypatch.setattr(task, "SHARD", 2)
+    monkeypatch.setattr(task, "BLOCK_BYTES", 1)
+    blocks = run(tmp_path, inputs, "blocks")
+    assert max(whole.column("num_tries")) > 1
+    assert blocks.ref.digest == whole.ref.digest, "the table, and through it the array, byte by byte"
+    np.save(tmp_path / "saved.npy", np.asarray(whole.array("frames")))
+    assert file_digest(tmp_path / "saved.npy") == whole.files["frames.npy"]["sha256"], "as NumPy writes it"
+
+
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, inputs, monkeypatch):
+    """Rows that a generator holds at once, with blocks of two shards of one row."""
+    held = []
+
+    def watched(folder, conditions, options, *, seeds, work):
+        held.append(len(conditions))
+        return drawn_alone(folder, conditions, options, seeds=seeds, work=work)
+
+    plugin = plugins.Plugin("generators", "alone", SimpleNamespace(sample=watched, VERSION=1), OPTIONS)
+    monkeypatch.setattr(task.plugins, "load_options", lambda choice: plugin)
+    monkeypatch.setattr(task, "SHARD", 1)
+    monkeypatch.setattr(task, "BLOCK_BYTES", 2 * inputs[0].array("frames")[0].nbytes)
+    assert len(run(tmp_path, inputs, max_tries=2)) == COUNT and max(held) == 2
 
 
 def test_the_gate_is_that_of_the_training_frames(tmp_path):
