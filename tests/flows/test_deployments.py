@@ -1,27 +1,21 @@
 """The deployments of prefect.yaml, served as docs/operations.md says: a server, a pool and a worker on loopback."""
 
-import contextlib
+import datetime
+import itertools
 import json
-import os
 import re
-import signal
-import socket
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
-from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 import yaml
+from deployment_service import ENDED, serving, smoke_parameters
 from flow_scripts import REPOSITORY, digests
 
-from ctlev_core.processes import die_with_parent
+from data_contracts.published import published_folder, read_latest, read_versions
 from tasks.store import Store
 
-PREFECT = [str(Path(sys.executable).with_name("prefect"))]
 SCRIPTS = {
     name: path
     for path in (REPOSITORY / "flows").glob("*.py")
@@ -37,116 +31,11 @@ def test_every_flow_script_has_a_deployment_with_a_description_and_tags():
     assert all(item["description"] and item["tags"] and item["work_pool"] == {"name": "ctlev"} for item in listed)
 
 
-@dataclass
-class Service:
-    """A server, and a worker that serves the pool; both end with this process."""
-
-    home: Path
-    url: str
-    environment: dict[str, str]
-    worker: subprocess.Popen | None = None
-
-    def api(self, path, body=None):
-        """What the server answers."""
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(f"{self.url}/{path}", data, {"Content-Type": "application/json"})
-        with urllib.request.urlopen(request, timeout=60) as response:
-            return json.load(response)
-
-    def prefect(self, *arguments, timeout=240):
-        """Run a command of Prefect's, from the repository."""
-        command = [*PREFECT, "--no-prompt", *arguments]
-        return subprocess.run(
-            command, cwd=REPOSITORY, env=self.environment, capture_output=True, text=True, timeout=timeout
-        )
-
-    def start_worker(self):
-        """A worker in a session of its own, so that it can be ended with what it started."""
-        with (self.home / "worker.log").open("ab") as log:
-            self.worker = subprocess.Popen(
-                [*PREFECT, "worker", "start", "--pool", "ctlev"],
-                cwd=self.home,
-                env=self.environment,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                preexec_fn=die_with_parent,
-            )
-
-    def start_run(self, deployment, home, *overrides):
-        """Ask for a run as a user does; its id."""
-        parameters = {"preset": "smoke", "overrides": list(overrides), "home": str(home)}
-        asked = [part for name, value in parameters.items() for part in ("-p", f"{name}={json.dumps(value)}")]
-        finished = self.prefect("deployment", "run", f"{deployment}/default", *asked)
-        assert finished.returncode == 0, finished.stderr + finished.stdout
-        return re.findall(r"UUID: ([0-9a-f-]{36})", finished.stdout)[0]
-
-    def state(self, run, *, until, timeout=400):
-        """The state of a run, once its type is one of `until`."""
-        deadline = time.monotonic() + timeout
-        while time.monotonic() < deadline:
-            state = self.api(f"flow_runs/{run}")["state"]
-            if state["type"] in until:
-                return state
-            time.sleep(0.5)
-        raise AssertionError(f"{state}\n{(self.home / 'worker.log').read_text()[-4000:]}")
-
-
-ENDED = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
-
-
-def end(process):
-    """End a process and all of its session."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-
-
 @pytest.fixture(scope="module")
 def service(tmp_path_factory):
     """Every deployment, ready to run."""
-    home = tmp_path_factory.mktemp("service")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")} | {
-        "CTLEV_HOME": str(home),
-        "PREFECT_HOME": str(home / "prefect"),
-        "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
-        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
-        "PREFECT_WORKER_QUERY_SECONDS": "2",
-        "DO_NOT_TRACK": "1",
-        "NO_COLOR": "1",
-    }
-    made = Service(home, environment["PREFECT_API_URL"], environment)
-    with (home / "server.log").open("wb") as log:
-        server = subprocess.Popen(
-            [*PREFECT, "server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui"],
-            cwd=home,
-            env=environment,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            preexec_fn=die_with_parent,
-        )
-    try:
-        deadline = time.monotonic() + 300
-        while True:
-            try:
-                made.api("health")
-                break
-            except (urllib.error.URLError, OSError):
-                assert server.poll() is None and time.monotonic() < deadline, (home / "server.log").read_text()
-                time.sleep(0.2)
-        made.start_worker()  # makes the pool where there is none
-        for command in (("work-pool", "create", "ctlev", "--type", "process", "--overwrite"), ("deploy", "--all")):
-            finished = made.prefect(*command)
-            assert finished.returncode == 0, finished.stdout + finished.stderr
+    with serving(tmp_path_factory.mktemp("service")) as made:
         yield made
-    finally:
-        if made.worker is not None:
-            end(made.worker)
-        end(server)
 
 
 def test_deployments_say_what_they_take_and_regenerate_never_overlaps(service):
@@ -197,46 +86,30 @@ def test_wrong_types_are_refused_before_anything_runs(service):
 
 @pytest.mark.slow
 def test_a_run_whose_worker_is_killed_goes_on_with_another(service, tmp_path):
-    first = service.start_run("prepare-dataset", tmp_path)
-    deadline = time.monotonic() + 400
-    while not digests(tmp_path, ("ingest",)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    before = digests(tmp_path)
-    assert before
-    end(service.worker)
-    service.start_worker()
+    before = service.lose_worker_after("ingest", "prepare-dataset", tmp_path)
     second = service.start_run("prepare-dataset", tmp_path)
     state = service.state(second, until=ENDED)
-    assert first != second and state["type"] == "COMPLETED", state
+    assert state["type"] == "COMPLETED", state
     after = digests(tmp_path)
-    assert before.items() <= after.items() and len(after) == 5
+    planned = service.plan(second)
+    assert before.items() <= after.items()
+    assert {row["key"] for row in planned} == {name.partition("/")[2] for name in after}
     for name in after:
         Store(tmp_path).check(tmp_path / "artefacts" / name)
-    (plan,) = service.api("artifacts/filter", {"artifacts": {"flow_run_id": {"any_": [second]}}})
-    cached = {row["stage"].partition(":")[0] for row in json.loads(plan["data"]) if row["plan"] == "cached"}
+    cached = {row["stage"].partition(":")[0] for row in planned if row["plan"] == "cached"}
     assert "ingest" in cached
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_a_whole_experiment_is_completed_although_its_worker_was_killed(service, tmp_path):
-    first = service.start_run("full-experiment", tmp_path)
-    deadline = time.monotonic() + 800
-    while not digests(tmp_path, ("encode",)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    before = digests(tmp_path)
-    assert before
-    end(service.worker)
-    service.start_worker()
+    before = service.lose_worker_after("encode", "full-experiment", tmp_path, timeout=800)
     second = service.start_run("full-experiment", tmp_path)
     state = service.state(second, until=ENDED, timeout=900)
-    assert first != second and state["type"] == "COMPLETED", state
+    assert state["type"] == "COMPLETED", state
     after = digests(tmp_path)
     assert before.items() <= after.items() and (tmp_path / "reports" / "smoke.html").is_file()
-    (plan,) = service.api(
-        "artifacts/filter", {"artifacts": {"flow_run_id": {"any_": [second]}, "key": {"any_": ["plan"]}}}
-    )
-    planned = json.loads(plan["data"])
+    planned = service.plan(second)
     assert {row["key"] for row in planned} == {name.partition("/")[2] for name in after}
     cached = {row["key"] for row in planned if row["plan"] == "cached"}
     assert {name.partition("/")[2] for name in before} <= cached
@@ -251,3 +124,84 @@ def test_a_run_that_would_overlap_is_cancelled_and_says_why(service, tmp_path):
     assert state["type"] == "CANCELLED" and "concurrency limit" in state["message"]
     assert service.prefect("flow-run", "cancel", first).returncode == 0
     assert service.state(first, until=ENDED)["type"] == "CANCELLED"
+
+
+QUICK = (
+    "num_synthetic=3", "baselines={}", "more_real=null", "generator.options.num_steps=2",
+    "sampling.num_inference_steps=2", "downstream.options.num_steps=2", "feature_extractor.options.num_steps=2",
+    # Nothing learnt in two steps is good.
+    *(f"gates.{gate}=null" for gate in ("max_distance_ratio", "max_label_error_ratio", "max_refused_share")),
+    "gates.max_copies_share=1",
+)  # fmt: skip
+
+
+def schedule_once(service, deployment, moment, parameters):
+    """A schedule that fires one time, at `moment`, seen and started by Prefect's own scheduler."""
+    rule = f"DTSTART:{moment:%Y%m%dT%H%M%SZ}\nRRULE:FREQ=DAILY;COUNT=1"
+    schedule = {"schedule": {"rrule": rule, "timezone": "UTC"}, "active": True, "parameters": parameters}
+    service.api(f"deployments/{deployment}/schedules", [schedule])
+
+
+def scheduled_runs(service, deployment, count, timeout):
+    """The runs that schedules asked for, once there are `count` and they have ended; in order of their start."""
+    asked = {"deployments": {"id": {"any_": [deployment]}}}
+    deadline = time.monotonic() + timeout
+    while True:
+        runs = [run for run in service.api("flow_runs/filter", asked) if run["auto_scheduled"]]
+        if len(runs) == count and all(run["state"]["type"] in ENDED for run in runs):
+            return sorted(runs, key=lambda run: run["start_time"] or "")
+        assert time.monotonic() < deadline, [(run["name"], run["state"]) for run in runs]
+        time.sleep(1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2400)
+def test_scheduled_regenerations_do_not_overlap_and_a_killed_one_is_gone_on_with(service, tmp_path):
+    """Two schedules fire at the same moment, a third later; the worker of a fourth run is killed while it samples."""
+    deployment = service.api("deployments/name/regenerate/default")["id"]
+    folder = published_folder(tmp_path, "smoke")
+    moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(seconds=30)
+    for _ in range(2):
+        schedule_once(service, deployment, moment, smoke_parameters(tmp_path, QUICK))
+    runs = scheduled_runs(service, deployment, 2, timeout=900)
+    ran = [run for run in runs if run["state"]["type"] == "COMPLETED"]
+    refused = [run for run in runs if run["state"]["type"] == "CANCELLED"]
+    assert len(ran) + len(refused) == 2 and ran, [run["state"] for run in runs]
+    assert all("concurrency limit" in run["state"]["message"] and run["run_count"] == 0 for run in refused), refused
+
+    moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(seconds=15)
+    schedule_once(service, deployment, moment, smoke_parameters(tmp_path, QUICK))
+    ran = [run for run in scheduled_runs(service, deployment, 3, timeout=900) if run["state"]["type"] == "COMPLETED"]
+    times = [(parsed(run["start_time"]), parsed(run["end_time"])) for run in ran]
+    assert all(begins < ends for begins, ends in times)
+    assert all(first[1] <= second[0] for first, second in itertools.pairwise(times)), "one after the other"
+    versions = read_versions(folder)
+    assert [version.number for version in versions] == list(range(1, len(ran) + 1)) and len(ran) >= 2
+    assert len({version.seed for version in versions}) == len(versions)
+
+    number = len(versions) + 1
+    killed = service.start_run("regenerate", tmp_path, *QUICK)
+    sampled = digests(tmp_path, ("sample",))
+    deadline = time.monotonic() + 600
+    while not (folder / "claimed.json").exists() or digests(tmp_path, ("sample",)) == sampled:
+        assert time.monotonic() < deadline, (service.home / "worker.log").read_text()[-4000:]
+        time.sleep(0.02)
+    service.replace_worker()
+    assert json.loads((folder / "claimed.json").read_text())["number"] == number
+    latest = read_latest(folder)
+    assert latest is not None and latest.number == number - 1, "the version that was begun is not yet the latest"
+    begun = digests(tmp_path)
+    # Nobody is left to say so, and the dead run keeps its place for the five minutes of its lease otherwise.
+    service.api(f"flow_runs/{killed}/set_state", {"state": {"type": "CRASHED"}, "force": True})
+    state = service.state(service.start_run("regenerate", tmp_path, *QUICK), until=ENDED, timeout=900)
+    assert (state["type"], state["name"]) == ("COMPLETED", "Published"), state
+    latest = read_latest(folder)
+    assert latest is not None and latest.number == number and not (folder / "claimed.json").exists()
+    after = digests(tmp_path)
+    assert begun.items() <= after.items() and digests(tmp_path, ("sample",)).keys() == {
+        name for name in begun if name.startswith("sample/")
+    }, "what the killed run had sampled is what is published"
+
+
+def parsed(moment):
+    return datetime.datetime.fromisoformat(moment)

@@ -1,0 +1,168 @@
+"""A Prefect server, a pool and a worker on loopback, as docs/operations.md says how to start them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flow_scripts import REPOSITORY, digests
+
+from ctlev_core.processes import die_with_parent
+
+PREFECT = [str(Path(sys.executable).with_name("prefect"))]
+ENDED = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
+
+
+@dataclass
+class Service:
+    """A server, and a worker that serves the pool; both end with this process."""
+
+    home: Path
+    url: str
+    environment: dict[str, str]
+    worker: subprocess.Popen | None = None
+
+    def api(self, path: str, body: Any = None, method: str | None = None) -> Any:
+        """What the server answers."""
+        data = None if body is None else json.dumps(body).encode()
+        headers = {"Content-Type": "application/json"}
+        request = urllib.request.Request(f"{self.url}/{path}", data, headers, method=method)
+        with urllib.request.urlopen(request, timeout=60) as response:
+            return json.loads(response.read() or b"null")
+
+    def prefect(self, *arguments: str, timeout: float = 240) -> subprocess.CompletedProcess[str]:
+        """Run a command of Prefect's, from the repository."""
+        command = [*PREFECT, "--no-prompt", *arguments]
+        return subprocess.run(
+            command, cwd=REPOSITORY, env=self.environment, capture_output=True, text=True, timeout=timeout
+        )
+
+    def start_worker(self) -> None:
+        """A worker in a session of its own, so that it can be ended with what it started."""
+        with (self.home / "worker.log").open("ab") as log:
+            self.worker = subprocess.Popen(
+                [*PREFECT, "worker", "start", "--pool", "ctlev"],
+                cwd=self.home,
+                env=self.environment,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                preexec_fn=die_with_parent,
+            )
+
+    def replace_worker(self) -> None:
+        """`kill -9` the worker with the runs it serves, and start another."""
+        assert self.worker is not None
+        end(self.worker)
+        self.start_worker()
+
+    def start_run(self, deployment: str, home: Path, *overrides: str) -> str:
+        """Ask for a run as a user does; its id."""
+        parameters = smoke_parameters(home, overrides)
+        asked = [part for name, value in parameters.items() for part in ("-p", f"{name}={json.dumps(value)}")]
+        finished = self.prefect("deployment", "run", f"{deployment}/default", *asked)
+        assert finished.returncode == 0, finished.stderr + finished.stdout
+        return re.findall(r"UUID: ([0-9a-f-]{36})", finished.stdout)[0]
+
+    def state(self, run: str, *, until: set[str], timeout: float = 400) -> dict[str, Any]:
+        """The state of a run, once its type is one of `until`."""
+        state: dict[str, Any] = {}
+        deadline = time.monotonic() + timeout
+        while time.monotonic() < deadline:
+            state = self.api(f"flow_runs/{run}")["state"]
+            if state["type"] in until:
+                return state
+            time.sleep(0.5)
+        raise AssertionError(f"{state}\n{(self.home / 'worker.log').read_text()[-4000:]}")
+
+    def lose_worker_after(self, stage: str, deployment: str, home: Path, timeout: float = 400) -> dict[str, str]:
+        """Ask for a run and kill its worker once a stage is stored; then there is a new one.
+
+        Returns:
+            Digests of what had been stored by then.
+        """
+        self.start_run(deployment, home)
+        deadline = time.monotonic() + timeout
+        while not digests(home, (stage,)) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        before = digests(home)
+        assert before, (self.home / "worker.log").read_text()[-4000:]
+        self.replace_worker()
+        return before
+
+    def plan(self, run: str) -> list[dict[str, str]]:
+        """What a run said it would do."""
+        asked = {"artifacts": {"flow_run_id": {"any_": [run]}, "key": {"any_": ["plan"]}}}
+        (plan,) = self.api("artifacts/filter", asked)
+        return json.loads(plan["data"])
+
+
+def smoke_parameters(home: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Of a deployment, to run the smallest experiment in a home of its own."""
+    return {"preset": "smoke", "overrides": list(overrides), "home": str(home)}
+
+
+def end(process: subprocess.Popen) -> None:
+    """End a process and all of its session."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@contextlib.contextmanager
+def serving(home: Path) -> Iterator[Service]:
+    """Every deployment, ready to run."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")} | {
+        "CTLEV_HOME": str(home),
+        "PREFECT_HOME": str(home / "prefect"),
+        "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
+        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "PREFECT_WORKER_QUERY_SECONDS": "2",
+        "DO_NOT_TRACK": "1",
+        "NO_COLOR": "1",
+    }
+    made = Service(home, environment["PREFECT_API_URL"], environment)
+    with (home / "server.log").open("wb") as log:
+        server = subprocess.Popen(
+            [*PREFECT, "server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui"],
+            cwd=home,
+            env=environment,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            preexec_fn=die_with_parent,
+        )
+    try:
+        deadline = time.monotonic() + 300
+        while True:
+            try:
+                made.api("health")
+                break
+            except (urllib.error.URLError, OSError):
+                assert server.poll() is None and time.monotonic() < deadline, (home / "server.log").read_text()
+                time.sleep(0.2)
+        made.start_worker()  # makes the pool where there is none
+        for command in (("work-pool", "create", "ctlev", "--type", "process", "--overwrite"), ("deploy", "--all")):
+            finished = made.prefect(*command)
+            assert finished.returncode == 0, finished.stdout + finished.stderr
+        yield made
+    finally:
+        if made.worker is not None:
+            end(made.worker)
+        end(server)
