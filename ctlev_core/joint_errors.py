@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -82,7 +82,7 @@ def compute_joint_errors_mm(predicted: Mapping[str, Any], target: Labels, alignm
         points = align_similarity(points, joints, known)
     apart = points - joints
     if alignment == "pelvis":
-        left, right = _hips(target.joint_set)
+        left, right = hip_indices(target.joint_set)
         # Both moved by their own hips: their difference moves by the difference of the hips.
         apart -= (apart[:, [left]] + apart[:, [right]]) / 2
     return _lengths(apart)
@@ -99,11 +99,22 @@ def _lengths(vectors: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("...c,...c->...", vectors, vectors))
 
 
-def _hips(joint_set: str) -> list[int]:
+def hip_indices(joint_set: str) -> list[int]:
+    """Left and right hip in a joint set.
+
+    Raises:
+        ValueError: it has none, or is not known.
+    """
     names = JOINT_SETS[joint_set].joints if joint_set in JOINT_SETS else ()
     if not {"left_hip", "right_hip"} <= set(names):
         raise ValueError(f"joint set {joint_set!r} has no hips to align by; known sets: {', '.join(JOINT_SETS)}")
     return [names.index("left_hip"), names.index("right_hip")]
+
+
+def check_length(length: Callable[[np.ndarray, str], np.ndarray], joint_set: str) -> None:
+    """Raise `ValueError` unless the set has the joints of a length of `ctlev_core.body_lengths`."""
+    count = len(JOINT_SETS[joint_set].joints) if joint_set in JOINT_SETS else 0
+    length(np.empty((0, count, 3)), joint_set)
 
 
 def row_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

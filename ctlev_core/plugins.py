@@ -281,6 +281,45 @@ class Downstream(Protocol):
         ...
 
 
+class DownstreamOfLabels(Downstream, Protocol):
+    """A model that says what it predicts: a metric that compares something else is refused where it is planned.
+
+    `PREDICTS` are those of the following that `predict` returns, N rows each: `joints2d` [N, J, 2] px; `joints3d`
+    [N, J, 3] mm, camera frame; `smpl`, that is `smpl_pose` [N, 72] rad, `smpl_betas` [N, 10] and `smpl_transl`
+    [N, 3] m, camera frame; `classes`, that is `probability` [N, K] and `classes` [K], the names of its columns. None:
+    the model has features alone.
+    """
+
+    PREDICTS: tuple[str, ...]
+
+
+class DownstreamOfSequences(Downstream, Protocol):
+    """A model that can look at several frames of a recording at once. It has both functions, and they are called."""
+
+    def train_sequences(
+        self,
+        frames: np.ndarray,
+        labels: Labels,
+        options: Any,
+        *,
+        seed: int,
+        out: Path,
+        work: Path,
+        parts: Sequence[int],
+        groups: Sequence[str],
+        recordings: Sequence[str],
+    ) -> History:
+        """As `train`; `recordings` name that of each row, whose rows follow one another in time.
+
+        A stretch of rows is one recording where names, groups and parts stay the same. Empty: each row is its own.
+        """
+        ...
+
+    def predict_sequences(self, model: Path, frames: np.ndarray, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+        """As `predict`, with the recording of each row; still one row a frame."""
+        ...
+
+
 class DownstreamWithFiles(Downstream, Protocol):
     """A model that starts from weights of its own from outside the store."""
 
@@ -314,6 +353,22 @@ class Metric(Protocol):
 
     def compute(self, predicted: Any, target: Any, options: Any) -> dict[str, float]:
         """Named scores; units in the names."""
+        ...
+
+
+class MetricWithFiles(Metric, Protocol):
+    """A metric that reads files of its own, such as a body."""
+
+    def input_files(self, options: Any) -> list[Path]:
+        """The files it reads, checked to be there; options that name them put their content into the cache key."""
+        ...
+
+
+class MetricOfSkeletons(Metric, Protocol):
+    """A metric that needs certain joints: hips to align by, or a head to measure with."""
+
+    def check_joint_set(self, joint_set: str, options: Any) -> None:
+        """Raise `ValueError` for a joint set, a key of `ctlev_core.skeletons.JOINT_SETS` or empty, without them."""
         ...
 
 

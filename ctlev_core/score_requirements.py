@@ -1,17 +1,28 @@
 """Do the scores of an experiment fit what is to be scored? Asked while it is planned, before anything is computed.
 
 A downstream model says in `PREDICTS` what of `joints2d`, `joints3d`, `smpl` and `classes` its predictions hold, a
-metric in `INPUT` what it compares. A model without `PREDICTS` is not checked.
+metric in `INPUT` what it compares, which must be among the labels, too. A model without `PREDICTS` is not checked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
 
 from ctlev_core import plugins
 from ctlev_core.plugins import PluginError
-from data_contracts.config import DownstreamChoice, MetricChoice
+from data_contracts.config import DatasetChoice, DownstreamChoice, MetricChoice
+from data_contracts.errors import DataError
+from data_contracts.labels import Labels
+from data_contracts.manifest import MANIFEST_FILE, ManifestRef, labels_of, read_manifest
 
+_ARRAYS = {
+    "joints2d": ("joints2d", "visible"),
+    "joints3d": ("joints3d",),
+    "smpl": ("smpl_pose", "smpl_betas", "smpl_transl"),
+}
 FEATURES = "features"
 """`INPUT` of metrics that compare two sets of frames rather than predictions with labels."""
 
@@ -39,6 +50,69 @@ def check_metrics(downstream: DownstreamChoice, metrics: Sequence[MetricChoice])
             )
         if hasattr(metric.module, "input_files"):
             metric.module.input_files(metric.options)
+
+
+def check_labels(metrics: Sequence[MetricChoice], labels: Labels, where: str) -> None:
+    """Check that predictions can be compared with labels such as these.
+
+    Args:
+        metrics: of predictions.
+        labels: one row is enough, for all rows of a dataset have the same kinds.
+        where: whose they are.
+
+    Raises:
+        PluginError: a metric needs labels or joints that there are not.
+    """
+    kinds = [kind for kind, arrays in _ARRAYS.items() if set(arrays) <= set(labels.arrays)]
+    kinds += ["classes"] * all(labels.class_names)
+    for choice in metrics:
+        metric = plugins.load_options(choice)
+        needed = metric.module.INPUT
+        if needed not in kinds:
+            raise PluginError(
+                f"metrics: {choice.name!r} expected labels with {needed}, got {where}, which has "
+                f"{', '.join(kinds) or 'none of any kind'}"
+            )
+        if hasattr(metric.module, "check_joint_set"):
+            try:
+                metric.module.check_joint_set(labels.joint_set, metric.options)
+            except ValueError as error:
+                raise PluginError(f"metrics: {choice.name!r} does not fit the labels of {where}: {error}") from None
+
+
+def check_dataset(metrics: Sequence[MetricChoice], dataset: DatasetChoice) -> None:
+    """The same by the labels of one recording, the first that is tested on; it is read for that.
+
+    Raises:
+        PluginError: as `check_labels`.
+        DataError: the dataset cannot be read.
+    """
+    plugin = plugins.load_options(dataset)
+    recordings = plugin.module.list_recordings(plugin.options)
+    tested = [recording for recording in recordings if any(part.split == "test" for part in recording.parts)]
+    if tested:
+        labels = plugin.module.read_labels(tested[0], plugin.options)
+        check_labels(metrics, labels, f"dataset {dataset.name!r}")
+
+
+def check_frames(metrics: Sequence[MetricChoice], folder: Path) -> None:
+    """The same by the labels of an artefact of frames, where it is there already.
+
+    Raises:
+        PluginError: as `check_labels`.
+    """
+    if (folder / MANIFEST_FILE).is_file():
+        # One that cannot be read is made anew, and looked at then.
+        with suppress(DataError):
+            labels = _first_label(folder)
+            if len(labels):
+                check_labels(metrics, labels, str(folder))
+
+
+@lru_cache(maxsize=16)
+def _first_label(folder: Path) -> Labels:
+    """Every score of an experiment asks for the same."""
+    return labels_of(read_manifest(ManifestRef(key=folder.name, path=folder)).table.slice(0, 1))
 
 
 def check_distances(extractor: DownstreamChoice, distances: Sequence[MetricChoice]) -> None:

@@ -15,7 +15,7 @@ from ctlev_core.feature_distances import estimate_distances, name_distance
 from ctlev_core.frame_sequences import name_recordings
 from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
 from ctlev_core.score_groups import Group, class_groups, origin_groups, subject_groups
-from ctlev_core.score_requirements import check_distances, check_metrics
+from ctlev_core.score_requirements import check_distances, check_frames, check_metrics
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
@@ -32,6 +32,7 @@ class _ModelScores(Stage):
 
     def check(self, arguments: dict[str, Any]) -> None:
         check_metrics(arguments["downstream"], arguments["metrics"])
+        check_frames(arguments["metrics"], arguments["data"].path)
 
 
 class _DistanceScores(Stage):

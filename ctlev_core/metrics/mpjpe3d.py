@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.joint_errors import Alignment, Sums, compute_joint_errors_mm, quotients, row_means, row_sums
+from ctlev_core.joint_errors import (
+    Alignment,
+    Sums,
+    compute_joint_errors_mm,
+    hip_indices,
+    quotients,
+    row_means,
+    row_sums,
+)
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
@@ -52,6 +60,11 @@ def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options)
     if not sums[NAMES[options.alignment]][1].any():
         raise ValueError(f"none of the {len(target)} target rows has what alignment {options.alignment!r} needs")
     return {name: (total, count) for name, (total, count) in sums.items() if count.any()}
+
+
+def check_joint_set(joint_set: str, options: Options) -> None:
+    """Raise `ValueError` unless the set has hips."""
+    hip_indices(joint_set)
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:

@@ -88,6 +88,11 @@ def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options)
     return np.where(has_area, row_means(similarity), np.nan)
 
 
+def check_joint_set(joint_set: str, options: Options) -> None:
+    """Raise `ValueError` unless every joint of the set has a sigma."""
+    _sigmas(joint_set)
+
+
 def _box_area_px2(target: Labels) -> np.ndarray:
     """Area [N] of the box around the visible joints, 0 without any."""
     joints, visible = target.joints2d, target.visible

@@ -15,12 +15,13 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.body_lengths import head_length, torso_length
-from ctlev_core.joint_errors import Sums, compute_joint_errors_px, quotients
+from ctlev_core.joint_errors import Sums, check_length, compute_joint_errors_px, quotients
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 1
 INPUT = "joints2d"
+_LENGTHS = {"torso": torso_length, "head": head_length}
 
 
 class Options(Frozen):
@@ -66,6 +67,12 @@ def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options)
     return np.where(count > 0, correct / np.maximum(count, 1), np.nan)
 
 
+def check_joint_set(joint_set: str, options: Options) -> None:
+    """Raise `ValueError` unless the set has the joints of the normaliser."""
+    if options.normaliser in _LENGTHS:
+        check_length(_LENGTHS[options.normaliser], joint_set)
+
+
 def _normaliser_px(target: Labels, options: Options) -> np.ndarray:
     """Length [N] in px that a threshold of 1 stands for; NaN where unknown."""
     if target.joints2d is None or target.visible is None:
@@ -79,4 +86,4 @@ def _normaliser_px(target: Labels, options: Options) -> np.ndarray:
         seen = target.visible.any(axis=1)
         size[seen] = (np.nanmax(points[seen], axis=1) - np.nanmin(points[seen], axis=1)).max(axis=-1)
         return size
-    return (torso_length if options.normaliser == "torso" else head_length)(points, target.joint_set)
+    return _LENGTHS[options.normaliser](points, target.joint_set)

@@ -19,7 +19,16 @@ import numpy as np
 from pydantic import Field, PositiveFloat
 
 from ctlev_core.body_lengths import head_length
-from ctlev_core.joint_errors import Alignment, Sums, compute_joint_errors_mm, quotients, row_means, row_sums
+from ctlev_core.joint_errors import (
+    Alignment,
+    Sums,
+    check_length,
+    compute_joint_errors_mm,
+    hip_indices,
+    quotients,
+    row_means,
+    row_sums,
+)
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
@@ -71,6 +80,14 @@ def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options)
         correct = (errors_mm <= options.head_threshold * head_mm) @ ones
         sums[f"pckh3d_{tag}{options.head_threshold:g}"] = (correct * has_head, count * has_head)
     return sums
+
+
+def check_joint_set(joint_set: str, options: Options) -> None:
+    """Raise `ValueError` unless the set has what alignment and PCKh need."""
+    if options.alignment == "pelvis":
+        hip_indices(joint_set)
+    if options.head_threshold:
+        check_length(head_length, joint_set)
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:

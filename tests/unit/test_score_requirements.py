@@ -1,15 +1,23 @@
 """Scores that do not fit the model are refused in the plan; what a body file holds is in the key."""
 
+import inspect
+from dataclasses import replace
+
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from ctlev_core import plugins
 from ctlev_core.metrics import pve
 from ctlev_core.plugins import PluginError
-from ctlev_core.score_requirements import check_distances, check_metrics
-from data_contracts.config import DownstreamChoice, MetricChoice, cache_material
+from ctlev_core.score_requirements import check_dataset, check_distances, check_frames, check_labels, check_metrics
+from ctlev_core.skeletons import JOINT_SETS
+from data_contracts import tables
+from data_contracts.config import DatasetChoice, DownstreamChoice, MetricChoice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
+from data_contracts.labels import Labels
+from data_contracts.manifest import label_columns, write_manifest
 from flows.command_line import PRESETS, load_preset, preset_names
 from flows.full_experiment import full_experiment
 from tasks.stage import call_flow, planning
@@ -50,6 +58,28 @@ def test_predictions_hold_what_a_model_says_it_predicts():
             assert columns[name] in text, (model, name)
 
 
+CONTRACTS = {
+    "train_sequences": plugins.DownstreamOfSequences,
+    "predict_sequences": plugins.DownstreamOfSequences,
+    "input_files": plugins.MetricWithFiles,
+    "check_joint_set": plugins.MetricOfSkeletons,
+    "compute_rows": plugins.MetricOfRows,
+    "prepare": plugins.PreparedMetric,
+    "compute_sums": plugins.MetricOfSums,
+}
+
+
+@pytest.mark.parametrize("kind", ["downstream", "metrics"])
+def test_what_plug_ins_have_beyond_their_kind_is_called_as_they_have_it(kind):
+    for name in plugins.names(kind):
+        module = plugins.load(kind, name)
+        assert hasattr(module, "train_sequences") == hasattr(module, "predict_sequences")
+        for function in [function for function in CONTRACTS if hasattr(module, function)]:
+            wanted = inspect.signature(getattr(CONTRACTS[function], function)).parameters.values()
+            found = inspect.signature(getattr(module, function)).parameters.values()
+            assert [(p.name, p.kind) for p in found] == [(p.name, p.kind) for p in list(wanted)[1:]], (name, function)
+
+
 def test_a_model_that_says_nothing_is_not_checked(monkeypatch):
     monkeypatch.delattr(plugins.load("downstream", "pose2d"), "PREDICTS")
     check_metrics(DownstreamChoice(name="pose2d"), [MetricChoice(name="pve")])
@@ -78,12 +108,77 @@ def test_a_plan_that_cannot_be_scored_is_refused_before_anything_is_written(over
 
 def test_every_preset_can_be_scored():
     for name in preset_names():
-        if name == "ablations":
-            continue  # extends another
+        if name == "all_routes":
+            continue  # made of others
         experiment = load_preset(Experiment, PRESETS, name, [])
         check_metrics(experiment.downstream, experiment.metrics)
         if experiment.feature_extractor is not None:
             check_distances(experiment.feature_extractor, experiment.distances)
+
+
+def some_labels(**changes):
+    row = {"joints2d": np.zeros((1, 13, 2), np.float32), "visible": np.ones((1, 13), bool), "joint_set": "dhp19"}
+    return Labels(("walk",), np.zeros(1, np.int64), **{**row, **changes})
+
+
+SOLID = np.zeros((1, 13, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("metric", "options", "labels", "message"),
+    [
+        ("mpjpe3d", {}, some_labels(), "expected labels with joints3d, got mine, which has joints2d, classes"),
+        ("pve", {}, some_labels(), "expected labels with smpl"),
+        ("classification", {}, replace(some_labels(), class_names=("",)), "with classes, got mine, which has joints2d"),
+        ("mpjpe2d", {}, Labels(("",), np.zeros(1, np.int64)), "which has none of any kind"),
+        ("oks", {}, some_labels(joint_set="hands"), "'oks' does not fit the labels of mine: .* sigmas, got 'hands'"),
+        ("pck2d", {}, some_labels(joint_set=""), "the torso needs a joint set of"),
+        ("pck2d", {"normaliser": "head"}, some_labels(joint_set="hands"), "the head needs a joint set of"),
+        ("mpjpe3d", {}, some_labels(joints3d=SOLID, joint_set="hands"), "no hips to align by"),
+        ("pck3d", {}, some_labels(joints3d=SOLID, joint_set="hands"), "no hips to align by"),
+        (
+            "pck3d",
+            {"alignment": "none", "head_threshold": 0.5},
+            some_labels(joints3d=SOLID, joint_set="hands"),
+            "the head needs a joint set of",
+        ),
+    ],
+)
+def test_labels_that_a_metric_cannot_use_are_refused(metric, options, labels, message):
+    with pytest.raises(PluginError, match=message):
+        check_labels([MetricChoice(name=metric, options=options)], labels, "mine")
+
+
+@pytest.mark.parametrize("joint_set", sorted(JOINT_SETS))
+def test_all_pose_metrics_take_the_joint_sets_there_are(joint_set):
+    count = len(JOINT_SETS[joint_set].joints)
+    flat, solid = np.zeros((1, count, 2), np.float32), np.zeros((1, count, 3), np.float32)
+    labels = some_labels(joints2d=flat, visible=np.ones((1, count), bool), joints3d=solid, joint_set=joint_set)
+    head = {"normaliser": "head"}
+    chosen = [("mpjpe2d", {}), ("pck2d", {}), ("pck2d", head), ("mpjpe3d", {}), ("pck3d", {"head_threshold": 0.5})]
+    chosen += [("oks", {})] * (joint_set != "smpl")  # nobody has measured how far annotators disagree about a spine
+    check_labels([MetricChoice(name=name, options=options) for name, options in chosen], labels, "mine")
+
+
+def test_a_dataset_is_asked_for_the_labels_of_one_recording():
+    """Objects have classes and no joints."""
+    objects = DatasetChoice(name="studio_objects")
+    check_dataset([MetricChoice(name="classification")], objects)
+    with pytest.raises(PluginError, match="got dataset 'studio_objects', which has classes"):
+        check_dataset([MetricChoice(name="mpjpe2d")], objects)
+
+
+def test_frames_that_are_there_already_are_looked_at_in_the_plan(tmp_path):
+    metrics = [MetricChoice(name="mpjpe2d")]
+    check_frames(metrics, tmp_path / "planned")
+    columns = {
+        "sample_id": ["a"], "recording_id": ["r"], "subject": ["s"], "split": ["test"], "class_name": ["walk"],
+        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), pa.array([1], pa.int64())),
+        **label_columns(Labels(("walk",), np.zeros(1, np.int64))),
+    }  # fmt: skip
+    write_manifest(tmp_path, pa.table(columns), tables.FRAMES)
+    with pytest.raises(PluginError, match=r"'mpjpe2d' expected labels with joints2d, got .*, which has classes"):
+        check_frames(metrics, tmp_path)
 
 
 BODY = ("downstream={name: smpl_regressor}", "feature_extractor=null")
