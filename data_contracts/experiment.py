@@ -27,6 +27,7 @@ LABELS_OF = "labels of"
 """Settings that start so score frames of a generator against the labels they were made from."""
 SHUFFLED = f"shuffled {LABELS_OF}"
 """Settings that start so score the same frames against the labels of others: how bad no faithfulness at all is."""
+NAME_PATTERN = r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$"
 RESERVED = ("real", "synthetic", "more_real", "faithful")
 
 
@@ -60,7 +61,7 @@ class Experiment(Frozen):
     compared; None leaves the comparison out.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", description="names the experiment and its report")
+    name: str = Field(pattern=NAME_PATTERN, description="names the experiment and its report")
     data_notice: str = Field("", description="first line of the report: what data this is")
     seed: int = Field(0, ge=0, description="seed of conditions, fine-tuning and sampling")
     dataset: DatasetChoice

@@ -18,6 +18,7 @@ from ctlev_core import plugins
 from ctlev_core.plugins import PluginError, validate_options
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.experiment import Experiment
+from data_contracts.study import Study
 from flows import local_server
 from tasks.stage import PlannedStage, in_one_run, planning
 
@@ -42,10 +43,53 @@ def load_experiment(preset: str, overrides: list[str], model: type[X] = Experime
         PluginError: unknown preset, option or plug-in, a wrong value, or parts that do not go together.
     """
     experiment = load_preset(model, PRESETS, preset, overrides)
+    _check_parts(experiment)
+    return experiment
+
+
+def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
+    """The experiment a preset describes, or the study of several where it has `experiments`.
+
+    Args:
+        preset: as `load_preset` takes it. Each of a study's `experiments` `extends` a preset, changes whole options,
+            and single ones under `set`, as `key=value`.
+        overrides: likewise; those of a study begin with `experiments.NAME.`.
+
+    Raises:
+        PluginError: as `load_experiment`.
+    """
+    values = _read_preset(PRESETS, preset, ())
+    parts = values.get("experiments")
+    if parts is None:
+        return load_experiment(preset, overrides)
+    where = f"preset {preset!r}"
+    if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
+        raise PluginError(f"{where}: experiments must be a mapping of names to options, got {parts!r}")
+    values["experiments"] = {name: _part(dict(part), f"{where}, experiments.{name}") for name, part in parts.items()}
+    for override in overrides:
+        _apply(values, override)
+    study = validate_options(Study, values, where)
+    for experiment in study.experiments.values():
+        _check_parts(experiment)
+    return study
+
+
+def _part(part: dict[str, Any], where: str) -> dict[str, Any]:
+    """The options of one experiment of a study."""
+    extended, changes = part.pop("extends", None), part.pop("set", [])
+    if not isinstance(changes, list) or not all(isinstance(change, str) for change in changes):
+        raise PluginError(f"{where}: set must be a list of texts key=value, got {changes!r}")
+    values = ({} if extended is None else _read_preset(PRESETS, str(extended), (where,))) | part
+    for change in changes:
+        _apply(values, change)
+    return values
+
+
+def _check_parts(experiment: Experiment) -> None:
+    """Raise `PluginError` for a plug-in that is missing, whose options are wrong, or that lacks what it needs."""
     for choice in experiment.choices:
         plugins.load_options(choice)
     _check_intensity(experiment)
-    return experiment
 
 
 def _check_intensity(experiment: Experiment) -> None:
@@ -78,6 +122,8 @@ def load_preset(model: type[BaseModel], folder: Path, preset: str, overrides: li
         overrides: dotted names, for example `encoding.options.polarity=false`; values are YAML.
     """
     values = _read_preset(folder, preset, ())
+    if "experiments" in values:
+        raise PluginError(f"preset {preset!r} is a study of several experiments, which only full_experiment runs")
     for override in overrides:
         _apply(values, override)
     return validate_options(model, values, f"preset {preset!r}")

@@ -29,7 +29,7 @@ from flows import regenerate as of_regenerate
 from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
-from flows.command_line import PRESETS, check_home, load_experiment, load_preset, use_cores
+from flows.command_line import PRESETS, check_home, load_experiment, load_preset, load_study, use_cores
 from flows.settings import HOME, flow
 from tasks.contact_sheet import publish_contact_sheet
 from tasks.export_events import publish_events
@@ -83,7 +83,7 @@ def _deployable(
     return flow(name=script_flow.name)(run)
 
 
-full_experiment = _deployable(of_full_experiment.full_experiment, publish=publish_report)
+full_experiment = _deployable(of_full_experiment.full_experiment, load=load_study, publish=publish_report)
 prepare_dataset = _deployable(
     of_prepare_dataset.prepare_dataset,
     publish=lambda made, folder, name: publish_contact_sheet(made.contact_sheet, folder, name),

@@ -10,8 +10,9 @@ from functools import partial
 
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
+from data_contracts.study import Study
 from flows.baselines import baselines
-from flows.command_line import main
+from flows.command_line import load_study, main
 from flows.evaluate import evaluate
 from flows.export_events import export_streams
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
@@ -23,11 +24,17 @@ from tasks.ingest import ingest
 from tasks.realism import realism
 from tasks.report import publish_report, report
 from tasks.stage import call_flow, call_together
+from tasks.study_report import study_report
 
 
 @flow(name="full-experiment")
-def full_experiment(experiment: Experiment) -> ManifestRef:
-    """Every stage from recordings to the report; what is in the store already is not computed again."""
+def full_experiment(experiment: Experiment | Study) -> ManifestRef:
+    """Every stage from recordings to the report; what is in the store already is not computed again.
+
+    The experiments of a study run side by side, and share what they have in common.
+    """
+    if isinstance(experiment, Study):
+        return _study(experiment)
     dataset = call_flow(prepare_dataset, experiment)
     *own, compared = call_together(
         *(partial(_own_frames, experiment, dataset, number) for number in range(experiment.num_generators)),
@@ -84,10 +91,28 @@ def full_experiment(experiment: Experiment) -> ManifestRef:
     )
 
 
+def _study(study: Study) -> ManifestRef:
+    parts = study.experiments
+    reports = call_together(*(partial(_one_of_study, part) for part in parts.values()))
+    return study_report(
+        reports,
+        title=study.name,
+        notice=study.data_notice,
+        names=list(parts),
+        settings=[part.trained_settings for part in parts.values()],
+        generator_names=[part.generator_names for part in parts.values()],
+        label=study.name,
+    )
+
+
+def _one_of_study(experiment: Experiment) -> ManifestRef:
+    return call_flow(full_experiment, experiment)
+
+
 def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -> tuple[ManifestRef, ManifestRef]:
     checkpoint = call_flow(train_generator, experiment, dataset, number)
     return checkpoint, call_flow(synthesize, experiment, dataset, checkpoint, number)
 
 
 if __name__ == "__main__":
-    sys.exit(main(full_experiment, lambda made, experiment: publish_report(made, HOME, experiment.name)))
+    sys.exit(main(full_experiment, lambda made, asked: publish_report(made, HOME, asked.name), load=load_study))

@@ -32,11 +32,12 @@ from ctlev_core.report.score_tables import (
     score_tables,
     trained_rows,
 )
+from ctlev_core.report.summary import Summary, write_summary
 from ctlev_core.report.tables import Cell, Table, render_latex, render_markdown
 from ctlev_core.report.verdict import verdict
 from ctlev_core.traced_scores import paired_samples, trace_scores
 from data_contracts import tables
-from data_contracts.manifest import RUN_FILE, Manifest, ManifestRef
+from data_contracts.manifest import MANIFEST_FILE, RUN_FILE, Manifest, ManifestRef
 from tasks.stage import Output, stage
 
 PAGE, LATEX, MARKDOWN, PROVENANCE = "report.html", "tables.tex", "tables.md", "provenance.json"
@@ -45,7 +46,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=9, schema=tables.REPORT)
+@stage(version=10, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -67,7 +68,7 @@ def report(
     checkpoint_names: Sequence[str],
     model_names: Sequence[str],
 ) -> pa.Table:
-    """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, and `provenance.json`.
+    """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, `provenance.json` and `summary.json`.
 
     `generated` are the frames of each generator: first the experiment's own, called `synthetic`, then the baselines; of
     several sets of one name the first is shown. `more_real` are other real frames of the moments asked for.
@@ -99,16 +100,20 @@ def report(
     sheet = contact_sheet_sections(frames, frame_conditions, conditions)
     _, by_class = group_tables(rows, settings)
     words = _verdict(rows, settings, list(shown), paired)
+    steps = pictures.steps(frames, frame_conditions, conditions, next(iter(shown.values())), _kind(frame_conditions))
+    grid = pictures.sample_grid(conditions, shown, [frames] if more_real is None else [frames, more_real])
+    write_summary(out.folder, Summary(words, steps, grid))
     page = render_report(
         title=title,
         lead=notice,
         verdict=words,
-        steps=pictures.steps(frames, frame_conditions, conditions, next(iter(shown.values())), _kind(frame_conditions)),
+        steps=steps,
         sections=[
             *results,
             *copied[:1],
             *refused,
-            *_figures(rows, frames, conditions, shown, more_real),
+            grid,
+            *_figures(rows, frames, conditions, shown),
             *looks[:1],
             *_training_of_generators(checkpoints, checkpoint_names),
             *_folded("Class by class", by_class),
@@ -144,13 +149,10 @@ def _results(rows: list[Row], settings: Sequence[str], names: list[str], paired:
     return [headline, *origins, *baseline_tables(names, _first_metric(rows), paired), *others]
 
 
-def _figures(
-    rows: list[Row], frames: Manifest, conditions: Manifest, shown: dict[str, Manifest], more_real: Manifest | None
-) -> list[Section]:
+def _figures(rows: list[Row], frames: Manifest, conditions: Manifest, shown: dict[str, Manifest]) -> list[Section]:
     metric = _first_metric(rows)
     points = scaling_points(rows, metric)
     return [
-        pictures.sample_grid(conditions, shown, [frames] if more_real is None else [frames, more_real]),
         *pictures.motion(conditions, next(iter(shown.values()))),
         *([scaling_figure(points, metric)] if len({point.ratio for point in points}) >= FEWEST_AMOUNTS else []),
         pictures.real_grid(frames),
@@ -173,15 +175,26 @@ def _verdict(rows: list[Row], settings: Sequence[str], names: list[str], paired:
 def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
     """Put the newest report of an experiment where a person looks for it, and say where that is.
 
-    `<home>/reports/NAME.html`, and in the folder `NAME` beside it the tables and `provenance.json`.
+    `<home>/reports/NAME.html`, and in the folder `NAME` beside it the tables and `provenance.json`; of a study also the
+    reports of its experiments, a folder each.
     """
     folder = home / "reports"
     (folder / name).mkdir(parents=True, exist_ok=True)
-    for path in ref.path.iterdir():
-        if path.name in (LATEX, MARKDOWN, PROVENANCE) or (path.suffix == ".parquet" and path.stem != "manifest"):
-            _replace(path, folder / name / path.name)
+    parts = [path for path in ref.path.iterdir() if path.is_dir()]  # of a study
+    for place in (ref.path, *parts):
+        (folder / name / place.relative_to(ref.path)).mkdir(exist_ok=True)
+        for path in published_files(place):
+            if path != ref.path / PAGE:
+                _replace(path, folder / name / path.relative_to(ref.path))
     _replace(ref.path / PAGE, folder / f"{name}.html")
     return f"report: {folder / f'{name}.html'}\ntables: {folder / name}"
+
+
+def published_files(folder: Path) -> list[Path]:
+    """What a person wants of a report's files."""
+    wanted = (PAGE, LATEX, MARKDOWN, PROVENANCE)
+    tables_of = (path for path in folder.glob("*.parquet") if path.name != MANIFEST_FILE)
+    return sorted([*(folder / name for name in wanted if (folder / name).exists()), *tables_of])
 
 
 def _replace(source: Path, target: Path) -> None:

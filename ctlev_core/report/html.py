@@ -10,6 +10,7 @@ import html
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from urllib.parse import quote
 
 import numpy as np
 
@@ -85,7 +86,15 @@ class Animation:
     caption: str = ""
 
 
-Section = Text | Table | ImageGrid | Curves | Animation
+@dataclass(frozen=True)
+class Links:
+    """Pages beside this one: (text, relative address) of each."""
+
+    title: str
+    pages: Sequence[tuple[str, str]]
+
+
+Section = Text | Table | ImageGrid | Curves | Animation | Links
 
 
 @dataclass(frozen=True)
@@ -218,6 +227,9 @@ def _section(section: Section) -> str:
         return _image_grid(section)
     if isinstance(section, Animation):
         return _animation(section)
+    if isinstance(section, Links):
+        pages = (f'<li><a href="{html.escape(quote(place))}">{_inline(text)}</a></li>' for text, place in section.pages)
+        return f"<ul>{''.join(pages)}</ul>"
     return _curves(section)
 
 

@@ -1,0 +1,112 @@
+"""The page over several experiments: the paper's five tables, each from the experiment that asks its question."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ctlev_core.report import paper_numbers
+from ctlev_core.report.html import Folded, Section
+from ctlev_core.report.score_tables import PairedScores, cell_text, score_tables, trained_rows
+from ctlev_core.report.summary import Summary
+from ctlev_core.report.tables import Cell, Table
+
+Row = dict[str, Any]
+_QUESTIONS = (
+    ("binary_accuracy", "Zero-shot recognition", paper_numbers.ZERO_SHOT),
+    ("accuracy", "Object recognition", paper_numbers.CLASSIFICATION),
+    ("mpjpe2d", "2D pose", paper_numbers.POSE_2D),
+    ("mpjpe3d", "3D body", paper_numbers.BODY_3D),
+)
+"""What an experiment asks, by a score that begins so; the first that any of its scores begins with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One experiment of a study.
+
+    Attributes:
+        name: its name in the study.
+        rows: of the table `scores`.
+        settings: what was trained on, in the order of the tables.
+        generators: whose frames were compared, its own first.
+        paired: its scores sample by sample.
+        summary: of its report.
+    """
+
+    name: str
+    rows: list[Row]
+    settings: Sequence[str]
+    generators: Sequence[str]
+    paired: PairedScores
+    summary: Summary
+
+    @property
+    def question(self) -> str:
+        """What it asks, in two words."""
+        return self._asked[0]
+
+    @property
+    def published(self) -> Table | None:
+        """The paper's answer, on other data."""
+        return self._asked[1]
+
+    @property
+    def _asked(self) -> tuple[str, Table | None]:
+        metrics = [row["metric"] for row in trained_rows(self.rows)]
+        for start, question, published in _QUESTIONS:
+            if any(metric.startswith(start) for metric in metrics):
+                return question, published
+        return self.name, None
+
+
+def study_verdict(parts: Sequence[Part]) -> str:
+    """A paragraph an experiment."""
+    return "\n\n".join(f"{part.question} (`{part.name}`): {part.summary.verdict}" for part in parts)
+
+
+def study_tables(parts: Sequence[Part]) -> list[list[Table]]:
+    """The tables of scores of each experiment that the page shows; in the last list those of all together."""
+    found = []
+    for part in parts:
+        tables = [table for table in score_tables(part.rows, part.settings, part.paired) if _answers(table)]
+        found.append([replace(table, title=f"{part.question} (`{part.name}`): {table.title}") for table in tables])
+    return [*found, [distances_table(parts)]]
+
+
+def _answers(table: Table) -> bool:
+    """Is it about models tested on real frames? What else was scored is on the experiment's own page."""
+    return table.columns[0] in ("trained on", "classes")
+
+
+def study_sections(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> list[Section | Folded]:
+    """Of each experiment its tables, its samples and the paper's numbers; then the distances of all."""
+    sections: list[Section | Folded] = []
+    for part, shown in zip(parts, tables, strict=False):
+        sections += shown
+        sections.append(replace(part.summary.grid, title=f"{part.question} (`{part.name}`): asked for, and sampled"))
+        sections += _published(part.published)
+    return [*sections, *tables[-1], *_published(paper_numbers.DISTANCES)]
+
+
+def _published(table: Table | None) -> list[Folded]:
+    caption = "Other data, another prior, other sizes: not comparable with the numbers above. It gives no intervals."
+    return [] if table is None else [Folded(table.title, [table], caption)]
+
+
+def distances_table(parts: Sequence[Part]) -> Table:
+    """Generators down, experiments across: the layout of the paper's Table 4."""
+    distances = [[row for row in part.rows if row["task"] == "distance" and row["metric"].startswith(("fd", "fid"))]
+                 for part in parts]  # fmt: skip
+    settings = list(dict.fromkeys(row["setting"] for rows in distances for row in rows))
+    body: list[list[Cell]] = [
+        [setting, *(cell_text([row for row in rows if row["setting"] == setting]) for rows in distances)]
+        for setting in settings
+    ]
+    caption = (
+        "Frechet distance to the real training frames, in features of a classifier trained on real events: another one "
+        "for each experiment, so that only numbers below one another compare. Lower is nearer; the row of held-out "
+        "real frames is the floor. In brackets 95 %."
+    )
+    return Table("Quality of the frames", ["frames", *(f"{part.name} ↓" for part in parts)], body, caption=caption)

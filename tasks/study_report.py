@@ -1,0 +1,75 @@
+"""One page over the reports of several experiments."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ctlev_core.report.html import Links, render_report
+from ctlev_core.report.score_tables import PairedScores
+from ctlev_core.report.study import Part, study_sections, study_tables, study_verdict
+from ctlev_core.report.summary import read_summary
+from ctlev_core.report.tables import render_latex, render_markdown
+from data_contracts import tables
+from data_contracts.manifest import Manifest
+from tasks.report import LATEX, MARKDOWN, PAGE, published_files
+from tasks.stage import Output, stage
+
+
+@stage(version=1, schema=tables.REPORT)
+def study_report(
+    out: Output,
+    reports: list[Manifest],
+    *,
+    title: str,
+    notice: str,
+    names: Sequence[str],
+    settings: Sequence[Sequence[str]],
+    generator_names: Sequence[Sequence[str]],
+) -> pa.Table:
+    """Write `report.html`, `tables.tex` and `tables.md` over all experiments, and into a folder each what they report.
+
+    Args:
+        out: where.
+        reports: of the experiments.
+        title: of the page; its links lead to the folder of that name, where the pages are published.
+        notice: first line.
+        names: of the experiments, likewise the following.
+        settings: what was trained on.
+        generator_names: whose frames were compared, the experiment's own first.
+    """
+    parts = [
+        _part(report.ref.path, name, trained, generators)
+        for report, name, trained, generators in zip(reports, names, settings, generator_names, strict=True)
+    ]
+    shown, words = study_tables(parts), study_verdict(parts)
+    links = [(f"{part.question} (`{part.name}`)", f"{title}/{part.name}/{PAGE}") for part in parts]
+    page = render_report(
+        title=title,
+        lead=notice,
+        verdict=words,
+        steps=parts[0].summary.steps,
+        sections=[*study_sections(parts, shown), Links("Everything else, experiment by experiment", links)],
+    )
+    (out.folder / PAGE).write_text(page, encoding="utf-8")
+    kept = [table for of_part in shown for table in of_part]
+    (out.folder / LATEX).write_text(render_latex(kept, title=title, lead=notice), encoding="utf-8")
+    (out.folder / MARKDOWN).write_text(render_markdown(kept, title=title, lead=notice, verdict=words), encoding="utf-8")
+    files = []
+    for name, report in zip(names, reports, strict=True):
+        (out.folder / name).mkdir()
+        for path in published_files(report.ref.path):
+            files.append(f"{name}/{path.name}")
+            shutil.copyfile(path, out.folder / files[-1])
+    found = [file for file in files if file.endswith(".parquet")]
+    return pa.table({"table": [file.removesuffix(".parquet") for file in found], "file": found})
+
+
+def _part(folder: Path, name: str, settings: Sequence[str], generators: Sequence[str]) -> Part:
+    paired = PairedScores(pq.read_table(folder / "samples.parquet"))
+    rows = pq.read_table(folder / "scores.parquet").to_pylist()
+    return Part(name, rows, settings, generators, paired, read_summary(folder))

@@ -1,0 +1,148 @@
+"""Studies: presets of several experiments, and the page that tells them as one."""
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from report_artefacts import SETTINGS, Experiment
+
+from ctlev_core.plugins import PluginError
+from ctlev_core.report.html import ImageGrid, Step
+from ctlev_core.report.study import distances_table
+from ctlev_core.report.summary import SUMMARY_FILE, Summary, read_summary, write_summary
+from ctlev_core.run_comparison import read_run
+from data_contracts.errors import DataError
+from data_contracts.manifest import Manifest, ManifestRef
+from data_contracts.study import Study
+from flows.command_line import load_experiment, load_study
+from tasks.report import publish_report, report
+from tasks.stage import Output
+from tasks.study_report import study_report
+
+PARTS = ("first", "second")
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory):
+    """The folders of two reports."""
+    folders = []
+    for name in PARTS:
+        experiment = Experiment(tmp_path_factory.mktemp(name))
+        folder = experiment.home / "report"
+        folder.mkdir()
+        report.function(Output(folder, folder), **experiment.arguments)
+        folders.append(folder)
+    return folders
+
+
+@pytest.fixture(scope="module")
+def published(reports, tmp_path_factory):
+    """The folder of reports with a study's."""
+    home = tmp_path_factory.mktemp("study")
+    made = home / "made"
+    made.mkdir()
+    manifests = [Manifest(ManifestRef(key="k", path=folder), None, (), ()) for folder in reports]
+    shown = {"settings": [list(SETTINGS)] * 2, "generator_names": [["synthetic", "gan"]] * 2}
+    study_report.function(Output(made, made), manifests, title="both", notice="Data: `x`.", names=PARTS, **shown)
+    publish_report(ManifestRef(key="k", path=made), home, "both")
+    return home / "reports"
+
+
+def test_the_page_has_every_experiment_its_samples_the_papers_numbers_and_all_distances(published):
+    page = (published / "both.html").read_text()
+    texts = ["Data: <code>x</code>", "2D pose (<code>first</code>): mpjpe2d", "2D pose (<code>second</code>): mpjpe2d"]
+    texts += ["1. A label"]
+    for part in PARTS:
+        heading = f"2D pose (<code>{part}</code>): "
+        texts += [f"{heading}Does synthetic data help?</h2>", f"{heading}asked for, and sampled</h2>"]
+        texts += ["Paper, Table 2: 2D pose on DHP19 and CDEHP</h2>"]
+    texts += ["Quality of the frames</h2>", "Paper, Table 4"]
+    texts += [f'href="both/{part}/report.html"' for part in PARTS]
+    place = 0
+    for text in texts:
+        place = page.index(text, place) + 1
+    assert page.count("Do the synthetic frames show their labels?") == 0  # on the experiments' own pages
+
+
+def test_links_lead_to_the_experiments_own_reports(published, reports):
+    for part, folder in zip(PARTS, reports, strict=True):
+        for name in ("report.html", "tables.tex", "provenance.json", "scores.parquet", "samples.parquet"):
+            assert (published / "both" / part / name).read_bytes() == (folder / name).read_bytes()
+        assert not (published / "both" / part / SUMMARY_FILE).exists()
+        assert read_run(part, published / "both" / part).scores  # `flows/compare.py` takes the folder
+
+
+def test_distances_stand_beside_each_other_by_experiment(reports):
+    parts = []
+    for name, folder, factor in zip(PARTS, reports, (1, 2), strict=True):
+        rows = pq.read_table(folder / "scores.parquet").to_pylist()
+        rows = [{**row, "value": factor * row["value"]} for row in rows]
+        parts.append(type("Part", (), {"name": name, "rows": rows}))
+    table = distances_table(parts)
+    assert table.columns == ["frames", "first ↓", "second ↓"]
+    (row,) = table.rows
+    assert [row[0], row[1][:5], row[2][:6]] == ["synthetic", "9.000", "18.000"]
+
+
+def test_summaries_come_back_as_they_were(tmp_path):
+    rng = np.random.default_rng(0)
+    colour, grey = rng.integers(0, 256, (5, 7, 3), np.uint8), rng.integers(0, 256, (4, 6), np.uint8)
+    steps = [Step("1", colour, "see", follows=True), Step("2", "“a cat”", "read")]
+    grid = ImageGrid("grid", [("a", [colour, colour]), ("b", [grey])], column_labels=["x", "y"], caption="c")
+    write_summary(tmp_path, Summary("so", steps, grid))
+    back = read_summary(tmp_path)
+    assert (back.verdict, back.steps[1], back.steps[0].follows) == ("so", steps[1], True)
+    assert (back.grid.title, back.grid.caption, list(back.grid.column_labels)) == ("grid", "c", ["x", "y"])
+    np.testing.assert_array_equal(back.steps[0].picture, colour)
+    for (name, images), (expected_name, expected) in zip(back.grid.rows, grid.rows, strict=True):
+        assert name == expected_name
+        for image, picture in zip(images, expected, strict=True):
+            np.testing.assert_array_equal(image, picture)
+
+
+@pytest.mark.parametrize(
+    "damage", ["", "{}", '{"verdict": "v", "steps": [], "grid": {"rows": [["a", [{"png": "AA"}]]]}}']
+)
+def test_damaged_summaries_are_refused(tmp_path, damage):
+    (tmp_path / SUMMARY_FILE).write_text(damage)
+    with pytest.raises(DataError, match=r"summary\.json: is not the summary of a report"):
+        read_summary(tmp_path)
+
+
+def test_the_bundled_study_is_made_of_its_presets():
+    study = load_study("all_routes", ["experiments.pose.num_synthetic=5"])
+    assert isinstance(study, Study)
+    demo = load_experiment("demo", [])
+    assert study.experiments["pose"] == demo.model_copy(update={"num_synthetic": 5})
+    assert study.experiments["body"] == load_experiment("body", [])
+    changes = ["name=zero_shot", "settings=[synthetic]", "dataset.options.zero_shot=true"]
+    assert study.experiments["zero_shot"] == load_experiment("objects", changes)
+    assert load_study("demo", []) == demo
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"experiments": [1]}, "experiments must be a mapping of names to options"),
+        ({"experiments": {"a": 3}}, "experiments must be a mapping of names to options"),
+        ({"experiments": {}}, "experiments"),
+        ({"experiments": {"a": {"extends": "nonesuch"}}}, r"experiments\.a extends an unknown preset 'nonesuch'"),
+        ({"experiments": {"a": {"extends": "smoke", "set": "x=1"}}}, "set must be a list of texts"),
+        ({"experiments": {"a": {"extends": "smoke", "set": ["seed"]}}}, "--set expects key=value, got 'seed'"),
+        ({"experiments": {"a": {"extends": "smoke", "set": ["seeds=1"]}}}, "seeds"),
+        ({"experiments": {"a": {"extends": "smoke"}, "b": {"extends": "smoke"}}}, "need different names"),
+        ({"experiments": {"../a": {"extends": "smoke"}}}, "names of folders"),
+        ({"experiments": {"a": {"extends": "smoke", "set": ["dataset.options.colour=1"]}}}, "unknown option 'colour'"),
+    ],
+)
+def test_wrong_studies_are_refused(tmp_path, content, message):
+    path = tmp_path / "study.yaml"
+    path.write_text(json.dumps({"name": "s", **content}))
+    with pytest.raises(PluginError, match=message):
+        load_study(str(path), [])
+
+
+def test_only_the_full_experiment_takes_a_study():
+    with pytest.raises(PluginError, match="'all_routes' is a study of several experiments"):
+        load_experiment("all_routes", [])
