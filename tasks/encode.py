@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from data_contracts.events import Events
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, by_recording, concat_labels, label_columns, labels_of
 from tasks.stage import Output, stage
+from tasks.workers import is_spread, map_shards
 
 MAX_EVENTS = 1 << 22
 """Events held at a time; with what reading them takes, 0.2 GiB."""
@@ -28,14 +30,22 @@ MAX_GAP = 1 << 18
 """Events between two windows that are read rather than skipped."""
 MAX_WINDOWS = 64
 """Frames made at a time: the pages of large new arrays cost more than the counting in them."""
+HELD_BYTES = 1 << 23
+"""Images of a recording that wait in memory until their turn comes; four frames of 512 x 512 px fit."""
+MAX_GROUP = 4
+"""Recordings that travel together; up to two such groups a worker wait, so that 16 workers hold 1 GiB at most."""
 GREY_SCALE = 256
 """Counts that a grey value of 1 becomes, so that averages keep their fractions."""
 
 
 class _Source(NamedTuple):
-    """One recording and what was ingested with it; `windows` [W, 2] and their labels where the dataset's are wanted."""
+    """One recording and what was ingested with it; `windows` [W, 2] and their labels where the dataset's are wanted.
+
+    `file` holds its events, or event images that come finished.
+    """
 
     recording: dict[str, Any]
+    file: Path
     parts: list[dict[str, Any]]
     track: Labels
     windows: np.ndarray | None
@@ -57,25 +67,21 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
 
     Event images that come finished take the place of both: every image is a window, its grey values stand for counts.
     """
-    plugin = plugins.load_options(encoding)
     sources = _sources(recordings, windows)
     rows: list[dict[str, Any]] = []
     labels: list[Labels] = []
     with out.open_array("histograms") as histograms, out.open_array("frames") as frames:
-        for source in tqdm(sources, "encode", unit="recording", leave=False, disable=None):
-            of_events = bool(source.recording["events_file"])
-            made = _encode_events if of_events else _encode_images
-            for samples in made(recordings, source, plugin, windows):
-                try:
-                    histograms.append(samples.histograms)
-                except DataError as error:
-                    name = source.recording["recording_id"]
-                    raise DataError(
-                        f"encode: sensors differ in size, {name} does; set encoding.options.image_size ({error})"
-                    ) from error
-                frames.append(samples.frames)
-                rows += samples.rows
-                labels.append(samples.labels)
+        encoded = _encode_spread if is_spread(len(sources)) else _encode_in_turn
+        for name, samples in encoded(sources, encoding, windows, out.work):
+            try:
+                histograms.append(samples.histograms)
+            except DataError as error:
+                raise DataError(
+                    f"encode: sensors differ in size, {name} does; set encoding.options.image_size ({error})"
+                ) from error
+            frames.append(samples.frames)
+            rows += samples.rows
+            labels.append(samples.labels)
     for split in ("train", "test"):
         if not any(row["split"] == split for row in rows):
             raise DataError(f"encode: no window in split {split!r}; the recordings are too short for {windows!r}")
@@ -84,6 +90,61 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
     for name, column in label_columns(stacked).items():
         table = table.append_column(name, column)
     return table
+
+
+def _encode_in_turn(
+    sources: list[_Source], encoding: EncodingChoice, windows: Windows, work: Path
+) -> Iterator[tuple[str, _Samples]]:
+    """Some windows at a time, each handed on before the next are read."""
+    plugin = plugins.load_options(encoding)
+    for source in tqdm(sources, "encode", unit="recording", leave=False, disable=None):
+        for samples in _encode_source(source, plugin, windows):
+            yield source.recording["recording_id"], samples
+
+
+def _encode_spread(
+    sources: list[_Source], encoding: EncodingChoice, windows: Windows, work: Path
+) -> Iterator[tuple[str, _Samples]]:
+    """The same, several recordings at a time."""
+    found = map_shards(partial(_encode_shard, encoding, windows, work), list(enumerate(sources)), max_group=MAX_GROUP)
+    found = tqdm(found, "encode", len(sources), unit="recording", leave=False, disable=None)
+    for source, pieces in zip(sources, found, strict=True):
+        for samples in pieces:
+            yield source.recording["recording_id"], samples if isinstance(samples, _Samples) else samples.take_back()
+
+
+class _PutAway(NamedTuple):
+    """Samples whose images wait in files."""
+
+    samples: _Samples
+    histograms: Path
+    frames: Path
+
+    def take_back(self) -> _Samples:
+        histograms, frames = (np.load(path, allow_pickle=False) for path in (self.histograms, self.frames))
+        self.histograms.unlink()
+        self.frames.unlink()
+        return self.samples._replace(histograms=histograms, frames=frames)
+
+
+def _put_away(samples: _Samples, path: Path) -> _PutAway:
+    paths = path.with_suffix(".histograms.npy"), path.with_suffix(".frames.npy")
+    for images, file in zip((samples.histograms, samples.frames), paths, strict=True):
+        np.save(file, images, allow_pickle=False)
+    return _PutAway(samples._replace(histograms=samples.histograms[:0], frames=samples.frames[:0]), *paths)
+
+
+def _encode_shard(
+    encoding: EncodingChoice, windows: Windows, work: Path, numbered: tuple[int, _Source]
+) -> list[_Samples | _PutAway]:
+    """All windows of a recording; images beyond `HELD_BYTES` go to files, for many recordings may wait."""
+    number, source = numbered
+    pieces: list[_Samples | _PutAway] = []
+    held = 0
+    for samples in _encode_source(source, plugins.load_options(encoding), windows):
+        held += samples.histograms.nbytes + samples.frames.nbytes
+        pieces.append(samples if held <= HELD_BYTES else _put_away(samples, work / f"{number:07d}_{len(pieces):05d}"))
+    return pieces
 
 
 def _sources(recordings: Manifest, windows: Windows) -> list[_Source]:
@@ -108,15 +169,19 @@ def _sources(recordings: Manifest, windows: Windows) -> list[_Source]:
             table = ranges.get(name, tables.WINDOWS.arrow().empty_table())
             dataset_windows = np.stack([table["event_start"].to_numpy(), table["event_stop"].to_numpy()], axis=1)
         labels = labels_of(window_labels[name]) if name in window_labels else None
-        found.append(_Source(row, parts[name].to_pylist(), labels_of(tracks[name]), dataset_windows, labels))
+        file = recordings.path(row["events_file"] or row["event_images_file"])
+        found.append(_Source(row, file, parts[name].to_pylist(), labels_of(tracks[name]), dataset_windows, labels))
     return found
 
 
-def _encode_events(
-    recordings: Manifest, source: _Source, plugin: plugins.Plugin, windows: Windows
-) -> Iterator[_Samples]:
+def _encode_source(source: _Source, plugin: plugins.Plugin, windows: Windows) -> Iterator[_Samples]:
+    made = _encode_events if source.recording["events_file"] else _encode_images
+    return made(source, plugin, windows)
+
+
+def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) -> Iterator[_Samples]:
     """The windows of each part, some at a time: neither events nor histograms of a recording need fit into memory."""
-    path = recordings.path(source.recording["events_file"])
+    path = source.file
     for part in source.parts:
         start, stop = part["event_start"], part["event_stop"]
         held = event_files.read_events_range(path, start, stop) if stop - start <= MAX_EVENTS else None
@@ -163,9 +228,7 @@ def _groups(ranges: np.ndarray) -> Iterator[np.ndarray]:
         first = last
 
 
-def _encode_images(
-    recordings: Manifest, source: _Source, plugin: plugins.Plugin, windows: Windows
-) -> Iterator[_Samples]:
+def _encode_images(source: _Source, plugin: plugins.Plugin, windows: Windows) -> Iterator[_Samples]:
     """Finished event images: every one is a window; the grey values, in fixed point, stand for counts."""
     recording, name = source.recording, source.recording["recording_id"]
     if getattr(plugin.options, "polarity", False):
@@ -174,8 +237,8 @@ def _encode_images(
         )
     if len(source.parts) != 1:
         raise DataError(f"{name}: finished event images cannot be split in time")
-    images = recordings.array(recording["event_images_file"].removesuffix(".npy"))
-    t_us = recordings.array(recording["event_images_file"].removesuffix(".npy") + ".t_us")
+    images = np.load(source.file, mmap_mode="r", allow_pickle=False)
+    t_us = np.load(source.file.with_suffix(".t_us.npy"), mmap_mode="r", allow_pickle=False)
     sensor_size = (recording["sensor_width_px"], recording["sensor_height_px"])
     image_size = getattr(plugin.options, "image_size", None) or sensor_size
     chosen = spread(len(images), windows.max_windows)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from data_contracts.events import Events, check_events
 from data_contracts.labels import Labels, Recording, check_image_track, check_labels
 from data_contracts.manifest import concat_labels, label_columns
 from tasks.stage import Output, stage
+from tasks.workers import map_shards
 
 
 class _Ingested(NamedTuple):
@@ -59,11 +60,9 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     """Read every recording once, check it, and keep events and labels in the project's own form."""
     plugin = plugins.load_options(dataset)
     recordings = _list_recordings(plugin)
-    # Readers and the simulator release the interpreter lock; map() keeps the order of the recordings.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = pool.map(lambda recording: _ingest_recording(plugin, recording, out), recordings)
-        progress = tqdm(results, "ingest", len(recordings), unit="recording", leave=False, disable=None)
-        ingested = list(progress)
+    # Readers and the simulator release the interpreter lock, so that threads serve.
+    results = map_shards(partial(_ingest_recording, dataset, out), recordings)
+    ingested = list(tqdm(results, "ingest", len(recordings), unit="recording", leave=False, disable=None))
     out.write_table(pa.Table.from_pylist([p for i in ingested for p in i.parts], tables.PARTS.arrow()), tables.PARTS)
     out.write_table(_window_table(recordings, ingested), tables.WINDOWS)
     synonyms = plugin.module.read_synonyms(plugin.options) if hasattr(plugin.module, "read_synonyms") else {}
@@ -77,7 +76,8 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     return pa.Table.from_pylist([i.row for i in ingested], schema=tables.RECORDINGS.arrow())
 
 
-def _ingest_recording(plugin: Plugin, recording: Recording, out: Output) -> _Ingested:
+def _ingest_recording(dataset: DatasetChoice, out: Output, recording: Recording) -> _Ingested:
+    plugin = plugins.load_options(dataset)
     where = f"{plugin.name} {recording.recording_id}"
     labels = check_labels(plugin.module.read_labels(recording, plugin.options), where)
     row: dict[str, Any] = {

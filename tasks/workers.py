@@ -198,21 +198,24 @@ def together(calls: Sequence[Callable[[], R]]) -> list[R]:
         return [future.result() for future in futures]
 
 
-def map_shards(function: Callable[[S], R], shards: Sequence[S]) -> Generator[R, None, None]:
+def map_shards(
+    function: Callable[[S], R], shards: Sequence[S], *, max_group: int = MAX_GROUP
+) -> Generator[R, None, None]:
     """`function` of every shard, in their order, computed where CTLEV_RUNNER says.
 
     Args:
         function: one that can travel: of a module, or a `functools.partial` of such. It depends on the shard alone.
         shards: what to do, such as paths and row numbers; data is better read where it is needed.
+        max_group: shards that travel together at most; fewer where each returns much.
     """
-    if len(shards) < 2 or not _has_several():
+    if not is_spread(len(shards)):
         yield from map(function, shards)
         return
     runner = _shard_runner()
     with ThreadPoolExecutor(runner.count) as threads:
         pending: deque[Future[list[R]]] = deque()
         try:
-            for group in _groups(shards, runner.count):
+            for group in _groups(shards, runner.count, max_group):
                 pending.append(threads.submit(runner.call, _call_each, function, group))
                 if len(pending) > WAITING * runner.count:
                     yield from pending.popleft().result()
@@ -226,11 +229,16 @@ def map_shards(function: Callable[[S], R], shards: Sequence[S]) -> Generator[R, 
     runner.release()
 
 
-def _groups(shards: Sequence[S], count: int) -> Iterator[Sequence[S]]:
+def is_spread(num_shards: int) -> bool:
+    """Does `map_shards` compute so many side by side, rather than here and one when it is asked for?"""
+    return num_shards > 1 and _has_several()
+
+
+def _groups(shards: Sequence[S], count: int, max_group: int = MAX_GROUP) -> Iterator[Sequence[S]]:
     """Consecutive shards, fewer and fewer towards the end, so that all processes end at about the same time."""
     start = 0
     while start < len(shards):
-        size = min(max((len(shards) - start) // (2 * count), 1), MAX_GROUP)
+        size = min(max((len(shards) - start) // (2 * count), 1), max_group)
         yield shards[start : start + size]
         start += size
 
