@@ -148,16 +148,6 @@ class Experiment(Frozen):
             raise ValueError(f"round_to_counts needs encoding 'event_histogram', got {self.encoding.name!r}")
         return self
 
-    @model_validator(mode="after")
-    def _normals_are_not_turned(self) -> Experiment:
-        for part in (self, *self.baselines.values()):
-            if part.condition.name == "normals" and part.generator.options.get("turned_share"):
-                raise ValueError(
-                    "turned_share turns condition images as pictures, and the colours of normal maps are directions "
-                    f"of the camera: it must be 0, got {part.generator.options['turned_share']}"
-                )
-        return self
-
     @property
     def sampling_choice(self) -> SamplingChoice:
         """The generator's sampling options as a plug-in choice."""

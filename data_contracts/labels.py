@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
 
@@ -243,12 +244,14 @@ class Conditions:
         images: [N, H, W, 3] uint8 condition images, or None for the text route.
         motions: what N bodies do, for a generator that films them; else None.
         class_names: N classes, whose names may take turns while a generator learns; else None.
+        made_by: the plug-in that made them, where it is known: the colours of its images may be directions.
     """
 
     prompts: tuple[str, ...]
     images: np.ndarray | None = None
     motions: BodyMotions | None = None
     class_names: tuple[str, ...] | None = None
+    made_by: ConditionChoice | None = None
 
     def __len__(self) -> int:
         return len(self.prompts)
@@ -258,7 +261,7 @@ class Conditions:
         images = None if self.images is None else self.images[rows]
         motions = None if self.motions is None else self.motions.take(rows)
         names = None if self.class_names is None else tuple(np.array(self.class_names, object)[rows])
-        return Conditions(tuple(np.array(self.prompts, object)[rows]), images, motions, names)
+        return Conditions(tuple(np.array(self.prompts, object)[rows]), images, motions, names, self.made_by)
 
 
 @dataclass

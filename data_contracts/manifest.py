@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from data_contracts.config import Frozen
+from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.errors import DataError, TableVersionError
 from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, History, Labels
 from data_contracts.tables import TABLES, TableSchema, check_table
@@ -261,7 +261,17 @@ def conditions_of(manifest: Manifest) -> Conditions:
     motions = None
     if all(f"{array}.npy" in manifest.files for array in arrays.values()):
         motions = BodyMotions(**{name: np.asarray(manifest.array(array)) for name, array in arrays.items()})
-    return Conditions(tuple(manifest.column("prompt")), images, motions, tuple(manifest.column("class_name")))
+    names = tuple(manifest.column("class_name"))
+    return Conditions(tuple(manifest.column("prompt")), images, motions, names, _condition_choice(manifest))
+
+
+def _condition_choice(manifest: Manifest) -> ConditionChoice | None:
+    """The plug-in that made a manifest of conditions, if a stage did."""
+    record = manifest.ref.path / RUN_FILE
+    chosen = json.loads(record.read_text())["arguments"].get("condition") if record.exists() else None
+    if chosen is None:
+        return None
+    return ConditionChoice(name=chosen["plugin"].rpartition("/")[2], options=chosen["options"])
 
 
 def condition_arrays(conditions: Conditions) -> dict[str, np.ndarray]:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from ctlev_core.render.body_normals import given_body_file, render_labelled_normals
@@ -78,3 +79,11 @@ def render(labels: Labels, image_size: tuple[int, int], options: Options, seeds:
         workers=options.workers,
     )
     return Conditions((options.prompt,) * len(labels), images)
+
+
+def turn(images: np.ndarray, turns: np.ndarray, options: Options) -> np.ndarray:
+    """Square maps [N, S, S, 3] uint8 in `turns` [N] quarter turns against the clock, colours turned with the body."""
+    from ctlev_core.render.normals import turn_normal_map
+
+    maps = [turn_normal_map(image, int(count), options.convention) for image, count in zip(images, turns, strict=True)]
+    return np.stack(maps)

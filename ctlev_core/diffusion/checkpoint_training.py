@@ -27,6 +27,7 @@ from ctlev_core.diffusion.ranks import ALONE, Ranks, start_ranks, stop_ranks
 from ctlev_core.diffusion.trainer import TrainingHistory
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from ctlev_core.processes import die_with_parent
+from data_contracts.config import ConditionChoice
 from data_contracts.errors import TrainingError
 from data_contracts.labels import Conditions
 
@@ -73,6 +74,7 @@ def train_checkpoint(
         "out": str(out),
         "work": str(work),
         "class_names": None if class_names is None else list(class_names),
+        "made_by": None if conditions.made_by is None else conditions.made_by.model_dump(),
     }
     count = options.num_processes or int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if count == 1:
@@ -164,7 +166,9 @@ def run_rank(folder: Path) -> None:
         ranks, device = start_ranks(options.device)
         images = np.load(folder / "conditions.npy", mmap_mode="r") if job["with_images"] else None
         frames = np.load(folder / "frames.npy", mmap_mode="r")
-        history = _train(frames, Conditions(tuple(job["prompts"]), images), options, job, ranks, device)
+        made_by = None if job["made_by"] is None else ConditionChoice(**job["made_by"])
+        conditions = Conditions(tuple(job["prompts"]), images, made_by=made_by)
+        history = _train(frames, conditions, options, job, ranks, device)
     except Exception as error:
         (folder / f"error_{rank}.txt").write_text(str(error))
         raise

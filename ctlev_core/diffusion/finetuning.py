@@ -183,7 +183,8 @@ def _identity(
         name: value for name, value in cache_material(options).items() if name in FineTuningOptions.model_fields
     }
     named = None if class_names is None else list(class_names)
-    digest = hashlib.sha256(json.dumps([material, tune, seed, conditions.prompts, named]).encode())
+    made_by = conditions.made_by.model_dump(mode="json") if conditions.made_by and options.turned_share else None
+    digest = hashlib.sha256(json.dumps([material, tune, seed, conditions.prompts, named, made_by]).encode())
     for array in (frames, conditions.images):
         if array is not None:
             digest.update(np.ascontiguousarray(array).data)

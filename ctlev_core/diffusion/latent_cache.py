@@ -10,8 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch
 from ctlev_core.diffusion.prior import Prior, conditions_to_tensor, encode_prompts, images_to_tensor
+from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 
@@ -30,6 +32,7 @@ class LatentCache:
         prompt_rows: for each of N frames the indices into `embeddings` of the prompts it may be shown with.
         conditions: [N, H, W, 3] uint8, or None.
         reversed_condition: the ControlNet expects BGR.
+        made_by: the plug-in of the conditions, where known.
     """
 
     mean: Tensor
@@ -39,6 +42,7 @@ class LatentCache:
     prompt_rows: tuple[Tensor, ...]
     conditions: np.ndarray | None
     reversed_condition: bool
+    made_by: ConditionChoice | None = None
 
     def batch(
         self,
@@ -70,7 +74,7 @@ class LatentCache:
         if self.conditions is not None:
             images = self.conditions[rows]
             if turns is not None:
-                images = np.stack([np.rot90(image, turn) for image, turn in zip(images, turns, strict=True)])
+                images = turn_conditions(images, turns, self.made_by)
             conditions = conditions_to_tensor(images, self.reversed_condition).to(device)
         latents = latents * self.scaling_factor
         return Batch(latents.to(device), self.embeddings[prompts].to(device), conditions)
@@ -113,7 +117,19 @@ def cache_latents(
         prompt_rows=_prompt_rows([position[prompt] for prompt in conditions.prompts], class_names),
         conditions=conditions.images,
         reversed_condition=prior.reversed_condition,
+        made_by=conditions.made_by,
     )
+
+
+def turn_conditions(images: np.ndarray, turns: np.ndarray, made_by: ConditionChoice | None) -> np.ndarray:
+    """Square condition images [B, S, S, 3] in `turns` [B] quarter turns against the clock.
+
+    A plug-in with a function `turn` knows what its colours mean; the others' images are pictures.
+    """
+    plugin = None if made_by is None else plugins.load_options(made_by)
+    if plugin is not None and hasattr(plugin.module, "turn"):
+        return plugin.module.turn(images, turns, plugin.options)
+    return np.stack([np.rot90(image, turn) for image, turn in zip(images, turns, strict=True)])
 
 
 def _prompt_rows(own: Sequence[int], class_names: Sequence[str] | None) -> tuple[Tensor, ...]:

@@ -93,8 +93,7 @@ class FineTuningOptions(TrainingOptions):
         ge=0,
         le=1,
         description="share of frames shown turned by 90, 180 or 270 degrees, with their condition images, as a rolled "
-        "camera would see them: bodies lie that only stood. Not for normal maps, whose colours are directions of the "
-        "camera",
+        "camera would see them: bodies lie that only stood",
     )
     num_validation: int = Field(
         default=64, ge=0, description="frames held back for the validation loss, a tenth at most"

@@ -181,6 +181,35 @@ def normal_map(normals: np.ndarray, convention: str) -> np.ndarray:
     return colours
 
 
+def turn_normal_map(image: np.ndarray, turns: int, convention: str) -> np.ndarray:
+    """A normal map as a camera that is rolled by quarter turns sees it, with the vectors turned as well.
+
+    Args:
+        image: [H, W, 3] uint8, as `normal_map` makes them.
+        turns: quarter turns of the picture against the clock, as `numpy.rot90` counts them.
+        convention: of the colours.
+    Returns:
+        [H, W, 3] or [W, H, 3] uint8; from rounding, a unit off the map of the turned body at most.
+    Raises:
+        ValueError: unknown convention.
+    """
+    _check_convention(convention)
+    axes, factors, offset, background = _COLOURS[convention]
+    across, down = axes.index(0), axes.index(1)
+    turned = np.rot90(image, turns).copy()
+    of_body = (turned != np.array(background, np.uint8)).any(axis=2)
+    mirror = int(2 * offset) - 1  # what is cut to k lay between k and k + 1
+    for _ in range(turns % 4):
+        x, y = turned[..., across].astype(np.int16), turned[..., down].astype(np.int16)
+        if factors[across] == factors[down]:
+            new_x, new_y = y, mirror - x
+        else:
+            new_x, new_y = mirror - y, x
+        turned[..., across] = np.where(of_body, np.clip(new_x, 0, 255), turned[..., across])
+        turned[..., down] = np.where(of_body, np.clip(new_y, 0, 255), turned[..., down])
+    return turned
+
+
 @numba.njit(cache=True, nogil=True)
 def _colour(normals, axes, factors, offset, background, colours):
     """Channel k of `colours` is factors[k] * component axes[k] + offset, cut to whole numbers in 0 .. 255."""

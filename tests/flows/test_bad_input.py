@@ -25,7 +25,7 @@ def refused(home, *arguments, preset="folder"):
     [
         (
             ("--preset", "nonesuch"),
-            "unknown preset 'nonesuch'; known: ablations, aist, all_routes, amass, body, cdehp, demo, dhp19, event_hpe, ",
+            "unknown preset 'nonesuch'; known: ablations, aist, all_routes, amass, body, cdehp, demo, dhp19, ",
         ),
         (
             ("--set", "dataset.options.intensity_rate_hz=null"),

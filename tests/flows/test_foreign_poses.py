@@ -74,8 +74,6 @@ def test_prepare_dataset(preset, write, condition, tmp_path):
         "num_synthetic=6",
         f"condition.name={condition}",
     )
-    if condition == "normals":
-        settings = (*settings, "generator.options.turned_share=0")
     if smpl_file:
         body = smpl(tmp_path / "basicModel_neutral_lbs_10_207_0_v1.0.0.pkl")
         settings = (*settings, f"condition.options={{body: {body}}}")

@@ -27,8 +27,6 @@ def test_prepare_dataset(condition, tmp_path):
         f"condition.name={condition}",
         f"num_synthetic={4 * len(CLASSES)}",
     )
-    if condition == "normals":
-        settings = (*settings, "generator.options.turned_share=0")
     options = [word for setting in settings for word in ("--set", setting)]
     finished = run_script("prepare_dataset", "--preset", "amass", *options, home=tmp_path)
     assert finished.status == 0, finished.errors

@@ -7,7 +7,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.render.normals import CONVENTIONS, normal_map, render_normal_maps, render_normals
+from ctlev_core.render.normals import CONVENTIONS, normal_map, render_normal_maps, render_normals, turn_normal_map
 from ctlev_core.render.rasteriser import NEAR_M
 from data_contracts.errors import DataError
 
@@ -288,3 +288,34 @@ def test_the_unreversed_convention_is_the_reversed_one_reversed():
     normals[0, :2] = 0.0
     reversed_by_config = normal_map(normals, "controlnet_unreversed")[..., ::-1]
     np.testing.assert_array_equal(reversed_by_config, normal_map(normals, "controlnet"))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_turned_maps_are_maps_of_turned_normals(convention, turns):
+    rng = np.random.default_rng(turns)
+    normals = rng.normal(size=(1, 16, 16, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals[0, :4, 3:9] = 0  # background
+    turned = np.rot90(normals, turns, axes=(1, 2)).copy()
+    for _ in range(turns):  # what points right points up, what points down points right
+        turned[..., 0], turned[..., 1] = turned[..., 1].copy(), -turned[..., 0]
+    expected = normal_map(turned, convention)[0].astype(int)
+    found = turn_normal_map(normal_map(normals, convention)[0], turns, convention)
+    assert np.abs(found - expected).max() <= 1
+    background = ~turned[0].any(axis=-1)
+    np.testing.assert_array_equal(found[background], expected[background])
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_a_turned_map_is_that_of_a_rolled_camera(convention):
+    size, intrinsics = (64, 64), np.array([[60.0, 60.0, 32.0, 32.0]])
+    vertices, faces = ball(radius=0.3, centre=(0.2, 0.35, 2.0))
+    rolled = vertices[:, [1, 0, 2]] * np.array([1, -1, 1], np.float32)  # once against the clock on the screen
+    still, expected = (
+        render_normal_maps(v[None], faces, intrinsics, size, convention)[0].astype(int) for v in (vertices, rolled)
+    )
+    found = turn_normal_map(still.astype(np.uint8), 1, convention).astype(int)
+    body = (found != found[0, 0]).any(axis=2) & (expected != expected[0, 0]).any(axis=2)
+    assert body.sum() > 200 and np.abs(np.rot90(still) - expected)[body].max() > 100
+    assert np.abs(found - expected)[body].max() <= 1

@@ -147,11 +147,6 @@ def test_only_event_histograms_can_be_rounded_to_counts():
         smoke("round_to_counts=true", "encoding={name: voxel_grid}")
 
 
-def test_normal_maps_are_not_turned():
-    with pytest.raises((DataError, ValidationError, ValueError), match="turned_share turns condition images"):
-        smoke("condition={name: normals}", "generator.options.turned_share=0.2")
-
-
 def test_groups_by_origin_part_the_test_rows():
     names = ["walk", "jump", "crawl", "walk", "jump"]
     data = SimpleNamespace(column=lambda name: ["walk", "walk", "sit"], rows_where=lambda split: np.array([0, 2]))

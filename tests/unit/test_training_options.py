@@ -14,9 +14,11 @@ from tiny_prior import make_data, make_prior, shared_prior
 from ctlev_core.diffusion import acceleration, finetuning, trainer, training
 from ctlev_core.diffusion.denoising import generator_for
 from ctlev_core.diffusion.finetuning import draw_turns, fine_tune, split_rows
-from ctlev_core.diffusion.latent_cache import LatentCache, cache_latents
+from ctlev_core.diffusion.latent_cache import LatentCache, cache_latents, turn_conditions
 from ctlev_core.diffusion.muon import MATRIX_RATE, is_matrix
 from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.render.normals import turn_normal_map
+from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import Conditions
 
@@ -247,6 +249,18 @@ def test_turned_frames_are_those_of_turned_pictures():
         torch.testing.assert_close(batch.latents[position], expected.latents[0], rtol=1e-5, atol=1e-5)
         assert torch.equal(batch.conditions[position], expected.conditions[0])
         assert torch.equal(batch.embeddings[position], expected.embeddings[0])
+
+
+def test_the_colours_of_normal_maps_turn_with_the_body():
+    images = np.random.default_rng(0).integers(0, 256, (4, 8, 8, 3), np.uint8)
+    turns = np.array([1, 0, 3, 2])
+    made_by = ConditionChoice(name="normals", options={"convention": "rgb"})
+    expected = np.stack([turn_normal_map(image, turn, "rgb") for image, turn in zip(images, turns, strict=True)])
+    np.testing.assert_array_equal(turn_conditions(images, turns, made_by), expected)
+    pictures = np.stack([np.rot90(image, turn) for image, turn in zip(images, turns, strict=True)])
+    for choice in (None, ConditionChoice(name="skeleton")):
+        np.testing.assert_array_equal(turn_conditions(images, turns, choice), pictures)
+    assert not np.array_equal(expected, pictures)
 
 
 def test_turns_have_their_share_and_a_stream_of_their_own():
