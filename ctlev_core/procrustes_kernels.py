@@ -24,20 +24,13 @@ def align_rows(
 
     Points whose spread is at most `relative_size` of their distance from the origin coincide.
     """
-    product, turned, rotation = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    centre, centre_target = np.zeros(3), np.zeros(3)
+    turn, centre, centre_target = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for row in range(len(points)):
-        count = _centres(points[row], target[row], known[row], centre, centre_target)
-        if count == 0:
+        if not _find_similarity(points[row], target[row], known[row], relative_size, turn, centre, centre_target):
             aligned[row] = points[row]
             continue
-        size = _product(points[row], target[row], known[row], centre, centre_target, product)
-        farthest = max(abs(centre[0]), abs(centre[1]), abs(centre[2]))
-        scale = 0.0
-        if size > relative_size * farthest:
-            scale = _best_rotation(product, turned, rotation) / size
         for axis in range(3):
-            a, b, c = scale * rotation[0, axis], scale * rotation[1, axis], scale * rotation[2, axis]
+            a, b, c = turn[axis]
             for joint in range(points.shape[1]):
                 x = points[row, joint, 0] - centre[0]
                 y = points[row, joint, 1] - centre[1]
@@ -46,16 +39,80 @@ def align_rows(
 
 
 @numba.njit(cache=True, nogil=True)
-def mean_distances(points: np.ndarray, target: np.ndarray, shifts: np.ndarray, means: np.ndarray) -> None:
-    """Mean distances of `points` [N, V, 3], moved by `shifts` [N, 3], from `target` [N, V, 3], into `means` [N]."""
+def mean_distances(
+    points: np.ndarray,
+    target: np.ndarray,
+    shifts: np.ndarray,
+    with_similarity: bool,
+    relative_size: float,
+    means: np.ndarray,
+) -> None:
+    """Mean distances of `points` [N, V, 3] from `target` [N, V, 3], all known, into `means` [N, S + 1].
+
+    The first S are those of points moved by `shifts` [N, S, 3], the last that of points brought onto the target as by
+    `align_rows`, where it is asked for: moved points are not kept, for writing many takes longer than moving them.
+    """
+    count = points.shape[1]
+    turn, centre, centre_target = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    known = np.ones(count, np.bool_)
     for row in range(len(points)):
-        total = 0.0
-        for point in range(points.shape[1]):
-            x = points[row, point, 0] - target[row, point, 0] + shifts[row, 0]
-            y = points[row, point, 1] - target[row, point, 1] + shifts[row, 1]
-            z = points[row, point, 2] - target[row, point, 2] + shifts[row, 2]
-            total += np.sqrt(x * x + y * y + z * z)
-        means[row] = total / points.shape[1]
+        for number in range(shifts.shape[1]):
+            a, b, c = shifts[row, number]
+            total = 0.0
+            for point in range(count):
+                x = points[row, point, 0] - target[row, point, 0] + a
+                y = points[row, point, 1] - target[row, point, 1] + b
+                z = points[row, point, 2] - target[row, point, 2] + c
+                total += np.sqrt(x * x + y * y + z * z)
+            means[row, number] = total / count
+        if with_similarity:
+            _find_similarity(points[row], target[row], known, relative_size, turn, centre, centre_target)
+            total = _sum_of_distances(points[row], target[row], turn, centre, centre_target)
+            means[row, shifts.shape[1]] = total / count
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_of_distances(
+    points: np.ndarray, target: np.ndarray, turn: np.ndarray, centre: np.ndarray, centre_target: np.ndarray
+) -> float:
+    """Of `points` [V, 3], moved from `centre` to `centre_target` and turned, from `target` [V, 3]."""
+    xx, xy, xz = turn[0]
+    yx, yy, yz = turn[1]
+    zx, zy, zz = turn[2]
+    # One constant an axis: turned points, less the turned centre, plus that of the target.
+    a, b, c = centre_target - turn @ centre
+    total = 0.0
+    for point in range(len(points)):
+        u, v, w = points[point]
+        x = xx * u + xy * v + xz * w + (a - target[point, 0])
+        y = yx * u + yy * v + yz * w + (b - target[point, 1])
+        z = zx * u + zy * v + zz * w + (c - target[point, 2])
+        total += np.sqrt(x * x + y * y + z * z)
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_similarity(
+    points: np.ndarray,
+    target: np.ndarray,
+    known: np.ndarray,
+    relative_size: float,
+    turn: np.ndarray,
+    centre: np.ndarray,
+    centre_target: np.ndarray,
+) -> bool:
+    """The best: turn (point - centre) + centre_target, the scale within `turn`; False where nothing is known."""
+    if _centres(points, target, known, centre, centre_target) == 0:
+        return False
+    product, turned = np.zeros((3, 3)), np.zeros((3, 3))
+    size = _product(points, target, known, centre, centre_target, product)
+    farthest = max(abs(centre[0]), abs(centre[1]), abs(centre[2]))
+    rotation = np.zeros((3, 3))
+    scale = 0.0
+    if size > relative_size * farthest:
+        scale = _best_rotation(product, turned, rotation) / size
+    turn[:] = scale * rotation.T
+    return True
 
 
 @numba.njit(cache=True, nogil=True)
