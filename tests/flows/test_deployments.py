@@ -135,11 +135,14 @@ QUICK = (
 )  # fmt: skip
 
 
-def schedule_once(service, deployment, moment, parameters):
-    """A schedule that fires one time, at `moment`, seen and started by Prefect's own scheduler."""
+def schedule_once(service, deployment, home, times=1):
+    """Schedules that each fire once, all at the same moment, when Prefect's scheduler has had time to see them."""
+    moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(seconds=45)
     rule = f"DTSTART:{moment:%Y%m%dT%H%M%SZ}\nRRULE:FREQ=DAILY;COUNT=1"
-    schedule = {"schedule": {"rrule": rule, "timezone": "UTC"}, "active": True, "parameters": parameters}
-    service.api(f"deployments/{deployment}/schedules", [schedule])
+    schedule = {"schedule": {"rrule": rule, "timezone": "UTC"}, "active": True}
+    schedule["parameters"] = smoke_parameters(home, QUICK)
+    for _ in range(times):
+        service.api(f"deployments/{deployment}/schedules", [schedule])
 
 
 def scheduled_runs(service, deployment, count, timeout):
@@ -160,17 +163,14 @@ def test_scheduled_regenerations_do_not_overlap_and_a_killed_one_is_gone_on_with
     """Two schedules fire at the same moment, a third later; the worker of a fourth run is killed while it samples."""
     deployment = service.api("deployments/name/regenerate/default")["id"]
     folder = published_folder(tmp_path, "smoke")
-    moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(seconds=30)
-    for _ in range(2):
-        schedule_once(service, deployment, moment, smoke_parameters(tmp_path, QUICK))
+    schedule_once(service, deployment, tmp_path, times=2)
     runs = scheduled_runs(service, deployment, 2, timeout=900)
     ran = [run for run in runs if run["state"]["type"] == "COMPLETED"]
     refused = [run for run in runs if run["state"]["type"] == "CANCELLED"]
     assert len(ran) + len(refused) == 2 and ran, [run["state"] for run in runs]
     assert all("concurrency limit" in run["state"]["message"] and run["run_count"] == 0 for run in refused), refused
 
-    moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(seconds=15)
-    schedule_once(service, deployment, moment, smoke_parameters(tmp_path, QUICK))
+    schedule_once(service, deployment, tmp_path)
     ran = [run for run in scheduled_runs(service, deployment, 3, timeout=900) if run["state"]["type"] == "COMPLETED"]
     times = [(parsed(run["start_time"]), parsed(run["end_time"])) for run in ran]
     assert all(begins < ends for begins, ends in times)
