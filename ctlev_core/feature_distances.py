@@ -22,9 +22,32 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from ctlev_core.intervals import MIN_RECORDINGS
 from ctlev_core.plugins import Plugin
+from data_contracts.tables import Column, TableSchema
+
+DISTANCE_ESTIMATES = TableSchema(
+    "distance_estimates",
+    1,
+    None,
+    (
+        Column("setting", pa.string(), "which frames are compared with the real training frames"),
+        Column("metric", pa.string(), "score, with the extractor"),
+        Column("value", pa.float64(), "of all frames"),
+        Column("low", pa.float64(), "lower end of its 95 % interval, from halves by recording", nullable=True),
+        Column("high", pa.float64(), "upper end", nullable=True),
+        Column("halved", pa.float64(), "mean over halves of both sets; compare with the floor", nullable=True),
+        Column("floor", pa.float64(), "mean between the halves of the real training frames", nullable=True),
+        Column("floor_low", pa.float64(), "central 95 % of the floor over the halvings, lower end", nullable=True),
+        Column("floor_high", pa.float64(), "upper end", nullable=True),
+        Column("num_predicted", pa.int64(), "frames compared", minimum=1),
+        Column("num_target", pa.int64(), "real training frames", minimum=1),
+        Column("num_features", pa.int64(), "features of a frame", minimum=1),
+    ),
+)
+"""What a distance has to be read with; missing where there are too few recordings to tell."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +142,15 @@ def estimate_distances(
             num_features=predicted.shape[1],
         )
     return found
+
+
+def estimates_table(setting: str, estimates: Mapping[str, DistanceEstimate]) -> pa.Table:
+    """Estimates by their names as rows of the table `distance_estimates`."""
+    columns = {"setting": pa.array([setting] * len(estimates)), "metric": pa.array(list(estimates), pa.string())}
+    for column in DISTANCE_ESTIMATES.columns[len(columns) :]:
+        values = np.array([getattr(estimate, column.name) for estimate in estimates.values()])
+        columns[column.name] = pa.array(values, column.type, from_pandas=True)
+    return pa.table(columns)
 
 
 def name_distance(plugin: Plugin, folder: Path, digest: str, score: str) -> str:

@@ -11,7 +11,13 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.feature_distances import estimate_distances, name_distance
+from ctlev_core.feature_distances import (
+    DISTANCE_ESTIMATES,
+    DistanceEstimate,
+    estimate_distances,
+    estimates_table,
+    name_distance,
+)
 from ctlev_core.frame_sequences import name_recordings
 from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
 from ctlev_core.score_groups import Group, class_groups, origin_groups, subject_groups
@@ -228,7 +234,7 @@ def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manife
             logger.warning(text, data.ref.path, shared[0], where)
 
 
-@partial(_DistanceScores, version=4, schema=tables.SCORES, raw_files=None)
+@partial(_DistanceScores, version=5, schema=tables.SCORES, raw_files=None)
 def score_distance(
     out: Output,
     extractor: Manifest,
@@ -246,7 +252,8 @@ def score_distance(
     A score is named after the classifier trained on real events whose features are compared, or as a ready-made
     extractor asks: `fid` is that of the verified network alone. Values depend on the number of samples: compare rows of
     equal `num_samples` only, and read them against the row of held-out real frames. Intervals come from halves by
-    recording, for a bootstrap is biased. `seed` is that of the generator.
+    recording, for a bootstrap is biased. `seed` is that of the generator. Beside the scores lies the table
+    `distance_estimates`: the number of features, and what real training frames score against one another.
     """
     plugin = plugins.load_options(downstream)
     folder = extractor.ref.path / "model"
@@ -257,7 +264,7 @@ def score_distance(
             raise DataError(f"{data.ref.path}: no rows in split {split if data is other else 'train'!r} to compare")
         features.append(plugin.module.features(folder, np.asarray(data.array("frames")[rows])))
         groups.append(np.array(data.column("recording_id"))[rows])
-    found = []
+    named: dict[str, DistanceEstimate] = {}
     for choice in distances:
         metric = plugins.load_options(choice)
         estimates = estimate_distances(
@@ -266,20 +273,23 @@ def score_distance(
             predicted_groups=groups[0],
             target_groups=groups[1],
         )
-        for name, estimate in estimates.items():
-            row = {
-                "task": "distance",
-                "setting": setting,
-                "seed": seed,
-                "group": "all",
-                "metric": name_distance(plugin, folder, extractor.ref.digest, name),
-                "value": estimate.value,
-                "low": None if np.isnan(estimate.low) else estimate.low,
-                "high": None if np.isnan(estimate.high) else estimate.high,
-                "num_samples": estimate.num_predicted,
-                "num_train": estimate.num_target,
-                "model_digest": extractor.ref.digest,
-                "data_digest": other.ref.digest,
-            }
-            found.append(row)
+        named |= {name_distance(plugin, folder, extractor.ref.digest, name): one for name, one in estimates.items()}
+    out.write_table(estimates_table(setting, named), DISTANCE_ESTIMATES)
+    found = [
+        {
+            "task": "distance",
+            "setting": setting,
+            "seed": seed,
+            "group": "all",
+            "metric": name,
+            "value": estimate.value,
+            "low": None if np.isnan(estimate.low) else estimate.low,
+            "high": None if np.isnan(estimate.high) else estimate.high,
+            "num_samples": estimate.num_predicted,
+            "num_train": estimate.num_target,
+            "model_digest": extractor.ref.digest,
+            "data_digest": other.ref.digest,
+        }
+        for name, estimate in named.items()
+    ]
     return pa.Table.from_pylist(found, schema=tables.SCORES.arrow())

@@ -1,15 +1,19 @@
 """KID, FD-infinity, precision and coverage against slow loops and closed forms; intervals by counting."""
 
+import math
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.feature_distances import estimate_distances
+from ctlev_core.feature_distances import DISTANCE_ESTIMATES, estimate_distances, estimates_table
 from ctlev_core.frechet import frechet_distance
 from ctlev_core.kernel_distance import kernel_distance
 from ctlev_core.metrics import fd_infinity, frechet, kid, prdc
 from ctlev_core.neighbour_scores import neighbour_scores
+from data_contracts.tables import check_table
 
 
 def normal(seed, count, width=6, scale=1.0, offset=0.0):
@@ -203,6 +207,18 @@ def test_floor_and_halves_say_what_small_sets_do():
     assert far.floor == same.floor and far.halved > 5 * far.floor
     assert (same.num_predicted, same.num_target, same.num_features) == (100, 100, 6)
     assert estimate_distances(score, normal(13, 100), normal(14, 100))["fd"] == same
+
+
+def test_estimates_become_rows_with_what_they_have_to_be_read_with():
+    full = estimate_distances(score, normal(13, 100), normal(14, 90))
+    alone = estimate_distances(score, normal(13, 4), normal(14, 3))
+    table = estimates_table("made", {"x": full["fd"], "y": alone["fd"]})
+    rows = check_table(table, DISTANCE_ESTIMATES, "here").to_pylist()
+    expected = [
+        {"setting": "made", "metric": name, **{k: None if math.isnan(v) else v for k, v in asdict(found["fd"]).items()}}
+        for name, found in (("x", full), ("y", alone))
+    ]
+    assert rows == expected and rows[1]["floor"] is None and (rows[0]["num_target"], rows[0]["num_features"]) == (90, 6)
 
 
 def test_too_few_recordings_leave_the_value_alone():

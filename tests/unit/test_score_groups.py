@@ -1,9 +1,10 @@
-"""Scores by class and by subject, and what may not be both learnt from and tested on."""
+"""Scores by class and by subject, what may not be both learnt from and tested on, and what lies beside distances."""
 
 import logging
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from ctlev_core.downstream import classifier
@@ -13,7 +14,7 @@ from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, ManifestRef, label_columns, read_manifest, write_manifest
-from tasks.evaluate import _refuse_overlap, score_model
+from tasks.evaluate import _refuse_overlap, score_distance, score_model
 from tasks.stage import Output
 
 
@@ -120,3 +121,24 @@ def test_a_subject_of_the_same_name_in_another_set_is_a_warning(tmp_path, score,
     caplog.clear()
     score(data, data)
     assert not caplog.records
+
+
+def test_a_distance_lies_beside_what_real_frames_score_against_one_another(tmp_path, monkeypatch):
+    data = frame_set(
+        tmp_path / "real", [(str(r), "ann", "test" if r % 2 else "train") for r in range(14) for _ in "abc"]
+    )
+    monkeypatch.setattr(
+        classifier, "features", lambda folder, frames: np.random.default_rng(len(frames)).normal(size=(len(frames), 3))
+    )
+    (tmp_path / "out").mkdir()
+    table = score_distance.function(
+        Output(tmp_path / "out", tmp_path), data, data, data, downstream=DownstreamChoice(name="classifier"),
+        distances=[MetricChoice(name="frechet"), MetricChoice(name="kid")], setting="held-out", split="test", seed=0,
+    )  # fmt: skip
+    beside = pq.read_table(tmp_path / "out" / "distance_estimates.parquet").to_pylist()
+    same = ("setting", "metric", "value", "low", "high")
+    assert [[row[name] for name in same] for row in beside] == [
+        [row[name] for name in same] for row in table.to_pylist()
+    ]
+    assert all(row["num_features"] == 3 and row["num_target"] == 21 for row in beside)
+    assert all(row["floor_low"] < row["floor"] < row["floor_high"] for row in beside)
