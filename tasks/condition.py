@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -28,15 +29,18 @@ from ctlev_core.pose_choice import balanced_choice, surrounded
 from ctlev_core.row_seeds import row_seeds
 from ctlev_core.windows import spread
 from data_contracts import tables
+from data_contracts.arrays import ArrayWriter
 from data_contracts.config import ConditionChoice, EncodingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
 from data_contracts.experiment import PoseOrder, PoseViews
-from data_contracts.labels import Labels
+from data_contracts.labels import BodyMotions, Labels
 from data_contracts.manifest import Manifest, concat_labels, condition_arrays, label_columns, labels_of
 from tasks.stage import Output, input_files_of, stage
 
 VIEW_STREAM = 30
+BLOCK_ROWS = 256
+"""Rows rendered at a time; pictures of 512 x 512 px take 0.2 GiB."""
 
 
 @stage(version=4, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
@@ -192,25 +196,34 @@ def _render(
     seed: int,
 ) -> pa.Table:
     plugin = _load_condition(condition, recordings)
-    labels = rows.labels
-    seeds = row_seeds(seed, len(labels))
-    asked = (labels, image_size_of(frames), plugin.options, seeds)
+    labels, seeds = rows.labels, row_seeds(seed, len(rows.labels))
     needs = getattr(plugin.module, "NEEDS", None)
+    further: list[np.ndarray | BodyMotions] = []
     if needs == "intensity":
-        rendered = plugin.module.render(*asked, read_pairs(rows, frames, encoding))
+        further = [read_pairs(rows, frames, encoding)]
     elif needs == "motion":
-        rendered = plugin.module.render(*asked, read_motions(rows, recordings, frames, encoding))
-    else:
-        rendered = plugin.module.render(*asked)
-    for name, array in condition_arrays(rendered).items():
-        out.write_array(name, array)
+        further = [read_motions(rows, recordings, frames, encoding)]
+    prompts: list[str] = []
+    block = max(len(labels), 1) if needs else BLOCK_ROWS
+    with ExitStack() as opened:
+        written: dict[str, ArrayWriter] = {}
+        for start in range(0, max(len(labels), 1), block):
+            some = np.arange(start, min(start + block, len(labels)))
+            part = labels if needs else labels.take(some)
+            own = seeds[start : start + block]
+            rendered = plugin.module.render(part, image_size_of(frames), plugin.options, own, *further)
+            prompts += rendered.prompts
+            for name, array in condition_arrays(rendered).items():
+                if name not in written:
+                    written[name] = opened.enter_context(out.open_array(name))
+                written[name].append(array)
     return pa.table(
         {
             "sample_id": sample_ids,
             "source_id": rows.source_ids,
             "subject": rows.subjects,
             "class_name": pa.array(labels.class_names, pa.string()),
-            "prompt": pa.array(rendered.prompts, pa.string()),
+            "prompt": pa.array(prompts, pa.string()),
             "t_start_us": rows.t_start_us,
             "t_end_us": rows.t_end_us,
             **label_columns(labels),

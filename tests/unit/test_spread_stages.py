@@ -6,9 +6,10 @@ import json
 import pytest
 
 from data_contracts.config import ConditionChoice, DatasetChoice, EncodingChoice, SamplingChoice, Windows
+from data_contracts.manifest import read_manifest
 from tasks import encode as encode_stage
 from tasks import runners
-from tasks.condition import condition_samples
+from tasks.condition import condition_frames, condition_samples
 from tasks.encode import encode
 from tasks.ingest import ingest
 from tasks.sample import simulate
@@ -103,6 +104,22 @@ def test_images_that_wait_in_files_are_the_same_and_leave_nothing(alone, tmp_pat
     monkeypatch.setattr(encode_stage, "MAX_WINDOWS", 2)
     assert make(monkeypatch, tmp_path, "threads", 2) == alone
     assert len(put_away) == 12, "three windows of six recordings, in twos"
+
+
+@pytest.mark.parametrize("name", ["skeleton", "normals", "text"])
+def test_conditions_rendered_some_rows_at_a_time_are_the_same(tmp_path, monkeypatch, name):
+    monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
+    recordings = run(ingest, dataset=STUDIO)
+    frames = run(encode, recordings=recordings, encoding=COUNTED, windows=WINDOWS)
+    given = {"condition": ConditionChoice(name=name), "encoding": COUNTED, "seed": 3}
+    found = set()
+    for rows in (1, 5, 1000):
+        monkeypatch.setattr("tasks.condition.BLOCK_ROWS", rows)
+        monkeypatch.setattr(condition_frames, "version", 1000 + rows)  # not the cached artefact
+        made = read_manifest(run(condition_frames, recordings=recordings, frames=frames, **given), full=True)
+        assert len(made) == 12 and ("images.npy" in made.files) == (name != "text")
+        found.add(made.ref.digest)
+    assert len(found) == 1
 
 
 @pytest.mark.parametrize("kind", SPREAD)
