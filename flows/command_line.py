@@ -14,12 +14,13 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from ctlev_core import plugins
 from ctlev_core.plugins import PluginError, validate_options
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.experiment import Experiment
 from data_contracts.study import Study
 from flows import local_server
+from flows.costs import HOW_ESTIMATED, estimate_costs
+from flows.inputs import InputsMissing, check_inputs
 from tasks.stage import PlannedStage, in_one_run, planning
 
 X = TypeVar("X", bound=Experiment)
@@ -43,73 +44,8 @@ def load_experiment(preset: str, overrides: list[str], model: type[X] = Experime
         PluginError: unknown preset, option or plug-in, a wrong value, or parts that do not go together.
     """
     experiment = load_preset(model, PRESETS, preset, overrides)
-    _check_parts(experiment)
+    check_inputs(experiment)
     return experiment
-
-
-def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
-    """The experiment a preset describes, or the study of several where it has `experiments`.
-
-    Args:
-        preset: as `load_preset` takes it. Each of a study's `experiments` `extends` a preset, changes whole options,
-            and single ones under `set`, as `key=value`.
-        overrides: likewise; those of a study begin with `experiments.NAME.`.
-
-    Raises:
-        PluginError: as `load_experiment`.
-    """
-    values = _read_preset(PRESETS, preset, ())
-    parts = values.get("experiments")
-    if parts is None:
-        return load_experiment(preset, overrides)
-    where = f"preset {preset!r}"
-    if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
-        raise PluginError(f"{where}: experiments must be a mapping of names to options, got {parts!r}")
-    values["experiments"] = {name: _part(dict(part), f"{where}, experiments.{name}") for name, part in parts.items()}
-    for override in overrides:
-        _apply(values, override)
-    study = validate_options(Study, values, where)
-    for experiment in study.experiments.values():
-        _check_parts(experiment)
-    return study
-
-
-def _part(part: dict[str, Any], where: str) -> dict[str, Any]:
-    """The options of one experiment of a study."""
-    extended, changes = part.pop("extends", None), part.pop("set", [])
-    if not isinstance(changes, list) or not all(isinstance(change, str) for change in changes):
-        raise PluginError(f"{where}: set must be a list of texts key=value, got {changes!r}")
-    values = ({} if extended is None else _read_preset(PRESETS, str(extended), (where,))) | part
-    for change in changes:
-        _apply(values, change)
-    return values
-
-
-def _check_parts(experiment: Experiment) -> None:
-    """Raise `PluginError` for a plug-in that is missing, whose options are wrong, or that lacks what it needs."""
-    for choice in experiment.choices:
-        plugins.load_options(choice)
-    _check_intensity(experiment)
-
-
-def _check_intensity(experiment: Experiment) -> None:
-    """Raise `PluginError` where a condition needs intensity frames and a dataset has none, before anything is read."""
-    conditions = {"condition": experiment.condition}
-    conditions |= {f"baselines.{name}.condition": baseline.condition for name, baseline in experiment.baselines.items()}
-    needing = [
-        name
-        for name, choice in conditions.items()
-        if getattr(plugins.load("conditions", choice.name), "NEEDS", "") == "intensity"
-    ]
-    for dataset in (experiment.dataset, experiment.poses) if needing else ():
-        if dataset is None:
-            continue
-        plugin = plugins.load_options(dataset)
-        if not any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options)):
-            raise PluginError(
-                f"{', '.join(needing)}: needs intensity frames, "
-                f"and dataset {dataset.name!r} with these options has none"
-            )
 
 
 def load_preset(model: type[BaseModel], folder: Path, preset: str, overrides: list[str]) -> Any:
@@ -121,15 +57,15 @@ def load_preset(model: type[BaseModel], folder: Path, preset: str, overrides: li
         preset: name of a bundled preset, or path of a YAML file.
         overrides: dotted names, for example `encoding.options.polarity=false`; values are YAML.
     """
-    values = _read_preset(folder, preset, ())
+    values = read_preset(folder, preset)
     if "experiments" in values:
         raise PluginError(f"preset {preset!r} is a study of several experiments, which only full_experiment runs")
     for override in overrides:
-        _apply(values, override)
+        apply_override(values, override)
     return validate_options(model, values, f"preset {preset!r}")
 
 
-def _read_preset(folder: Path, preset: str, heirs: tuple[str, ...]) -> dict[str, Any]:
+def read_preset(folder: Path, preset: str, heirs: tuple[str, ...] = ()) -> dict[str, Any]:
     """The options of a preset over those of the one it `extends`; each option at the top replaces the other whole."""
     path = Path(preset) if preset.endswith((".yaml", ".yml")) else folder / f"{preset}.yaml"
     if not path.is_file():
@@ -144,10 +80,16 @@ def _read_preset(folder: Path, preset: str, heirs: tuple[str, ...]) -> dict[str,
         return values
     if not isinstance(extended, str) or extended in (*heirs, preset):
         raise PluginError(f"{path}: extends must name another preset, got {extended!r}")
-    return _read_preset(folder, extended, (*heirs, preset)) | values
+    return read_preset(folder, extended, (*heirs, preset)) | values
 
 
-def _apply(values: dict[str, Any], override: str) -> None:
+def apply_override(values: dict[str, Any], override: str) -> None:
+    """Change one option in place.
+
+    Args:
+        values: options by name, groups as mappings.
+        override: `dotted.name=value`; the value is YAML.
+    """
     name, separator, text = override.partition("=")
     if not separator or not name:
         raise PluginError(f"--set expects key=value, got {override!r}")
@@ -169,6 +111,18 @@ def print_plan(rows: list[PlannedStage]) -> None:
     for row in rows:
         print(f"{'cached' if row.cached else 'to run':7} {row.label:{width}}  {row.key}")
     print(f"{sum(row.cached for row in rows)} of {len(rows)} stages are cached")
+
+
+def print_costs(asked: Any) -> None:
+    """What generators of Stable Diffusion's size would take; nothing for the bundled prior, a matter of minutes."""
+    if not isinstance(asked, Experiment | Study):
+        return
+    parts = asked.experiments if isinstance(asked, Study) else {asked.name: asked}
+    found = {name: cost for name, part in parts.items() if (cost := estimate_costs(part)) is not None}
+    if found:
+        print(HOW_ESTIMATED)
+    for name, cost in found.items():
+        print(f"  {name:{max(map(len, found))}}  {cost}")
 
 
 def main(
@@ -202,12 +156,15 @@ def main(
             flow.fn(options)
         if arguments.dry_run:
             print_plan(rows)
+            print_costs(options)
             return 0
         use_cores(rows)
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
             result = flow(options)
     except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
+        if isinstance(error, InputsMissing) and arguments.dry_run:
+            print_costs(error.asked)
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

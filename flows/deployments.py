@@ -29,8 +29,9 @@ from flows import regenerate as of_regenerate
 from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
-from flows.command_line import PRESETS, check_home, load_experiment, load_preset, load_study, use_cores
+from flows.command_line import PRESETS, check_home, load_experiment, load_preset, use_cores
 from flows.settings import HOME, flow
+from flows.studies import load_study
 from tasks.contact_sheet import publish_contact_sheet
 from tasks.export_events import publish_events
 from tasks.report import publish_report

@@ -12,11 +12,12 @@ from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from data_contracts.study import Study
 from flows.baselines import baselines
-from flows.command_line import load_study, main
+from flows.command_line import main
 from flows.evaluate import evaluate
 from flows.export_events import export_streams
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
+from flows.studies import load_study
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
 from tasks.copy_check import copy_check

@@ -18,6 +18,7 @@ from pydantic import Field
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.config import RUN_SETTING
+from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History
 
 VERSION = 1
@@ -47,9 +48,17 @@ def prior_folders(options: Options) -> list[Path]:
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.prior_files import prior_places
+    from ctlev_core.diffusion.prior_files import find_controlnet, prior_places
 
-    return prior_places(options.prior, controlnet=options.controlnet, needs_controlnet=True)
+    try:
+        return prior_places(options.prior, controlnet=options.controlnet, needs_controlnet=True)
+    except DataError as error:
+        if options.prior is not None and not options.prior.exists() and options.controlnet is not None:
+            try:
+                find_controlnet(options.prior, options.controlnet)
+            except DataError as other:  # neither is there: better said at once
+                raise DataError(f"{error}; {other}") from other
+        raise
 
 
 def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:

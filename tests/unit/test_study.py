@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from report_artefacts import SETTINGS, Experiment
 
 from ctlev_core.plugins import PluginError
@@ -13,9 +14,13 @@ from ctlev_core.report.study import distances_table
 from ctlev_core.report.summary import SUMMARY_FILE, Summary, read_summary, write_summary
 from ctlev_core.run_comparison import read_run
 from data_contracts.errors import DataError
+from data_contracts.experiment import Experiment as Options
 from data_contracts.manifest import Manifest, ManifestRef
 from data_contracts.study import Study
-from flows.command_line import load_experiment, load_study
+from flows.command_line import PRESETS, load_experiment, load_preset
+from flows.costs import estimate_costs
+from flows.inputs import InputsMissing
+from flows.studies import load_study
 from tasks.report import publish_report, report
 from tasks.stage import Output
 from tasks.study_report import study_report
@@ -141,6 +146,68 @@ def test_wrong_studies_are_refused(tmp_path, content, message):
     path.write_text(json.dumps({"name": "s", **content}))
     with pytest.raises(PluginError, match=message):
         load_study(str(path), [])
+
+
+def test_the_papers_study_says_everything_that_is_missing_at_once():
+    with pytest.raises(InputsMissing) as raised:
+        load_study("paper", [])
+    message = str(raised.value)
+    values = yaml.safe_load((PRESETS / "paper.yaml").read_text())
+    for name in values["paths"]:
+        assert f"paths.{name}" in message
+    assert message.count("paths.inception") == 1  # all six need it
+    assert "  - recognition, zero_shot, pose_dhp19, pose_cdehp, body, body_amass: torchscript" in message
+    assert "extracted_train/" in message  # the expected tree
+    assert list(raised.value.asked.experiments) == list(values["experiments"])
+
+
+def test_a_path_that_is_given_is_no_longer_missing(tmp_path):
+    (tmp_path / "body.npz").touch()
+    with pytest.raises(InputsMissing) as raised:
+        load_study("paper", [f"paths.smpl={tmp_path / 'body.npz'}"])
+    assert "paths.smpl" not in str(raised.value)
+    parts = raised.value.asked.experiments
+    assert parts["body"].condition.options["body"] == str(tmp_path / "body.npz")
+    # The same lines of the file serve several experiments, and each has a ControlNet of its own.
+    controlnets = {name: part.generator.options["controlnet"] for name, part in parts.items() if "pose" in name}
+    assert set(controlnets.values()) == {"paths.controlnet_openpose"}
+    assert parts["body_amass"].generator.options["controlnet"] == "paths.controlnet_normal"
+    with pytest.raises(PluginError, match="has no such path; it has stable_diffusion, "):
+        load_study("paper", ["paths.nonesuch=1"])
+
+
+def test_costs_are_those_of_the_operations():
+    with pytest.raises(InputsMissing) as raised:
+        load_study("paper", [])
+    costs = {name: estimate_costs(part) for name, part in raised.value.asked.experiments.items()}
+    # 512 frames a step; TFLOP of Stable Diffusion v1.4 at 512 px: U-Net 0.803, ControlNet 0.283, decoder 2.515.
+    text, pose = costs["recognition"], costs["pose_dhp19"]
+    assert (text.images_trained, pose.images_trained) == (15625 * 512, 11719 * 512)
+    assert text.training_s == pytest.approx(15625 * 512 * 2.41 / 790)
+    assert pose.training_s == pytest.approx(11719 * 512 * 2.27 / 790)
+    assert text.sampling_s == pytest.approx(650_000 * (1000 * 0.803 + 2.515) / 790)
+    assert pose.sampling_s == pytest.approx(5000 * (1000 * (0.803 + 0.283) + 2.515) / 790)
+    assert pose.frames_bytes == 5000 * 512 * 512 * 3
+    assert estimate_costs(load_experiment("demo", [])) is None
+
+
+def test_costs_of_smaller_images_and_guidance_are_between_the_counted_ones():
+    asked = (
+        "generator.options.prior=FOLDER",
+        "generator={name: stable_diffusion, options: {prior: x}}",
+        "condition={name: text}",
+    )
+
+    def seconds(*more):
+        experiment = load_preset(Options, PRESETS, "demo", [*asked, "sampling={}", *more])
+        return estimate_costs(experiment)
+
+    large, small = (seconds(f"encoding.options.image_size=[{side}, {side}]") for side in (512, 256))
+    assert small.training_s / large.training_s == pytest.approx(0.537 / 2.41)
+    between = seconds("encoding.options.image_size=[384, 384]")
+    assert small.training_s < between.training_s < large.training_s
+    guided = seconds("encoding.options.image_size=[512, 512]", "sampling={guidance_scale: 7.5}")
+    assert guided.sampling_s - large.sampling_s == pytest.approx(800 * 20 * 0.803 / 790)
 
 
 def test_only_the_full_experiment_takes_a_study():

@@ -1,0 +1,93 @@
+"""Hours and storage that a generator of Stable Diffusion's size would take, by calculation.
+
+Operations per image as torch's FlopCounterMode counts them for Stable Diffusion v1.4 and ControlNet v1.0, latents
+cached while training.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from ctlev_core import plugins
+from data_contracts.experiment import Experiment
+
+FLOPS = 790e12
+HOW_ESTIMATED = (
+    "by calculation, at 790 TFLOP/s, what one H200 reaches at best in bfloat16; expect twice as many hours or more:"
+)
+PIXELS = 3
+_TERA = 1e12
+# (at 512 px, at 256 px): TFLOP an image.
+_OPERATIONS = {
+    "unet": (0.803, 0.180), "controlnet": (0.283, 0.063), "decoding": (2.515, 0.622), "tune unet": (2.41, 0.537),
+    "tune controlnet": (2.27, 0.493),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Of one experiment's own generator, all fine-tunings and sets together.
+
+    Attributes:
+        images_trained: that training sees, repeated ones too.
+        training_s: seconds on one GPU at `FLOPS`.
+        num_samples: frames.
+        num_steps: of the sampler.
+        sampling_s: as `training_s`.
+        frames_bytes: of the samples, as stored.
+    """
+
+    images_trained: int
+    training_s: float
+    num_samples: int
+    num_steps: int
+    sampling_s: float
+    frames_bytes: int
+
+    def __str__(self) -> str:
+        return (
+            f"train on {self.images_trained / 1e6:.1f} million images: {self.training_s / 3600:.1f} GPU hours; sample "
+            f"{self.num_samples:,} in {self.num_steps} steps: {self.sampling_s / 3600:.1f}; "
+            f"frames {self.frames_bytes / 1e9:.1f} GB"
+        )
+
+
+def estimate_costs(experiment: Experiment) -> Costs | None:
+    """The costs of an experiment whose generator is fine-tuned from weights of Stable Diffusion's size, else None."""
+    given, sampling = experiment.generator.options, experiment.sampling
+    if experiment.generator.name not in ("stable_diffusion", "controlnet") or "prior" not in given:
+        return None
+    # Read as they are: other options may still be wrong, or their files missing.
+    options = _with_defaults(experiment.generator.name, "Options", given)
+    sampled = _with_defaults(experiment.generator.name, "SampleOptions", sampling)
+    width, height = experiment.encoding.options.get("image_size") or (512, 512)
+    controlled = experiment.generator.name == "controlnet"
+    per_step = options["batch_size"] * options["gradient_accumulation"]
+    images = options["num_steps"] * per_step * experiment.num_generators
+    forward = _operations("unet", width, height) + controlled * _operations("controlnet", width, height)
+    tuned = {"unet": "tune unet", "controlnet": "tune controlnet"}.get(options["tune"])
+    backward = 3 * forward if tuned is None else _operations(tuned, width, height)
+    evaluations = sampled["num_inference_steps"] * (2 if sampled["guidance_scale"] > 1 else 1)
+    samples = experiment.num_synthetic * experiment.num_generators
+    return Costs(
+        images_trained=images,
+        training_s=images * backward / FLOPS,
+        num_samples=samples,
+        num_steps=sampled["num_inference_steps"],
+        sampling_s=samples * (evaluations * forward + _operations("decoding", width, height)) / FLOPS,
+        frames_bytes=samples * width * height * PIXELS,
+    )
+
+
+def _with_defaults(generator: str, model: str, given: dict[str, Any]) -> dict[str, Any]:
+    fields = getattr(plugins.load("generators", generator), model).model_fields
+    return {name: given.get(name, field.default) for name, field in fields.items()}
+
+
+def _operations(what: str, width: int, height: int) -> float:
+    """Operations an image: a power of its area through the two sizes that were counted."""
+    large, small = _OPERATIONS[what]
+    exponent = math.log(large / small) / math.log(4)
+    return _TERA * large * (width * height / 512**2) ** exponent

@@ -1,0 +1,99 @@
+"""What experiments need from outside the store, looked for all at once: one look says everything that is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ctlev_core import plugins
+from ctlev_core.plugins import PluginError
+from data_contracts.config import Choice
+from data_contracts.errors import DataError
+from data_contracts.experiment import Experiment
+from data_contracts.study import Study
+
+
+class InputsMissing(PluginError):
+    """Options, files or folders are missing or wrong.
+
+    Attributes:
+        asked: the experiment or study that needs them.
+    """
+
+    def __init__(self, problems: list[str], asked: Experiment | Study) -> None:
+        self.asked = asked
+        listed = "".join("\n  - " + problem.replace("\n", "\n    ") for problem in problems)
+        super().__init__(problems[0] if len(problems) == 1 else f"{len(problems)} inputs are missing or wrong:{listed}")
+
+
+def check_inputs(asked: Experiment | Study, *, thoroughly: bool = False) -> None:
+    """Raise `InputsMissing` unless every plug-in is there, its options are right, and datasets have what is needed.
+
+    Whether all files are there is seen where stages are planned, which reads folders once; here they are only looked
+    for when something is wrong already, so that the error names them all.
+    """
+    experiments = asked.experiments if isinstance(asked, Study) else {"": asked}
+    try:
+        for experiment in experiments.values():
+            for choice in experiment.choices:
+                plugins.load_options(choice)
+            _check_intensity(experiment)
+    except (PluginError, DataError) as error:
+        # What is found by looking again need not be what was found first: folders change.
+        raise InputsMissing(_problems(experiments) or [str(error)], asked) from error
+    if thoroughly and (problems := _problems(experiments)):
+        raise InputsMissing(problems, asked)
+
+
+def _problems(experiments: Mapping[str, Experiment]) -> list[str]:
+    """Every problem once, with the experiments of a study that have it."""
+    found: dict[str, list[str]] = {}
+    for name, experiment in experiments.items():
+        for choice in experiment.choices:
+            try:
+                _look_for(choice)
+            except (PluginError, DataError, OSError) as error:
+                found.setdefault(str(error), []).append(name)
+        try:
+            _check_intensity(experiment)
+        except (PluginError, DataError, OSError) as error:
+            found.setdefault(str(error), []).append(name)
+    listed = []
+    for problem, names in found.items():
+        of = ", ".join(dict.fromkeys(names))
+        listed.append(f"{of}: {problem}" if of else problem)
+    return listed
+
+
+def _look_for(choice: Choice) -> None:
+    """Load a plug-in, and let it look for its files."""
+    plugin = plugins.load_options(choice)
+    look: Any = None
+    if choice.KIND == "datasets":
+        look = plugin.module.list_recordings
+    elif choice.KIND == "generators" and choice.OPTIONS == "Options":
+        look = getattr(plugin.module, "prior_folders", None)  # some film instead of learning
+    elif choice.KIND != "generators":
+        look = getattr(plugin.module, "input_files", None)
+    if look is not None:
+        look(plugin.options)
+
+
+def _check_intensity(experiment: Experiment) -> None:
+    """Raise `PluginError` where a condition needs intensity frames and a dataset has none, before anything is read."""
+    conditions = {"condition": experiment.condition}
+    conditions |= {f"baselines.{name}.condition": baseline.condition for name, baseline in experiment.baselines.items()}
+    needing = [
+        name
+        for name, choice in conditions.items()
+        if getattr(plugins.load("conditions", choice.name), "NEEDS", "") == "intensity"
+    ]
+    for dataset in (experiment.dataset, experiment.poses) if needing else ():
+        if dataset is None:
+            continue
+        plugin = plugins.load_options(dataset)
+        if not any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options)):
+            raise PluginError(
+                f"{', '.join(needing)}: needs intensity frames, "
+                f"and dataset {dataset.name!r} with these options has none"
+            )
