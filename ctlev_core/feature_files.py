@@ -28,6 +28,8 @@ BATCH_SIZE = 32
 """Fixed, for rounding may depend on it."""
 INCEPTION_SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
 """Of `inception-2015-12-05.pt`, the TorchScript translation of TensorFlow's Inception that StyleGAN2-ADA published."""
+INCEPTION_STATE_SHA256 = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"
+"""Of `pt_inception-2015-12-05-6726825d.pth`, the weights of the same network as pytorch-fid published them."""
 _SCORES_OF_INCEPTION = {"fd": "fid", "kid": "kid", "fd_infinity": "fid_infinity"}
 
 
@@ -132,7 +134,8 @@ def name_score(score: str, config: Mapping[str, Any]) -> str:
         first 8 digits of the checksum: of the file, or of the list of checksums where there are several.
     """
     digests = config["sha256"]
-    if list(digests.values()) == [INCEPTION_SHA256] and score in _SCORES_OF_INCEPTION:
+    is_inception = list(digests.values()) in ([INCEPTION_SHA256], [INCEPTION_STATE_SHA256])
+    if is_inception and score in _SCORES_OF_INCEPTION:
         return _SCORES_OF_INCEPTION[score]
     return f"{score}_event_{config['architecture']}_{_short_digest(digests)}"
 
