@@ -18,6 +18,7 @@ from prefect.artifacts import create_table_artifact
 from prefect.logging import get_run_logger
 
 from ctlev_core.diffusion.pretraining import PretrainingOptions
+from ctlev_core.report.report_files import publish_report
 from flows import baselines as of_baselines
 from flows import compare as of_compare
 from flows import evaluate as of_evaluate
@@ -34,7 +35,6 @@ from flows.settings import HOME, flow
 from flows.studies import load_study
 from tasks.contact_sheet import publish_contact_sheet
 from tasks.export_events import publish_events
-from tasks.report import publish_report
 from tasks.speed_report import publish_speed_report
 from tasks.stage import planning
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from functools import partial
 
+from ctlev_core.report.report_files import publish_report
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from data_contracts.study import Study
@@ -23,7 +24,7 @@ from flows.train_generator import train_generator
 from tasks.copy_check import copy_check
 from tasks.ingest import ingest
 from tasks.realism import realism
-from tasks.report import publish_report, report
+from tasks.report import report
 from tasks.stage import call_flow, call_together
 from tasks.study_report import study_report
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from ctlev_core.report.html import Curves, Folded, Section, render_report
 from ctlev_core.report.paper_numbers import paper_section
 from ctlev_core.report.realism import realism_sections
 from ctlev_core.report.refusals import refusal_sections
+from ctlev_core.report.report_files import LATEX, MARKDOWN, PAGE, PROVENANCE
 from ctlev_core.report.scaling import scaling_figure, scaling_points
 from ctlev_core.report.score_tables import (
     PairedScores,
@@ -37,10 +37,9 @@ from ctlev_core.report.tables import Cell, Table, render_latex, render_markdown
 from ctlev_core.report.verdict import verdict
 from ctlev_core.traced_scores import paired_samples, trace_scores
 from data_contracts import tables
-from data_contracts.manifest import MANIFEST_FILE, RUN_FILE, Manifest, ManifestRef
+from data_contracts.manifest import RUN_FILE, Manifest
 from tasks.stage import Output, stage
 
-PAGE, LATEX, MARKDOWN, PROVENANCE = "report.html", "tables.tex", "tables.md", "provenance.json"
 Row = dict[str, Any]
 FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
@@ -170,38 +169,6 @@ def _verdict(rows: list[Row], settings: Sequence[str], names: list[str], paired:
     if gain is not None and start is not None and reached is not None and most is not None:
         ceiling = gain, share_of_gain(start, reached, most)
     return verdict(rows, settings, paired.difference("real", f"real+{own}", metric), beside, ceiling)
-
-
-def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
-    """Put the newest report of an experiment where a person looks for it, and say where that is.
-
-    `<home>/reports/NAME.html`, and in the folder `NAME` beside it the tables and `provenance.json`; of a study also the
-    reports of its experiments, a folder each.
-    """
-    folder = home / "reports"
-    (folder / name).mkdir(parents=True, exist_ok=True)
-    parts = [path for path in ref.path.iterdir() if path.is_dir()]  # of a study
-    for place in (ref.path, *parts):
-        (folder / name / place.relative_to(ref.path)).mkdir(exist_ok=True)
-        for path in published_files(place):
-            if path != ref.path / PAGE:
-                _replace(path, folder / name / path.relative_to(ref.path))
-    _replace(ref.path / PAGE, folder / f"{name}.html")
-    return f"report: {folder / f'{name}.html'}\ntables: {folder / name}"
-
-
-def published_files(folder: Path) -> list[Path]:
-    """What a person wants of a report's files."""
-    wanted = (PAGE, LATEX, MARKDOWN, PROVENANCE)
-    tables_of = (path for path in folder.glob("*.parquet") if path.name != MANIFEST_FILE)
-    return sorted([*(folder / name for name in wanted if (folder / name).exists()), *tables_of])
-
-
-def _replace(source: Path, target: Path) -> None:
-    """Copy a file so that whoever reads the target sees the old one or the new one."""
-    temporary = target.with_name(f".{target.name}")
-    shutil.copyfile(source, temporary)
-    temporary.replace(target)
 
 
 def _roles(role: str, names: Sequence[str], manifests: Sequence[Manifest]) -> list[tuple[str, Path]]:

@@ -10,13 +10,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.report.html import Links, render_report
+from ctlev_core.report.report_files import LATEX, MARKDOWN, PAGE, published_files
 from ctlev_core.report.score_tables import PairedScores
 from ctlev_core.report.study import Part, study_sections, study_tables, study_verdict
 from ctlev_core.report.summary import read_summary
 from ctlev_core.report.tables import render_latex, render_markdown
 from data_contracts import tables
 from data_contracts.manifest import Manifest
-from tasks.report import LATEX, MARKDOWN, PAGE, published_files
 from tasks.stage import Output, stage
 
 

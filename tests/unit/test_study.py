@@ -10,6 +10,7 @@ from report_artefacts import SETTINGS, Experiment
 
 from ctlev_core.plugins import PluginError
 from ctlev_core.report.html import ImageGrid, Step
+from ctlev_core.report.report_files import publish_report
 from ctlev_core.report.study import distances_table
 from ctlev_core.report.summary import SUMMARY_FILE, Summary, read_summary, write_summary
 from ctlev_core.run_comparison import read_run
@@ -21,7 +22,7 @@ from flows.command_line import PRESETS, load_experiment, load_preset
 from flows.costs import estimate_costs
 from flows.inputs import InputsMissing
 from flows.studies import load_study
-from tasks.report import publish_report, report
+from tasks.report import report
 from tasks.stage import Output
 from tasks.study_report import study_report
 

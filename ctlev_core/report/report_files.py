@@ -1,0 +1,42 @@
+"""What lies in the folder of a report, and where a person finds it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from data_contracts.manifest import MANIFEST_FILE, ManifestRef
+
+PAGE, LATEX, MARKDOWN, PROVENANCE = "report.html", "tables.tex", "tables.md", "provenance.json"
+
+
+def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
+    """Put the newest report of an experiment where a person looks for it, and say where that is.
+
+    `<home>/reports/NAME.html`, and in the folder `NAME` beside it the tables and `provenance.json`; of a study also the
+    reports of its experiments, a folder each.
+    """
+    folder = home / "reports"
+    (folder / name).mkdir(parents=True, exist_ok=True)
+    parts = [path for path in ref.path.iterdir() if path.is_dir()]  # of a study
+    for place in (ref.path, *parts):
+        (folder / name / place.relative_to(ref.path)).mkdir(exist_ok=True)
+        for path in published_files(place):
+            if path != ref.path / PAGE:
+                _replace(path, folder / name / path.relative_to(ref.path))
+    _replace(ref.path / PAGE, folder / f"{name}.html")
+    return f"report: {folder / f'{name}.html'}\ntables: {folder / name}"
+
+
+def published_files(folder: Path) -> list[Path]:
+    """What a person wants of a report's files."""
+    wanted = (PAGE, LATEX, MARKDOWN, PROVENANCE)
+    tables_of = (path for path in folder.glob("*.parquet") if path.name != MANIFEST_FILE)
+    return sorted([*(folder / name for name in wanted if (folder / name).exists()), *tables_of])
+
+
+def _replace(source: Path, target: Path) -> None:
+    """Copy a file so that whoever reads the target sees the old one or the new one."""
+    temporary = target.with_name(f".{target.name}")
+    shutil.copyfile(source, temporary)
+    temporary.replace(target)
