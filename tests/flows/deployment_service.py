@@ -125,6 +125,21 @@ def end(process: subprocess.Popen) -> None:
 @contextlib.contextmanager
 def serving(home: Path) -> Iterator[Service]:
     """Every deployment, ready to run."""
+    with server(home) as made:
+        try:
+            made.start_worker()  # makes the pool where there is none
+            for command in (("work-pool", "create", "ctlev", "--type", "process", "--overwrite"), ("deploy", "--all")):
+                finished = made.prefect(*command)
+                assert finished.returncode == 0, finished.stdout + finished.stderr
+            yield made
+        finally:
+            if made.worker is not None:
+                end(made.worker)
+
+
+@contextlib.contextmanager
+def server(home: Path) -> Iterator[Service]:
+    """A server alone."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -139,7 +154,7 @@ def serving(home: Path) -> Iterator[Service]:
     }
     made = Service(home, environment["PREFECT_API_URL"], environment)
     with (home / "server.log").open("wb") as log:
-        server = subprocess.Popen(
+        process = subprocess.Popen(
             [*PREFECT, "server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui"],
             cwd=home,
             env=environment,
@@ -155,14 +170,8 @@ def serving(home: Path) -> Iterator[Service]:
                 made.api("health")
                 break
             except (urllib.error.URLError, OSError):
-                assert server.poll() is None and time.monotonic() < deadline, (home / "server.log").read_text()
+                assert process.poll() is None and time.monotonic() < deadline, (home / "server.log").read_text()
                 time.sleep(0.2)
-        made.start_worker()  # makes the pool where there is none
-        for command in (("work-pool", "create", "ctlev", "--type", "process", "--overwrite"), ("deploy", "--all")):
-            finished = made.prefect(*command)
-            assert finished.returncode == 0, finished.stdout + finished.stderr
         yield made
     finally:
-        if made.worker is not None:
-            end(made.worker)
-        end(server)
+        end(process)
