@@ -120,13 +120,17 @@ def check_distances(extractor: DownstreamChoice, distances: Sequence[MetricChoic
 
     Raises:
         PluginError: the extractor has no features, or a metric does not compare features.
+        DataError: a file that a metric reads is missing.
     """
     if not hasattr(plugins.load_options(extractor).module, "features"):
         raise PluginError(f"feature_extractor: expected a model with features, got {extractor.name!r}, which has none")
     for choice in distances:
-        needed = plugins.load_options(choice).module.INPUT
+        metric = plugins.load_options(choice)
+        needed = metric.module.INPUT
         if needed != FEATURES:
             raise PluginError(
                 f"distances: expected metrics of features, got {choice.name!r}, which compares {needed}; "
                 "name it under metrics"
             )
+        if hasattr(metric.module, "input_files"):
+            metric.module.input_files(metric.options)

@@ -8,7 +8,6 @@ The vertices are those of the body of `body`, for predictions and labels alike, 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,11 @@ import numpy as np
 from pydantic import Field, field_serializer
 
 from ctlev_core.joint_errors import Alignment, Sums, quotients
+from ctlev_core.remembered_files import remembered_digest
 from ctlev_core.vertex_errors import compute_vertex_errors_mm
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
-from data_contracts.manifest import file_digest
 
 VERSION = 1
 INPUT = "smpl"
@@ -38,10 +37,7 @@ class Options(Frozen):
     @field_serializer("body", when_used="json")
     def _content_of_body(self, body: str) -> str:
         """What keys and records know of the file: its SHA-256, for another body makes other scores of the same name."""
-        if not body:
-            return ""
-        status = Path(body).stat()
-        return _remembered_digest(body, status.st_size, status.st_mtime_ns)
+        return remembered_digest(Path(body)) if body else ""
 
 
 def input_files(options: Options) -> list[Path]:
@@ -82,12 +78,6 @@ def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options)
     """Error [N] mm of each row in the chosen alignment."""
     errors_mm = compute_vertex_errors_mm(predicted, target, _body_file(options), [options.alignment])
     return errors_mm[options.alignment]
-
-
-@lru_cache(maxsize=4)
-def _remembered_digest(path: str, size: int, modified_ns: int) -> str:
-    """Every score of an experiment asks for the same file, and asks again when it runs."""
-    return file_digest(Path(path))
 
 
 def _body_file(options: Options) -> Path | None:

@@ -1,5 +1,6 @@
 """KID, FD-infinity, precision and coverage against slow loops and closed forms; intervals by counting."""
 
+import hashlib
 import math
 from dataclasses import asdict
 
@@ -13,6 +14,8 @@ from ctlev_core.frechet import frechet_distance
 from ctlev_core.kernel_distance import kernel_distance
 from ctlev_core.metrics import fd_infinity, frechet, kid, prdc
 from ctlev_core.neighbour_scores import neighbour_scores
+from data_contracts.config import cache_material
+from data_contracts.errors import DataError
 from data_contracts.tables import check_table
 
 
@@ -41,6 +44,29 @@ def test_kid_agrees_with_a_loop_over_pairs(seed, n, m, width, offset):
     # The loop cancels numbers of the size of the kernel.
     size = max(1.0, (max(np.abs(a).max(), np.abs(b).max()) ** 2 + 1) ** 3)
     assert kernel_distance(a, b) == pytest.approx(slow_kid(a, b), rel=1e-9, abs=1e-13 * size)
+
+
+def test_the_reference_may_be_a_file_of_statistics(tmp_path):
+    a, b = normal(1, 50), normal(2, 60, offset=0.3)
+    file = tmp_path / "reference.npz"
+    np.savez(file, mu=b.mean(axis=0), sigma=np.cov(b, rowvar=False))
+    options = frechet.Options(statistics=str(file))
+    assert frechet.input_files(options) == [file]
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    assert cache_material(options) == {"statistics": digest} and cache_material(frechet.Options()) == {"statistics": ""}
+    # No matter which real frames there are.
+    expected = {f"fd_to_{digest[:8]}": pytest.approx(frechet_distance(a, b), rel=1e-11)}
+    assert frechet.compute(a, a[:3], options) == expected
+    with pytest.raises(ValueError, match="same number of features, got 6 and 5"):
+        frechet.compute(a, a, frechet.Options(statistics=str(_statistics(tmp_path / "five.npz", b[:, :5]))))
+    assert frechet.compute(a, a, frechet.Options(statistics=str(_statistics(file, a)))).popitem()[1] < 1e-25
+    with pytest.raises(DataError, match=r"expected option `statistics` to be an \.npz file, got .*absent"):
+        frechet.input_files(frechet.Options(statistics=str(tmp_path / "absent")))
+
+
+def _statistics(file, features):
+    np.savez(file, mu=features.mean(axis=0), sigma=np.cov(features, rowvar=False))
+    return file
 
 
 def test_kid_of_large_offsets_keeps_its_digits():
