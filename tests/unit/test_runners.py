@@ -17,7 +17,7 @@ from tasks import runners
 from tasks.runners import WorkerError, asked_runner
 from tasks.stage import planning, stage
 from tasks.store import Store
-from tasks.workers import MAX_GROUP, _groups, current_workers, map_shards, together
+from tasks.workers import MAX_GROUP, _groups, current_workers, is_spread, map_shards, together
 
 KINDS = [
     kind
@@ -137,12 +137,19 @@ def test_the_rest_is_not_computed_where_nobody_wants_it():
     assert len(done) < 1000
 
 
+@pytest.mark.parametrize("max_group", [1, 4, MAX_GROUP])
 @pytest.mark.parametrize(("num_shards", "count"), [(1, 2), (5, 2), (100, 3), (10_000, 16)])
-def test_groups_cover_all_shards_once_and_end_small(num_shards, count):
-    groups = list(_groups(range(num_shards), count))
+def test_groups_cover_all_shards_once_and_end_small(num_shards, count, max_group):
+    groups = list(_groups(range(num_shards), count, max_group))
     assert [shard for group in groups for shard in group] == list(range(num_shards))
     sizes = [len(group) for group in groups]
-    assert sizes == sorted(sizes, reverse=True) and sizes[0] <= MAX_GROUP and sizes[-1] == 1
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] <= max_group and sizes[-1] == 1
+
+
+def test_shards_are_spread_where_there_are_several_of_both(monkeypatch):
+    assert is_spread(2) and not is_spread(1)
+    monkeypatch.setenv("CTLEV_WORKERS", "1")
+    assert not is_spread(2)
 
 
 def test_one_worker_computes_here(monkeypatch):
