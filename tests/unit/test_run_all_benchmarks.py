@@ -1,0 +1,44 @@
+"""The page of all benchmarks: what was judged, what failed, and what did not run."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def run_all(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import run_all
+
+    monkeypatch.setattr(run_all, "KEPT", tmp_path / "kept")
+    monkeypatch.setattr(run_all, "RESULTS", tmp_path / "RESULTS.md")
+    return run_all
+
+
+def test_every_benchmark_is_a_script(run_all):
+    for benchmark in run_all.ALL:
+        assert (BENCHMARKS / f"{benchmark.name}.py").exists()
+
+
+def test_what_ran_and_what_did_not(run_all, monkeypatch, tmp_path):
+    (tmp_path / "quick.py").write_text("import sys\nprint('1.6x, wanted 1.5x: met\\nsolving')\nsys.exit(3)")
+    monkeypatch.setattr(run_all, "HERE", tmp_path)
+    monkeypatch.setattr(run_all, "ALL", (run_all.Benchmark("quick"), run_all.Benchmark("other", needs_gpu=True)))
+    monkeypatch.setattr(run_all, "_has_gpu", lambda: False)
+    monkeypatch.setattr(sys, "argv", ["run_all.py"])
+    assert run_all.main() == 1
+    page = (tmp_path / "RESULTS.md").read_text()
+    assert "Not run here: `other`." in page
+    assert "- 1.6x, wanted 1.5x: met\n" in page and "**It ended with status 3.**" in page
+    assert "- solving" not in page and "solving\n```" in page
+
+
+def test_unknown_names_are_refused():
+    found = subprocess.run(
+        [sys.executable, str(BENCHMARKS / "run_all.py"), "trainig"], capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 2 and "no such benchmark: trainig; there are events, rendering" in found.stderr
