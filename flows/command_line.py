@@ -162,6 +162,7 @@ def main(
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
             result = flow(options)
+        described = describe(result, options)
     except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
         if isinstance(error, InputsMissing) and arguments.dry_run:
             print_costs(error.asked)
@@ -171,7 +172,7 @@ def main(
         print("interrupted; finished stages and checkpoints are kept", file=sys.stderr)
         return 130
     cached = sum(row.cached for row in rows)
-    print(describe(result, options))
+    print(described)
     print(f"{len(rows)} stages, {cached} of them cached, in {time.perf_counter() - started:.1f} s")
     return 0
 
