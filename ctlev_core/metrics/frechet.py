@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, field_serializer
 
-from ctlev_core.frechet import frechet_distance, frechet_distance_of_gaussians
+from ctlev_core.frechet import frechet_distance_of_gaussians
+from ctlev_core.frechet_extended import refined_frechet_distance
 from ctlev_core.gaussian_factors import GaussianFactor, fit_gaussian, gaussian_from_statistics, read_statistics
 from ctlev_core.remembered_files import remembered_digest
 from data_contracts.config import Frozen
@@ -62,7 +63,7 @@ def compute(predicted: np.ndarray, target: np.ndarray, options: Options) -> dict
         DataError: the file holds no statistics.
     """
     if not options.statistics:
-        return {"fd": frechet_distance(predicted, target)}
+        return {"fd": refined_frechet_distance(predicted, target)}
     digest = remembered_digest(Path(options.statistics))
     reference = _reference(options.statistics, digest)
     return {f"fd_to_{digest[:8]}": frechet_distance_of_gaussians(fit_gaussian(predicted), reference)}

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.frechet import frechet_distance, frechet_distance_of_gaussians, frechet_distance_of_statistics
+from ctlev_core.frechet_extended import refined_frechet_distance
 from ctlev_core.gaussian_factors import FeatureStream, fit_gaussian, gaussian_from_statistics, read_statistics
 from data_contracts.errors import DataError
 
@@ -100,6 +101,32 @@ def test_nearly_identical_sets_lose_only_what_their_own_rounding_does():
     b = a * (1 + 1e-6)
     exact = exact_distance(a, b)
     assert abs(frechet_distance(a, b) - exact) <= 1e-9 * exact
+
+
+@pytest.mark.parametrize("apart", [1e-4, 1e-6, 1e-8])
+@pytest.mark.parametrize("counts", [(60, 60), (7, 7), (60, 61), (8, 7)])
+def test_nearly_identical_sets_keep_their_digits_in_extended_precision(counts, apart):
+    if np.finfo(np.longdouble).eps >= np.finfo(np.float64).eps:
+        pytest.skip("long double is float64 here")
+    a = normal(30, counts[0])
+    b = a[: counts[1]] * (1 + apart)
+    if counts[1] > counts[0]:
+        b = np.concatenate([b, a.mean(axis=0, keepdims=True)])
+    for first, second in ((a, b), (b, a)):
+        exact = exact_distance(first, second)
+        # 1e-19, long double's rounding, of the features' size over their difference.
+        assert abs(mpmath.mpf(refined_frechet_distance(first, second)) - exact) <= max(1e-12, 2e-18 / apart) * exact
+
+
+def test_extended_precision_is_for_sets_that_need_it_alone():
+    a, b = normal(31, 60), normal(33, 60)
+    assert refined_frechet_distance(a, b) == frechet_distance(a, b)
+    assert refined_frechet_distance(a, a.copy()) == 0
+    assert refined_frechet_distance(a * 1e-150, a * (1 + 1e-6) * 1e-150) >= 0
+    near = a * (1 + 1e-6)
+    assert refined_frechet_distance(a, near) == pytest.approx(frechet_distance(a, near), rel=1e-8)
+    with pytest.raises(ValueError, match="first set: a covariance needs at least 2 rows, got 1"):
+        refined_frechet_distance(a[:1], a)
 
 
 def test_the_fast_route_is_left_where_its_own_estimate_says_so():
