@@ -102,10 +102,10 @@ def _find_similarity(
     centre_target: np.ndarray,
 ) -> bool:
     """The best: turn (point - centre) + centre_target, the scale within `turn`; False where nothing is known."""
-    if _centres(points, target, known, centre, centre_target) == 0:
-        return False
     product, turned = np.zeros((3, 3)), np.zeros((3, 3))
-    size = _product(points, target, known, centre, centre_target, product)
+    size = _moments(points, target, known, centre, centre_target, product)
+    if size < 0.0:
+        return False
     farthest = max(abs(centre[0]), abs(centre[1]), abs(centre[2]))
     rotation = np.zeros((3, 3))
     scale = 0.0
@@ -116,27 +116,7 @@ def _find_similarity(
 
 
 @numba.njit(cache=True, nogil=True)
-def _centres(
-    points: np.ndarray, target: np.ndarray, known: np.ndarray, centre: np.ndarray, centre_target: np.ndarray
-) -> int:
-    """Means of the known points into `centre` and `centre_target`; returns their number."""
-    count = 0
-    centre[:] = 0.0
-    centre_target[:] = 0.0
-    for joint in range(len(points)):
-        if known[joint]:
-            count += 1
-            for axis in range(3):
-                centre[axis] += points[joint, axis]
-                centre_target[axis] += target[joint, axis]
-    for axis in range(3):
-        centre[axis] /= max(count, 1)
-        centre_target[axis] /= max(count, 1)
-    return count
-
-
-@numba.njit(cache=True, nogil=True)
-def _product(
+def _moments(
     points: np.ndarray,
     target: np.ndarray,
     known: np.ndarray,
@@ -144,24 +124,47 @@ def _product(
     centre_target: np.ndarray,
     product: np.ndarray,
 ) -> float:
-    """Sum of the outer products of centred points and centred target, over the points' size, which is returned."""
+    """Means of the known points into `centre` and `centre_target`, and the sum of the outer products of centred points
+    and centred target, over the points' size, into `product`; returns the size, -1 where nothing is known.
+
+    In one pass, as seen from the first known point: however far away points are, no digits are lost.
+    """
+    count, first = 0, 0
     square = 0.0
+    a = b = c = d = e = f = 0.0
     xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
     for joint in range(len(points)):
         if known[joint]:
-            x, y, z = points[joint, 0] - centre[0], points[joint, 1] - centre[1], points[joint, 2] - centre[2]
-            u = target[joint, 0] - centre_target[0]
-            v = target[joint, 1] - centre_target[1]
-            w = target[joint, 2] - centre_target[2]
+            if count == 0:
+                first = joint
+            count += 1
+            x, y, z = (
+                points[joint, 0] - np.float64(points[first, 0]),
+                points[joint, 1] - np.float64(points[first, 1]),
+                points[joint, 2] - np.float64(points[first, 2]),
+            )
+            u, v, w = (
+                target[joint, 0] - np.float64(target[first, 0]),
+                target[joint, 1] - np.float64(target[first, 1]),
+                target[joint, 2] - np.float64(target[first, 2]),
+            )
+            a, b, c, d, e, f = a + x, b + y, c + z, d + u, e + v, f + w
             square += x * x + y * y + z * z
             xx, xy, xz = xx + x * u, xy + x * v, xz + x * w
             yx, yy, yz = yx + y * u, yy + y * v, yz + y * w
             zx, zy, zz = zx + z * u, zy + z * v, zz + z * w
-    size = np.sqrt(square)
+    if count == 0:
+        return -1.0
+    size = np.sqrt(max(square - (a * a + b * b + c * c) / count, 0.0))
     unit = 1.0 / size if size > 0.0 else 0.0
-    product[0, 0], product[0, 1], product[0, 2] = unit * xx, unit * xy, unit * xz
-    product[1, 0], product[1, 1], product[1, 2] = unit * yx, unit * yy, unit * yz
-    product[2, 0], product[2, 1], product[2, 2] = unit * zx, unit * zy, unit * zz
+    a, b, c, d, e, f = a / count, b / count, c / count, d / count, e / count, f / count
+    product[0, 0], product[0, 1], product[0, 2] = xx - count * a * d, xy - count * a * e, xz - count * a * f
+    product[1, 0], product[1, 1], product[1, 2] = yx - count * b * d, yy - count * b * e, yz - count * b * f
+    product[2, 0], product[2, 1], product[2, 2] = zx - count * c * d, zy - count * c * e, zz - count * c * f
+    product *= unit
+    centre[0], centre[1], centre[2] = points[first, 0] + a, points[first, 1] + b, points[first, 2] + c
+    centre_target[0], centre_target[1] = target[first, 0] + d, target[first, 1] + e
+    centre_target[2] = target[first, 2] + f
     return size
 
 
