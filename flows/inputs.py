@@ -7,6 +7,7 @@ from typing import Any
 
 from ctlev_core import plugins
 from ctlev_core.plugins import PluginError
+from ctlev_core.score_requirements import check_dataset
 from data_contracts.config import Choice
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
@@ -29,6 +30,8 @@ class InputsMissing(PluginError):
 def check_inputs(asked: Experiment | Study, *, thoroughly: bool = False) -> None:
     """Raise `InputsMissing` unless every plug-in is there, its options are right, and datasets have what is needed.
 
+    The labels of one test recording are read, to see whether the metrics can use them.
+
     Whether all files are there is seen where stages are planned, which reads folders once; here they are only looked
     for when something is wrong already, so that the error names them all.
     """
@@ -38,6 +41,7 @@ def check_inputs(asked: Experiment | Study, *, thoroughly: bool = False) -> None
             for choice in experiment.choices:
                 plugins.load_options(choice)
             _check_intensity(experiment)
+            _check_labels(experiment)
     except (PluginError, DataError) as error:
         # What is found by looking again need not be what was found first: folders change.
         raise InputsMissing(_problems(experiments) or [str(error)], asked) from error
@@ -54,10 +58,11 @@ def _problems(experiments: Mapping[str, Experiment]) -> list[str]:
                 _look_for(choice)
             except (PluginError, DataError, OSError) as error:
                 found.setdefault(str(error), []).append(name)
-        try:
-            _check_intensity(experiment)
-        except (PluginError, DataError, OSError) as error:
-            found.setdefault(str(error), []).append(name)
+        for check in (_check_intensity, _check_labels):
+            try:
+                check(experiment)
+            except (PluginError, DataError, OSError) as error:
+                found.setdefault(str(error), []).append(name)
     listed = []
     for problem, names in found.items():
         of = ", ".join(dict.fromkeys(names))
@@ -77,6 +82,10 @@ def _look_for(choice: Choice) -> None:
         look = getattr(plugin.module, "input_files", None)
     if look is not None:
         look(plugin.options)
+
+
+def _check_labels(experiment: Experiment) -> None:
+    check_dataset(experiment.metrics, experiment.dataset)
 
 
 def _check_intensity(experiment: Experiment) -> None:

@@ -21,6 +21,8 @@ from data_contracts.experiment import LABELS_OF, SHUFFLED
 Row = dict[str, Any]
 ORIGINS = "classes with"
 """Groups that begin so are classes by where they were to be learnt from."""
+SUBJECTS = ("subject ", "subjects ")
+"""Groups that begin so are one subject, or subjects by whether they were learnt from."""
 _METRICS = {
     "mpjpe2d": "mean distance between predicted and true joints in the image, in pixels",
     "mpjpe3d": "mean distance between predicted and true joints in space, in millimetres",
@@ -110,7 +112,7 @@ def score_tables(rows: list[Row], settings: Sequence[str], paired: PairedScores)
 
 
 def group_tables(rows: list[Row], settings: Sequence[str]) -> tuple[list[Table], list[Table]]:
-    """The first score by group: classes by where they were to be learnt from, and class by class."""
+    """The first score by group: classes by where they were to be learnt from and subjects, and class by class."""
     groups = [row for row in trained_rows(rows) if row["group"] != "all"]
     if not groups:
         return [], []
@@ -118,11 +120,14 @@ def group_tables(rows: list[Row], settings: Sequence[str]) -> tuple[list[Table],
     groups = [row for row in groups if row["metric"] == metric]
     names = list(dict.fromkeys([*settings, *(row["setting"] for row in groups)]))
     by_origin = [row for row in groups if row["group"].startswith(ORIGINS)]
-    by_class = [row for row in groups if not row["group"].startswith(ORIGINS)]
+    by_subject = [row for row in groups if row["group"].startswith(SUBJECTS)]
+    by_class = [row for row in groups if not row["group"].startswith((ORIGINS, *SUBJECTS))]
     caption = (
         "Held-out real frames by class. What synthetic frames add is seen in classes that no real training frame shows."
     )
     origins = [_by_group(f"{metric}: where does it help?", by_origin, names, caption)] if by_origin else []
+    if by_subject:
+        origins.append(_by_group(f"{metric}, by subject", by_subject, names, first="subjects"))
     classes = [_by_group(f"{metric}, class by class", by_class, names)] if by_class else []
     return origins, classes
 
@@ -229,13 +234,13 @@ def _pivot(title: str, rows: list[Row], first: str, caption: str) -> Table:
     return Table(title, columns, body, caption=caption)
 
 
-def _by_group(title: str, rows: list[Row], settings: Sequence[str], caption: str = "") -> Table:
+def _by_group(title: str, rows: list[Row], settings: Sequence[str], caption: str = "", first: str = "classes") -> Table:
     body: list[list[Cell]] = []
     for group in dict.fromkeys(row["group"] for row in rows):
         of_group = [row for row in rows if row["group"] == group]
         cells: list[Cell] = [cell_text([row for row in of_group if row["setting"] == setting]) for setting in settings]
         body.append([group, *cells, of_group[0]["num_samples"]])
-    return Table(title, ["classes", *settings, "frames scored"], body, caption=caption)
+    return Table(title, [first, *settings, "frames scored"], body, caption=caption)
 
 
 def cell_text(rows: Sequence[Row]) -> str:

@@ -1,7 +1,6 @@
 """The deployments of prefect.yaml, served as docs/operations.md says: a server, a pool and a worker on loopback."""
 
 import datetime
-import importlib.metadata
 import itertools
 import json
 import re
@@ -136,13 +135,6 @@ QUICK = (
 )  # fmt: skip
 
 
-SCHEDULES_FIRE = pytest.mark.xfail(
-    importlib.metadata.version("sqlalchemy").split(".")[:2] > ["2", "0"],
-    reason="Prefect 3.8.8 with SQLAlchemy 2.1: no schedule ever fires (Can't evaluate bulk DML statement)",
-    run=False,
-)
-
-
 def schedule_once(service, deployment, home, times=1, after_s=45):
     """Schedules that each fire once, all at the same moment, when Prefect's scheduler has had time to see them."""
     moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(seconds=after_s)
@@ -165,7 +157,6 @@ def scheduled_runs(service, deployment, count, timeout):
         time.sleep(1)
 
 
-@SCHEDULES_FIRE
 def test_a_schedule_becomes_a_run(service, tmp_path):
     deployment = service.api("deployments/name/prepare-dataset/default")["id"]
     schedule_once(service, deployment, tmp_path, after_s=86_400)
@@ -179,7 +170,6 @@ def test_a_schedule_becomes_a_run(service, tmp_path):
     service.api(f"flow_runs/{run['id']}", method="DELETE")
 
 
-@SCHEDULES_FIRE
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
 def test_scheduled_regenerations_do_not_overlap_and_a_killed_one_is_gone_on_with(service, tmp_path):

@@ -129,6 +129,15 @@ def test_groups_by_origin_and_by_class_are_apart():
     assert group_tables([row("real", 5.0)], ["real"]) == ([], [])
 
 
+def test_subjects_have_a_table_of_their_own():
+    groups = ("walk", "subject 14", "subjects not learnt from")
+    rows = [row(setting, 5.0, group=group) for setting in ("real", "new") for group in groups]
+    (subjects,), (classes,) = group_tables(rows, ["real", "new"])
+    assert subjects.columns == ["subjects", "real", "new", "frames scored"]
+    assert [cells[0] for cells in subjects.rows] == [*groups[1:]]
+    assert [cells[0] for cells in classes.rows] == ["walk"]
+
+
 def test_intervals_join_recordings_and_trainings():
     rows = [row("a", value, seed=seed, low=value - 0.3, high=value + 0.4) for seed, value in enumerate((5.0, 5.2, 5.4))]
     value, low, high = interval_over_trainings(rows)
