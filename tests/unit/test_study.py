@@ -123,6 +123,7 @@ def test_the_bundled_study_is_made_of_its_presets():
     assert study.experiments["pose"] == demo.model_copy(update={"num_synthetic": 5})
     assert study.experiments["body"] == load_experiment("body", [])
     changes = ["name=zero_shot", "settings=[synthetic]", "dataset.options.zero_shot=true"]
+    changes += ["metrics=[{name: zero_shot}, {name: classification}]"]
     assert study.experiments["zero_shot"] == load_experiment("objects", changes)
     assert load_study("demo", []) == demo
 
