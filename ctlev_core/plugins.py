@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -231,6 +231,14 @@ class Generator(Protocol):
         self, checkpoint: Path, conditions: Conditions, options: Any, *, seeds: Sequence[int], work: Path
     ) -> np.ndarray:
         """Frames [N, H, W, 3] uint8; row i depends on conditions[i] and seeds[i] alone."""
+        ...
+
+
+class GeneratorOfNames(Generator, Protocol):
+    """A generator that reads words, and can tell which names are alike to it."""
+
+    def embed_names(self, checkpoint: Path, names: Sequence[str]) -> np.ndarray:
+        """[N, D] vectors of N names, to be compared by their cosines."""
         ...
 
 
@@ -457,17 +465,30 @@ def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: s
     try:
         return model(**values)
     except ValidationError as error:
-        known = ", ".join(model.model_fields)
         lines = []
         for problem in error.errors():
             option = ".".join(str(part) for part in problem["loc"])
             if problem["type"] == "extra_forbidden":
-                lines.append(f"unknown option {option!r}; known: {known}")
+                known = _options_at(model, problem["loc"][:-1])
+                lines.append(f"unknown option {option!r}; known: {', '.join(known)}")
             elif problem["type"] == "path_type":
                 lines.append(f"option {option!r} must be a path, got {problem['input']!r}; --set ...{option}=PATH")
             else:
                 lines.append(f"option {option!r}: {problem['msg'].lower()}, got {problem['input']!r}")
         raise PluginError(f"{where}: " + "; ".join(lines)) from None
+
+
+def _options_at(model: Any, path: Sequence[int | str]) -> list[str]:
+    """Names of the options of a model, or of that of its parts which `path` leads to."""
+    for step in path:
+        fields = getattr(model, "model_fields", {})
+        model = fields[step].annotation if step in fields else model  # else an entry of a mapping or sequence
+        while not hasattr(model, "model_fields"):
+            inner = [part for part in get_args(model) if part not in (str, int, type(None), Ellipsis)]
+            if not inner:
+                return []
+            model = inner[0]
+    return list(getattr(model, "model_fields", {}))
 
 
 def load_options(choice: Choice) -> Plugin:

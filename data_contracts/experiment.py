@@ -68,6 +68,11 @@ class Experiment(Frozen):
     poses: DatasetChoice | None = Field(
         None, description="another dataset whose poses (recordings of split `condition`) are sampled from instead"
     )
+    target: DatasetChoice | None = Field(
+        None,
+        description="another dataset that the generator learns nothing of, such as classes it has never seen: its "
+        "labels are sampled, its training recordings are the setting `real`, its test recordings are tested",
+    )
     pose_order: PoseOrder = Field(
         "random", description="of the labels to sample from: classes in turn and at random, or as they follow in time"
     )
@@ -163,9 +168,15 @@ class Experiment(Frozen):
         """Every plug-in the experiment names."""
         chosen = [self.dataset, self.encoding, self.condition, self.generator, self.sampling_choice, self.downstream]
         more = None if self.more_real is None else self.more_real.dataset
-        optional = [c for c in (self.poses, self.feature_extractor, self.realism_reference, more) if c]
-        others = [c for b in self.baselines.values() for c in (b.condition, b.generator, b.sampling_choice)]
-        return [*chosen, *optional, *others, *self.metrics, *self.distances]
+        others = (self.poses, self.target, self.feature_extractor, self.realism_reference, more)
+        optional = [choice for choice in others if choice]
+        compared = [c for b in self.baselines.values() for c in (b.condition, b.generator, b.sampling_choice)]
+        return [*chosen, *optional, *compared, *self.metrics, *self.distances]
+
+    @property
+    def tested_dataset(self) -> DatasetChoice:
+        """Whose recordings downstream models are tested on."""
+        return self.target or self.dataset
 
     @property
     def generator_names(self) -> list[str]:

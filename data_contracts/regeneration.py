@@ -11,7 +11,7 @@ from data_contracts.experiment import Experiment
 class Gates(Frozen):
     """What a new version must keep to become the latest; null = not asked.
 
-    Preset `demo` has a distance of 1.5 and a label error of 1.1 times that of real frames, and none refused.
+    Preset `pose` has a distance of 1.5 and a label error of 1.1 times that of real frames, and none refused.
     """
 
     max_distance_ratio: float | None = Field(

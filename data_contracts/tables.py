@@ -253,6 +253,17 @@ SAMPLE_SCORES = TableSchema(
         Column("value", pa.float64(), "score of this sample alone; missing where it has none", nullable=True),
     ),
 )
+NEAREST_SEEN = TableSchema(
+    "nearest_seen",
+    1,
+    None,
+    (
+        Column("unseen", pa.string(), "a class that was sampled, and that no training frame shows"),
+        Column("rank", pa.int32(), "1 = the nearest", minimum=1),
+        Column("seen", pa.string(), "a class that training frames show"),
+        Column("similarity", pa.float64(), "cosine between the embeddings of the two names", minimum=-1, maximum=1),
+    ),
+)
 REPORT = TableSchema(
     "report",
     1,
@@ -302,6 +313,7 @@ _ALL = (
     EVENT_STREAMS,
     SCORES,
     SAMPLE_SCORES,
+    NEAREST_SEEN,
     REPORT,
     TIMED_SAMPLES,
     SPEED_VS_ERROR,

@@ -59,7 +59,11 @@ def load_preset(model: type[BaseModel], folder: Path, preset: str, overrides: li
     """
     values = read_preset(folder, preset)
     if "experiments" in values:
-        raise PluginError(f"preset {preset!r} is a study of several experiments, which only full_experiment runs")
+        parts = ", ".join(str(part.get("extends", name)) for name, part in values["experiments"].items())
+        raise PluginError(
+            f"preset {preset!r} is a study of several experiments, which full_experiment alone runs; name one of its "
+            f"parts instead: {parts}"
+        )
     for override in overrides:
         apply_override(values, override)
     return validate_options(model, values, f"preset {preset!r}")
@@ -130,7 +134,7 @@ def main(
     describe: Callable[[Any, Any], str],
     *,
     load: Callable[[str, list[str]], Any] = load_experiment,
-    default_preset: str = "demo",
+    default_preset: str = "pose",
 ) -> int:
     """Run a flow as a script.
 

@@ -50,7 +50,7 @@ Args:
 def _deployable(
     script_flow: Flow[..., Any],
     *,
-    default_preset: str = "demo",
+    default_preset: str = "pose",
     load: Callable[[str, list[str]], Any] = load_experiment,
     publish: Callable[[Any, Path, str], str] | None = None,
 ) -> Flow[..., Any]:
@@ -84,7 +84,9 @@ def _deployable(
     return flow(name=script_flow.name)(run)
 
 
-full_experiment = _deployable(of_full_experiment.full_experiment, load=load_study, publish=publish_report)
+full_experiment = _deployable(
+    of_full_experiment.full_experiment, default_preset="demo", load=load_study, publish=publish_report
+)
 prepare_dataset = _deployable(
     of_prepare_dataset.prepare_dataset,
     publish=lambda made, folder, name: publish_contact_sheet(made.contact_sheet, folder, name),

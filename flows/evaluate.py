@@ -50,7 +50,7 @@ def evaluate(
     trained = [(setting, seed) for setting in experiment.trained_settings for seed in experiment.downstream_seeds]
     calls = [partial(_train_and_score, experiment, dataset, generated, setting, seed) for setting, seed in trained]
     if experiment.feature_extractor is not None:
-        calls.append(partial(_distances, experiment, experiment.feature_extractor, dataset.frames, generated))
+        calls.append(partial(_distances, experiment, experiment.feature_extractor, dataset, generated))
     found = call_together(*calls)
     return Evaluation(
         extractor=found[-1][0] if experiment.feature_extractor is not None else None,
@@ -67,7 +67,7 @@ def _train_and_score(
     training_set = [_frames_of(experiment, dataset, generated, part, seed) for part in setting.split("+")]
     label = f"{experiment.downstream.name} on {setting}, seed {seed}"
     model = train_downstream(training_set, downstream=experiment.downstream, seed=seed, label=label)
-    tested = [(dataset.frames, "test", setting, [dataset.poses])]
+    tested = [(dataset.tested_frames, "test", setting, [dataset.poses])]
     if setting == "real":
         # Do the synthetic frames show what their labels say? The real row's error is the floor, other frames' labels
         # are the ceiling.
@@ -98,14 +98,15 @@ def _frames_of(
 ) -> ManifestRef:
     """The training frames that a part of a setting's name stands for."""
     if part == "real":
-        return dataset.frames
+        return dataset.tested_frames
     if part == "more_real" and dataset.more_frames is not None:
         return dataset.more_frames
     if part in generated:
         return _of_seed(experiment, generated[part], seed)
     synthetic = _of_seed(experiment, generated["synthetic"], seed)
     if part == "faithful":
-        judge = train_downstream([dataset.frames], downstream=experiment.downstream, seed=seed, label="judge of labels")
+        real = [dataset.tested_frames]
+        judge = train_downstream(real, downstream=experiment.downstream, seed=seed, label="judge of labels")
         return take_faithful(
             judge,
             synthetic,
@@ -124,12 +125,13 @@ def _of_seed(experiment: Experiment, sets: list[ManifestRef], seed: int) -> Mani
 
 
 def _distances(
-    experiment: Experiment, feature_extractor: DownstreamChoice, frames: ManifestRef, generated: Generated
+    experiment: Experiment, feature_extractor: DownstreamChoice, dataset: PreparedDataset, generated: Generated
 ) -> tuple[ManifestRef, list[ManifestRef]]:
     """The feature extractor, and how far held-out real and generated frames are from the real training frames."""
     extractor = train_downstream(
-        [frames], downstream=feature_extractor, seed=experiment.seed, label="feature extractor"
+        [dataset.frames], downstream=feature_extractor, seed=experiment.seed, label="feature extractor"
     )
+    frames = dataset.tested_frames
     compared = [(frames, "test", "held-out real", 0)]
     compared += [(made, "train", name, number) for name, sets in generated.items() for number, made in enumerate(sets)]
     scores = [

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from functools import partial
 
+from ctlev_core import plugins
 from ctlev_core.report.report_files import publish_report
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
@@ -23,6 +24,7 @@ from flows.synthesize import synthesize
 from flows.train_generator import train_generator
 from tasks.copy_check import copy_check
 from tasks.ingest import ingest
+from tasks.nearest_seen import nearest_seen
 from tasks.realism import realism
 from tasks.report import report
 from tasks.stage import call_flow, call_together
@@ -69,6 +71,15 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         )
         for name, frames in zip(experiment.generator_names, generated, strict=True)
     ]
+    names = None
+    if experiment.target is not None and hasattr(plugins.load("generators", experiment.generator.name), "embed_names"):
+        names = nearest_seen(
+            checkpoint,
+            dataset.frames,
+            dataset.sample_conditions,
+            generator=experiment.generator,
+            label="nearest seen classes",
+        )
     if experiment.export is not None:
         call_flow(export_streams, experiment, dataset, synthetic)
     return report(
@@ -83,6 +94,8 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         looks,
         copies,
         dataset.more_frames,
+        dataset.target_frames,
+        names,
         title=experiment.name,
         notice=experiment.data_notice,
         settings=experiment.trained_settings,
@@ -117,4 +130,11 @@ def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -
 
 
 if __name__ == "__main__":
-    sys.exit(main(full_experiment, lambda made, asked: publish_report(made, HOME, asked.name), load=load_study))
+    sys.exit(
+        main(
+            full_experiment,
+            lambda made, asked: publish_report(made, HOME, asked.name),
+            load=load_study,
+            default_preset="demo",
+        )
+    )

@@ -85,7 +85,7 @@ def _look_for(choice: Choice) -> None:
 
 
 def _check_labels(experiment: Experiment) -> None:
-    check_dataset(experiment.metrics, experiment.dataset)
+    check_dataset(experiment.metrics, experiment.tested_dataset)
 
 
 def _check_intensity(experiment: Experiment) -> None:
@@ -97,7 +97,7 @@ def _check_intensity(experiment: Experiment) -> None:
         for name, choice in conditions.items()
         if getattr(plugins.load("conditions", choice.name), "NEEDS", "") == "intensity"
     ]
-    for dataset in (experiment.dataset, experiment.poses) if needing else ():
+    for dataset in (experiment.dataset, experiment.target, experiment.poses) if needing else ():
         if dataset is None:
             continue
         plugin = plugins.load_options(dataset)

@@ -17,7 +17,7 @@ from tasks.ingest import ingest
 
 class PreparedDataset(Frozen):
     """Manifests of a dataset ready for training and sampling; `poses` are the recordings whose labels are sampled,
-    `more_frames` other real frames to train on.
+    `more_frames` other real frames to train on, `target_frames` those of another dataset to train and test on.
     """
 
     recordings: ManifestRef
@@ -27,6 +27,12 @@ class PreparedDataset(Frozen):
     sample_conditions: ManifestRef
     contact_sheet: ManifestRef
     more_frames: ManifestRef | None = None
+    target_frames: ManifestRef | None = None
+
+    @property
+    def tested_frames(self) -> ManifestRef:
+        """What downstream models are trained on as `real`, and tested on."""
+        return self.target_frames or self.frames
 
 
 @flow(name="prepare-dataset")
@@ -36,7 +42,10 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
     frames = encode(
         recordings, encoding=experiment.encoding, windows=experiment.windows, label=experiment.encoding.name
     )
-    poses = recordings
+    poses, target_frames = recordings, None
+    if experiment.target is not None:
+        poses = ingest(dataset=experiment.target, label=f"{experiment.target.name}, target")
+        target_frames = encode(poses, encoding=experiment.encoding, windows=experiment.windows, label="target")
     if experiment.poses is not None:
         poses = ingest(dataset=experiment.poses, label=f"{experiment.poses.name}, poses")
     frame_conditions = condition_training_frames(experiment, recordings, frames, experiment.condition)
@@ -57,6 +66,7 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         sample_conditions=sample_conditions,
         contact_sheet=sheet,
         more_frames=_more_frames(experiment),
+        target_frames=target_frames,
     )
 
 

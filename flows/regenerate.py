@@ -97,15 +97,16 @@ def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: Mani
         seed=seed,
         label=regeneration.generator.name,
     )
-    calls = [partial(_score_likeness, regeneration, dataset.frames, synthetic)]
+    calls = [partial(_score_likeness, regeneration, dataset, synthetic)]
     if regeneration.gates.max_label_error_ratio is not None:
         calls.append(partial(_score_labels, regeneration, dataset, synthetic))
     scores = [score for found in call_together(*calls) for score in found]
     return MadeVersion(conditions=conditions, synthetic=synthetic, scores=scores)
 
 
-def _score_likeness(regeneration: Regeneration, frames: ManifestRef, synthetic: ManifestRef) -> list[ManifestRef]:
+def _score_likeness(regeneration: Regeneration, dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
     """How far from real frames, where features can be learnt, and how near to single ones."""
+    frames = dataset.frames
     downstream, extractor, scores = regeneration.feature_extractor, None, []
     if downstream is not None:
         extractor = train_downstream([frames], downstream=downstream, seed=regeneration.seed, label="feature extractor")
@@ -113,7 +114,7 @@ def _score_likeness(regeneration: Regeneration, frames: ManifestRef, synthetic: 
         scores.append(
             score_beside_real(
                 extractor,
-                frames,
+                dataset.tested_frames,
                 synthetic,
                 downstream=downstream,
                 distances=distances,
@@ -125,7 +126,7 @@ def _score_likeness(regeneration: Regeneration, frames: ManifestRef, synthetic: 
 
 def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
     """How well a model trained on real frames does on held-out real ones, and finds the labels of these."""
-    frames, downstream, seed = dataset.frames, regeneration.downstream, regeneration.downstream_seeds[0]
+    frames, downstream, seed = dataset.tested_frames, regeneration.downstream, regeneration.downstream_seeds[0]
     model = train_downstream([frames], downstream=downstream, seed=seed, label=f"{downstream.name} on real")
     scored = [
         (frames, "test", "real", [dataset.poses]),

@@ -165,7 +165,7 @@ def _errors(
     if measured.options.label_errors:
         seed = experiment.downstream_seeds[0]
         label = f"{experiment.downstream.name} on real, seed {seed}"
-        model = train_downstream([dataset.frames], downstream=experiment.downstream, seed=seed, label=label)
+        model = train_downstream([dataset.tested_frames], downstream=experiment.downstream, seed=seed, label=label)
     return sampling_errors(
         extractor,
         dataset.frames,

@@ -20,6 +20,7 @@ from ctlev_core.report.contact_sheet import contact_sheet_sections
 from ctlev_core.report.copies import copy_sections
 from ctlev_core.report.costs import cost_table, options_table, versions_table
 from ctlev_core.report.html import Curves, Folded, Section, render_report
+from ctlev_core.report.nearest_classes import nearest_sections
 from ctlev_core.report.paper_numbers import paper_section
 from ctlev_core.report.realism import realism_sections
 from ctlev_core.report.refusals import refusal_sections
@@ -45,7 +46,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=10, schema=tables.REPORT)
+@stage(version=11, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -59,6 +60,8 @@ def report(
     realism: Manifest,
     copies: list[Manifest],
     more_real: Manifest | None = None,
+    target: Manifest | None = None,
+    nearest: Manifest | None = None,
     *,
     title: str,
     notice: str,
@@ -70,7 +73,8 @@ def report(
     """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, `provenance.json` and `summary.json`.
 
     `generated` are the frames of each generator: first the experiment's own, called `synthetic`, then the baselines; of
-    several sets of one name the first is shown. `more_real` are other real frames of the moments asked for.
+    several sets of one name the first is shown. `more_real` are other real frames of the moments asked for, `target`
+    those of another dataset that was tested on, `nearest` what of the training set is most like its classes.
     """
     shown = dict(reversed(list(zip(generator_names, generated, strict=True))))
     shown = {name: shown[name] for name in dict.fromkeys(generator_names)}
@@ -87,10 +91,13 @@ def report(
             ("realism", realism.ref.path),
             *_roles("copies of", generator_names, copies),
             *([] if more_real is None else [("more real frames", more_real.ref.path)]),
+            *([] if target is None else [("target frames", target.ref.path)]),
+            *([] if nearest is None else [("nearest seen classes", nearest.ref.path)]),
         ]
     )
     traced = trace_scores([(manifest.ref.key, manifest.table) for manifest in scores], records)
-    samples = paired_samples(_samples(scores, [frames, *generated]))
+    real = [frames, *(manifest for manifest in (more_real, target) if manifest is not None)]
+    samples = paired_samples(_samples(scores, [*real, *generated]))
     rows, paired = traced.to_pylist(), PairedScores(samples)
     results = _results(rows, settings, list(shown), paired)
     copied = copy_sections(frames, generated, copies)
@@ -100,7 +107,7 @@ def report(
     _, by_class = group_tables(rows, settings)
     words = _verdict(rows, settings, list(shown), paired)
     steps = pictures.steps(frames, frame_conditions, conditions, next(iter(shown.values())), _kind(frame_conditions))
-    grid = pictures.sample_grid(conditions, shown, [frames] if more_real is None else [frames, more_real])
+    grid = pictures.sample_grid(conditions, shown, real)
     write_summary(out.folder, Summary(words, steps, grid))
     page = render_report(
         title=title,
@@ -112,7 +119,8 @@ def report(
             *copied[:1],
             *refused,
             grid,
-            *_figures(rows, frames, conditions, shown),
+            *([] if nearest is None else nearest_sections(nearest)),
+            *_figures(rows, frames, conditions, shown, target),
             *looks[:1],
             *_training_of_generators(checkpoints, checkpoint_names),
             *_folded("Class by class", by_class),
@@ -148,13 +156,15 @@ def _results(rows: list[Row], settings: Sequence[str], names: list[str], paired:
     return [headline, *origins, *baseline_tables(names, _first_metric(rows), paired), *others]
 
 
-def _figures(rows: list[Row], frames: Manifest, conditions: Manifest, shown: dict[str, Manifest]) -> list[Section]:
+def _figures(
+    rows: list[Row], frames: Manifest, conditions: Manifest, shown: dict[str, Manifest], target: Manifest | None
+) -> list[Section]:
     metric = _first_metric(rows)
     points = scaling_points(rows, metric)
     return [
         *pictures.motion(conditions, next(iter(shown.values()))),
         *([scaling_figure(points, metric)] if len({point.ratio for point in points}) >= FEWEST_AMOUNTS else []),
-        pictures.real_grid(frames),
+        pictures.real_grid(frames, target),
     ]
 
 

@@ -49,7 +49,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events
 from data_contracts.labels import Labels, Part, Recording
 
-VERSION = 1
+VERSION = 2
 
 FIELD: SensorSize = (240, 180)
 MAX_OUTSIDE = 0.01
@@ -141,7 +141,8 @@ def class_name_of(folder: str) -> str:
 def list_recordings(options: Options) -> list[Recording]:
     """Every chosen recording, sorted by class and name; its id and subject are the path in the root.
 
-    With `zero_shot`, a last label-only recording `condition/<class folder>` for each of the ten classes.
+    Last come label-only recordings `condition/<class folder>`, which say what is sampled: one for each class, with
+    `zero_shot` for each of the ten.
 
     Raises:
         DataError: the tree is not as expected; the message says where and shows it. An unknown class.
@@ -157,18 +158,10 @@ def list_recordings(options: Options) -> list[Recording]:
                 continue
             for file in sorted(first_of(files.get(folder, []), limits.get(split))):
                 recordings.append(_recording(folder, split, file, options))
-    if options.zero_shot:
-        recordings += [
-            Recording(
-                f"condition/{folder}",
-                f"condition/{folder}",
-                (Part("condition"),),
-                class_name_of(folder),
-                has_events=False,
-            )
-            for folder in wanted
-            if folder in ZERO_SHOT
-        ]
+    for folder in wanted:
+        if folder in ZERO_SHOT or not options.zero_shot:
+            name = f"condition/{folder}"
+            recordings.append(Recording(name, name, (Part("condition"),), class_name_of(folder), has_events=False))
     return recordings
 
 

@@ -86,6 +86,13 @@ def sample(
     return sample_checkpoint(checkpoint, conditions, options, with_controlnet=False, seeds=seeds, work=work)
 
 
+def embed_names(checkpoint: Path, names: Sequence[str]) -> np.ndarray:
+    """What the checkpoint's text encoder makes of N names: [N, D] float32."""
+    from ctlev_core.diffusion import name_embeddings
+
+    return name_embeddings.embed_names(checkpoint, names)
+
+
 def _check_text_only(conditions: Conditions) -> None:
     if conditions.images is not None:
         raise ValueError(

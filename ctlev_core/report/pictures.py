@@ -141,13 +141,17 @@ def _moment(source_id: str) -> tuple[str, int]:
     return name, int(time) if time.isdecimal() else -1
 
 
-def real_grid(frames: Manifest) -> ImageGrid:
-    """Some real frames of training and of test, evenly spread."""
+def real_grid(frames: Manifest, target: Manifest | None = None) -> ImageGrid:
+    """Some real frames of training and of test, evenly spread; `target` are those of another dataset tested on."""
     rows: list[tuple[str, list[np.ndarray]]] = []
-    for split in ("train", "test"):
-        members = frames.rows_where(split=split)
-        chosen = members[spread(len(members), GRID_COLUMNS)]
-        rows.append((f"real, {split}", [np.asarray(frames.array("frames")[row]) for row in chosen]))
+    sets = [("real", frames, ("train", "test"))]
+    if target is not None:
+        sets = [("the generator's", frames, ("train",)), ("real", target, ("train", "test"))]
+    for name, manifest, splits in sets:
+        for split in splits:
+            members = manifest.rows_where(split=split)
+            chosen = members[spread(len(members), GRID_COLUMNS)]
+            rows.append((f"{name}, {split}", [np.asarray(manifest.array("frames")[row]) for row in chosen]))
     return ImageGrid("Real frames", rows, caption="The data the generator was tuned on, and the data tested on.")
 
 

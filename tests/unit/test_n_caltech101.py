@@ -69,11 +69,14 @@ def ids(recordings: list, split: str) -> list[str]:
 
 def test_each_class_is_split_and_no_recording_is_in_two_splits(root):
     recordings = listed(root, test_fraction=0.25, validation_fraction=0.25)
-    assert len(recordings) == len({r.recording_id for r in recordings}) == 32
+    assert len(recordings) == len({r.recording_id for r in recordings}) == 32 + 4
+    folders = ["accordion", "crocodile_head", "bonsai", "ferry"]
     for split, number in (("train", 4), ("validation", 2), ("test", 2)):
         classes = [name.split("/")[0] for name in ids(recordings, split)]
-        assert classes == sorted(["accordion", "crocodile_head", "bonsai", "ferry"] * number)
-    assert all(r.subject == r.recording_id and r.sensor_size == (240, 180) for r in recordings)
+        assert classes == sorted(folders * number)
+    assert ids(recordings, "condition") == [f"condition/{name}" for name in sorted(folders)]
+    assert all(r.subject == r.recording_id for r in recordings)
+    assert all(r.sensor_size == (240, 180) for r in recordings if r.has_events)
     first = recordings[0]
     assert first.files[0].parent == root / "accordion" and first.recording_id.startswith("accordion/image_000")
     assert {r.class_name for r in recordings} == {"accordion", "crocodile head", "bonsai", "ferry"}

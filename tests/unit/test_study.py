@@ -8,7 +8,7 @@ import pytest
 import yaml
 from report_artefacts import SETTINGS, Experiment
 
-from ctlev_core.plugins import PluginError
+from ctlev_core.plugins import PluginError, load_options
 from ctlev_core.report.html import ImageGrid, Step
 from ctlev_core.report.report_files import publish_report
 from ctlev_core.report.study import distances_table
@@ -119,13 +119,25 @@ def test_damaged_summaries_are_refused(tmp_path, damage):
 def test_the_bundled_study_is_made_of_its_presets():
     study = load_study("all_routes", ["experiments.pose.num_synthetic=5"])
     assert isinstance(study, Study)
-    demo = load_experiment("demo", [])
-    assert study.experiments["pose"] == demo.model_copy(update={"num_synthetic": 5})
-    assert study.experiments["body"] == load_experiment("body", [])
-    changes = ["name=zero_shot", "settings=[synthetic]", "dataset.options.zero_shot=true"]
-    changes += ["metrics=[{name: zero_shot}, {name: classification}]"]
-    assert study.experiments["zero_shot"] == load_experiment("objects", changes)
-    assert load_study("demo", []) == demo
+    pose = load_experiment("pose", [])
+    assert study.experiments["pose"] == pose.model_copy(update={"num_synthetic": 5})
+    for name in ("body", "objects", "zero_shot"):
+        assert study.experiments[name] == load_experiment(name, [])
+    assert load_study("pose", []) == pose
+
+
+def test_the_demo_trains_once_what_its_experiments_share():
+    study = load_study("demo", [])
+    assert isinstance(study, Study)
+    pose, body, objects, zero_shot = study.experiments.values()
+    assert pose.baselines == body.baselines
+    assert load_options(pose.dataset) == load_options(body.dataset)  # one says what is the other's default
+    for name in ("windows", "encoding", "num_synthetic", "feature_extractor", "seed", "max_tries"):
+        assert getattr(pose, name) == getattr(body, name)
+    for name in ("dataset", "windows", "encoding", "condition", "generator", "feature_extractor", "seed"):
+        assert getattr(objects, name) == getattr(zero_shot, name)
+    assert objects.feature_extractor == objects.downstream
+    assert set(zero_shot.target.options["classes"]).isdisjoint(objects.dataset.options.get("classes", ()))
 
 
 @pytest.mark.parametrize(
@@ -139,6 +151,10 @@ def test_the_bundled_study_is_made_of_its_presets():
         ({"experiments": {"a": {"extends": "smoke", "set": ["seed"]}}}, "--set expects key=value, got 'seed'"),
         ({"experiments": {"a": {"extends": "smoke", "set": ["seeds=1"]}}}, "seeds"),
         ({"experiments": {"a": {"extends": "smoke"}, "b": {"extends": "smoke"}}}, "need different names"),
+        (
+            {"experiments": {"a": {"extends": "smoke", "set": ["windows.count=1"]}}},
+            r"unknown option 'experiments\.a\.windows\.count'; known: method, num_events",
+        ),
         ({"experiments": {"../a": {"extends": "smoke"}}}, "names of folders"),
         ({"experiments": {"a": {"extends": "smoke", "set": ["dataset.options.colour=1"]}}}, "unknown option 'colour'"),
     ],
@@ -190,7 +206,7 @@ def test_costs_are_those_of_the_operations():
     assert text.sampling_s == pytest.approx(650_000 * (1000 * 0.803 + 2.515) / 790)
     assert pose.sampling_s == pytest.approx(5000 * (1000 * (0.803 + 0.283) + 2.515) / 790)
     assert pose.frames_bytes == 5000 * 512 * 512 * 3
-    assert estimate_costs(load_experiment("demo", [])) is None
+    assert estimate_costs(load_experiment("pose", [])) is None
 
 
 def test_costs_of_smaller_images_and_guidance_are_between_the_counted_ones():
@@ -201,7 +217,7 @@ def test_costs_of_smaller_images_and_guidance_are_between_the_counted_ones():
     )
 
     def seconds(*more):
-        experiment = load_preset(Options, PRESETS, "demo", [*asked, "sampling={}", *more])
+        experiment = load_preset(Options, PRESETS, "pose", [*asked, "sampling={}", *more])
         return estimate_costs(experiment)
 
     large, small = (seconds(f"encoding.options.image_size=[{side}, {side}]") for side in (512, 256))
@@ -213,5 +229,7 @@ def test_costs_of_smaller_images_and_guidance_are_between_the_counted_ones():
 
 
 def test_only_the_full_experiment_takes_a_study():
-    with pytest.raises(PluginError, match="'all_routes' is a study of several experiments"):
+    with pytest.raises(
+        PluginError, match=r"'all_routes' is a study .* name one of its parts instead: pose, body, objects, zero_shot"
+    ):
         load_experiment("all_routes", [])
