@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.paired_differences import share_of_gain
-from ctlev_core.provenance import read_records, write_provenance
+from ctlev_core.provenance import Record, read_records, write_provenance
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.report import pictures
 from ctlev_core.report.contact_sheet import contact_sheet_sections
@@ -35,6 +35,7 @@ from ctlev_core.report.score_tables import (
 )
 from ctlev_core.report.summary import Summary, write_summary
 from ctlev_core.report.tables import Cell, Table, render_latex, render_markdown
+from ctlev_core.report.training_curves import prior_figures
 from ctlev_core.report.verdict import verdict
 from ctlev_core.traced_scores import paired_samples, trace_scores
 from data_contracts import tables
@@ -120,6 +121,7 @@ def report(
             *refused,
             grid,
             *([] if nearest is None else nearest_sections(nearest)),
+            *prior_figures(rows, _learnt_with(records), _first_metric(rows)),
             *_figures(rows, frames, conditions, shown, target),
             *looks[:1],
             *_training_of_generators(checkpoints, checkpoint_names),
@@ -179,6 +181,16 @@ def _verdict(rows: list[Row], settings: Sequence[str], names: list[str], paired:
     if gain is not None and start is not None and reached is not None and most is not None:
         ceiling = gain, share_of_gain(start, reached, most)
     return verdict(rows, settings, paired.difference("real", f"real+{own}", metric), beside, ceiling)
+
+
+def _learnt_with(records: Sequence[Record]) -> dict[str, dict[str, Any]]:
+    """Options of each generator that learnt, by its name."""
+    prefix = "checkpoint of "
+    return {
+        record.role.removeprefix(prefix): record.arguments["generator"]["options"]
+        for record in records
+        if record.role.startswith(prefix) and "generator" in record.arguments
+    }
 
 
 def _roles(role: str, names: Sequence[str], manifests: Sequence[Manifest]) -> list[tuple[str, Path]]:

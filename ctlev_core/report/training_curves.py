@@ -1,0 +1,65 @@
+"""How the frames of generators get better with training, from pre-trained weights and from random ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ctlev_core.report.html import Curves
+from ctlev_core.report.score_tables import interval_over_trainings
+from data_contracts.experiment import LABELS_OF
+
+FEWEST_AMOUNTS = 2
+"""Amounts of training that are worth a line."""
+PRE_TRAINED, RANDOM = "pre-trained weights", "random weights"
+_CAPTION = (
+    "Each point is a fine-tuning of its own with so many steps; bars are 95 % intervals, over fine-tunings too where "
+    "there are several. Both start from the same data; only the weights before the first step differ."
+)
+
+
+def prior_figures(
+    rows: Sequence[dict[str, Any]], options: Mapping[str, Mapping[str, Any]], metric: str
+) -> list[Curves]:
+    """Label error and distance to real frames over steps of training; none where it was not varied for both starts.
+
+    Args:
+        rows: of the table `scores`.
+        options: of each generator that learnt, by its name: `num_steps`, and `random_init` where it has a prior.
+        metric: of the labels.
+    """
+    found: dict[str, dict[int, str]] = {PRE_TRAINED: {}, RANDOM: {}}
+    for name, chosen in options.items():
+        if "random_init" in chosen:
+            found[RANDOM if chosen["random_init"] else PRE_TRAINED][chosen["num_steps"]] = name
+    if min(map(len, found.values())) < FEWEST_AMOUNTS:
+        return []
+    distance = next(
+        (r["metric"] for r in rows if r["task"] == "distance" and r["metric"].startswith(("fd", "fid"))), ""
+    )
+    figures = []
+    for title, prefix, wanted in (
+        ("Are labels found in the frames?", f"{LABELS_OF} ", metric),
+        ("How far are the frames from real ones?", "", distance),
+    ):
+        series: dict[str, tuple[list[float], list[float]]] = {}
+        spans: dict[str, tuple[list[float], list[float]]] = {}
+        for start, names in found.items():
+            for num_steps, name in sorted(names.items()):
+                scored = [r for r in rows if (r["setting"], r["metric"], r["group"]) == (prefix + name, wanted, "all")]
+                if scored:
+                    value, low, high = interval_over_trainings(scored)
+                    _append(series.setdefault(start, ([], [])), float(num_steps), value)
+                    _append(spans.setdefault(start, ([], [])), low, high)
+        if series:
+            figures.append(
+                Curves(
+                    title, series, "optimiser steps of fine-tuning", wanted, log_x=True, caption=_CAPTION, spans=spans
+                )
+            )
+    return figures
+
+
+def _append(columns: tuple[list[float], list[float]], first: float, second: float) -> None:
+    columns[0].append(first)
+    columns[1].append(second)
