@@ -103,6 +103,26 @@ def training_of(
     return train
 
 
+def naming_of(kind: str) -> Callable[[Path, str], str]:
+    """The `name_score` of an extractor plug-in of that name that is ready-made."""
+
+    def name_score_of(model: Path, score: str) -> str:
+        """What a score in these features is called: see `feature_files.name_score`."""
+        return name_score(score, read_extractor(model, kind))
+
+    return name_score_of
+
+
+def prediction_of(features: Callable[[Path, np.ndarray], np.ndarray]) -> Callable[..., Mapping[str, np.ndarray]]:
+    """The `predict` of an extractor plug-in that is ready-made; `features` are its own."""
+
+    def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+        """`features` [N, D]: there is nothing else to predict."""
+        return {"features": features(model, frames)}
+
+    return predict
+
+
 def read_extractor(folder: Path, kind: str) -> dict[str, Any]:
     """The `config.json` of an extractor that `write_extractor` wrote.
 

@@ -9,7 +9,6 @@ Source: Heusel et al., GANs Trained by a Two Time-Scale Update Rule, NeurIPS 201
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,19 +69,11 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
     return feature_files.compute_features(frames, network, place, f"features of {model}")
 
 
-def name_score(model: Path, score: str) -> str:
-    """What a score in these features is called: `fid` for `fd`."""
-    return feature_files.name_score(score, feature_files.read_extractor(model, NAME))
-
-
-def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
-    """`features` [N, 2048]: there is nothing else to predict."""
-    return {"features": features(model, frames)}
-
-
 def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
     (file,) = input_files(options)
     return "inception", {_FILE: file}
 
 
+name_score = feature_files.naming_of(NAME)
+predict = feature_files.prediction_of(features)
 train = feature_files.training_of(NAME, VERSION, _find_network, features)

@@ -9,7 +9,6 @@ by a Two Time-Scale Update Rule, NeurIPS 2017 (FID).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -94,16 +93,6 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
     return feature_files.compute_features(frames, run, resolve_device(place), f"features of {path.parent.parent}")
 
 
-def name_score(model: Path, score: str) -> str:
-    """What a score in these features is called: `fid` for `fd` of the verified Inception, or SCORE_event_..._SHA8."""
-    return feature_files.name_score(score, feature_files.read_extractor(model, NAME))
-
-
-def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
-    """`features` [N, D]: there is nothing else to predict."""
-    return {"features": features(model, frames)}
-
-
 def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
     (file,) = input_files(options)
     return "inception" if _is_inception(file) else options.architecture, {_FILE: file}
@@ -113,4 +102,6 @@ def _is_inception(path: Path) -> bool:
     return file_digest(path) == feature_files.INCEPTION_SHA256
 
 
+name_score = feature_files.naming_of(NAME)
+predict = feature_files.prediction_of(features)
 train = feature_files.training_of(NAME, VERSION, _find_network, features)

@@ -9,7 +9,6 @@ happens at the border of an event image counts.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -92,16 +91,6 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
     return feature_files.compute_features(frames, run, resolve_device(device), f"features of {model}")
 
 
-def name_score(model: Path, score: str) -> str:
-    """What a score in these features is called: SCORE_event_ARCHITECTURE_SHA8."""
-    return feature_files.name_score(score, feature_files.read_extractor(model, NAME))
-
-
-def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
-    """`features` [N, D]: there is nothing else to predict."""
-    return {"features": features(model, frames)}
-
-
 def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
     files = {path.name: path for path in input_files(options)}
     return _read_kind(files[_CONFIG].parent).replace("_", ""), files
@@ -158,4 +147,6 @@ def _load(folder: Path) -> tuple[Any, str]:
     return network.float().eval(), output
 
 
+name_score = feature_files.naming_of(NAME)
+predict = feature_files.prediction_of(features)
 train = feature_files.training_of(NAME, VERSION, _find_network, features)
