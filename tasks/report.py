@@ -180,7 +180,8 @@ def _verdict(rows: list[Row], settings: Sequence[str], names: list[str], paired:
     ceiling = None
     if gain is not None and start is not None and reached is not None and most is not None:
         ceiling = gain, share_of_gain(start, reached, most)
-    return verdict(rows, settings, paired.difference("real", f"real+{own}", metric), beside, ceiling)
+    added, instead = (paired.difference("real", setting, metric) for setting in (f"real+{own}", own))
+    return verdict(rows, settings, added, beside, ceiling, instead)
 
 
 def _learnt_with(records: Sequence[Record]) -> dict[str, dict[str, Any]]:

@@ -22,7 +22,7 @@ from ctlev_core.zero_shot import balanced_accuracy
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
-VERSION = 1
+VERSION = 2
 INPUT = "classes"
 
 
@@ -69,3 +69,23 @@ def prepare(predicted: Mapping[str, Any], target: Labels, options: Options) -> C
         return {"binary_accuracy_mean": float(np.mean(list(found.values()))), **found}
 
     return compute_of
+
+
+def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
+    """What each row adds to `binary_accuracy_mean`, times N, so that their mean is that score [N]; may exceed 1.
+
+    A row is a positive of its own class and a negative of all others; each is worth its share of those.
+
+    Raises:
+        ValueError: as `prepare`.
+    """
+    guesses = read_guesses(predicted, target)
+    names = options.classes or tuple(sorted(set(target.class_names)))
+    prepare(predicted, target, options)(np.arange(len(target)))  # raises
+    numbers = {name: number for number, name in enumerate(guesses.classes.tolist())}
+    total = np.zeros(len(target))
+    for name in names:
+        is_positive, is_called = (column == numbers[name] for column in (guesses.truth, guesses.guess))
+        share = np.where(is_positive, 1 / is_positive.sum(), 1 / (~is_positive).sum())
+        total += share * (is_positive == is_called)
+    return total * len(target) / (2 * len(names))

@@ -27,6 +27,7 @@ def verdict(
     difference: Difference | None = None,
     beside: Mapping[str, Difference | None] | None = None,
     ceiling: tuple[Difference, Difference | None] | None = None,
+    instead: Difference | None = None,
 ) -> str:
     """Compare training on real data with training on real and synthetic data, and synthetic data with baselines.
 
@@ -37,6 +38,7 @@ def verdict(
         beside: for each baseline, real + synthetic minus real + baseline, paired by sample.
         ceiling: real + more real minus real, and the share of that gain which synthetic data reached (None where the
             gain is not certain).
+        instead: synthetic alone minus real, likewise; told where nothing was trained on both together.
     Returns:
         A few sentences. A change counts as shown only where the interval of the difference excludes zero.
     """
@@ -51,6 +53,9 @@ def verdict(
         own = {name: values[name] for name in settings if name in values}
     summary = f"{metric} on held-out real data ({'lower' if lower_is_better(metric) else 'higher'} is better): "
     summary += ", ".join(f"{setting} {value:.3f}" for setting, value in own.items()) + "."
+    if "real+synthetic" not in values and instead is not None and {"real", "synthetic"} <= values.keys():
+        told = _what_it_did(instead, metric, values["real"], "Training on synthetic data instead of real data")
+        return f"{summary} {told} {_labels(values)}".rstrip()
     if difference is None or "real" not in values or "real+synthetic" not in values:
         return summary
     sentences = [summary, _what_it_did(difference, metric, values["real"])]
@@ -72,17 +77,18 @@ def _means(rows: list[dict[str, Any]], metric: str) -> dict[str, float]:
     return {setting: float(np.mean(values)) for setting, values in found.items()}
 
 
-def _what_it_did(difference: Difference, metric: str, real: float) -> str:
+def _what_it_did(difference: Difference, metric: str, real: float, what: str = "Adding synthetic data") -> str:
+    doing = what[0].lower() + what[1:]
     if math.isnan(difference.low):
-        return "There are too few test recordings to say whether adding synthetic data helped."
+        return f"There are too few test recordings to say whether {doing} helped."
     if difference.low == difference.high == 0:
-        return "Adding synthetic data changed nothing."
+        return f"{what} changed nothing."
     text = f"paired difference {difference.text()}"
     if not difference.is_certain:
-        return f"Whether adding synthetic data helped is undecided: {text}."
+        return f"Whether {doing} helped is undecided: {text}."
     better = (difference.value < 0) == lower_is_better(metric)
     share = f", {abs(difference.value / real):.0%} of what real data alone gives" if real else ""
-    return f"Adding synthetic data made it {'better' if better else 'worse'}: {text}{share}."
+    return f"{what} made it {'better' if better else 'worse'}: {text}{share}."
 
 
 def _ceiling(gain: Difference, share: Difference | None) -> str:

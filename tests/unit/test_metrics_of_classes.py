@@ -151,6 +151,23 @@ def test_negatives_are_as_many_and_evenly_spread(names, seed):
     assert np.array_equal(rows, again[0])
 
 
+@pytest.mark.parametrize("classes", [(), ("a", "c")])
+def test_the_mean_of_zero_shot_rows_is_the_score(classes):
+    names = [*"aaaaabbbc", "d"]
+    predicted, target = random_prediction(3, names, list("abcd")), class_labels(names)
+    options = zero_shot.Options(classes=classes)
+    rows = zero_shot.compute_rows(predicted, target, options)
+    assert rows.shape == (10,) and rows.min() >= 0
+    assert rows.mean() == pytest.approx(
+        zero_shot.compute(predicted, target, options)["binary_accuracy_mean"], abs=1e-14
+    )
+    if not classes:
+        # A right row of class c, alone in it: all of c's positives, and its share of the others' negatives, 1 / 5 of
+        # those of a, 1 / 7 of those of b, 1 / 9 of those of d; of 2 x 4 halves.
+        sure = {"probability": np.eye(4)[["abcd".index(name) for name in names]], "classes": np.array(list("abcd"))}
+        assert zero_shot.compute_rows(sure, target, options)[8] == pytest.approx(10 / 8 * (1 + 1 / 5 + 1 / 7 + 1 / 9))
+
+
 def test_zero_shot_names_what_is_missing():
     predicted, target = random_prediction(0, list("aab"), list("ab")), class_labels("aab")
     with pytest.raises(ValueError, match="no target row is of class pagoda"):

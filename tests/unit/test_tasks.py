@@ -111,6 +111,15 @@ def test_verdict_sets_each_baseline_beside_in_a_sentence_of_its_own():
     assert "real+esim is 6.200; which is better is undecided: +0.100 [-0.100, +0.300]." in text
 
 
+def test_without_both_together_synthetic_data_is_told_beside_real_data():
+    rows = [{**one, "metric": "accuracy"} for one in ROWS if one["setting"] != "real+synthetic"]
+    text = verdict(rows, SETTINGS, instead=Difference(0.5, 0.25, 0.75))
+    assert "Training on synthetic data instead of real data made it better: paired difference +0.500 [+0.250" in text
+    unsure = verdict(rows, SETTINGS, instead=Difference(0.5, -0.25, 1.25))
+    assert "Whether training on synthetic data instead of real data helped is undecided: paired difference" in unsure
+    assert "instead" not in verdict(ROWS, SETTINGS, Difference(-0.8, -1.0, -0.6), instead=Difference(0.5, 0.25, 0.75))
+
+
 def test_directions():
     assert lower_is_better("fd_event_classifier_0123abcd") and lower_is_better("mpjpe2d_px")
     assert not lower_is_better("accuracy") and not lower_is_better("pck_px4")
