@@ -13,17 +13,19 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flow_scripts import REPOSITORY, digests
+from flow_scripts import REPOSITORY
 
 from ctlev_core.processes import die_with_parent
 
 PREFECT = [str(Path(sys.executable).with_name("prefect"))]
 ENDED = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
+TIMEOUT_S = 900.0
+"""For what takes seconds to a minute where nothing else runs."""
 
 
 @dataclass
@@ -43,7 +45,7 @@ class Service:
         with urllib.request.urlopen(request, timeout=60) as response:
             return json.loads(response.read() or b"null")
 
-    def prefect(self, *arguments: str, timeout: float = 240) -> subprocess.CompletedProcess[str]:
+    def prefect(self, *arguments: str, timeout: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:
         """Run a command of Prefect's, from the repository."""
         command = [*PREFECT, "--no-prompt", *arguments]
         return subprocess.run(
@@ -77,31 +79,26 @@ class Service:
         assert finished.returncode == 0, finished.stderr + finished.stdout
         return re.findall(r"UUID: ([0-9a-f-]{36})", finished.stdout)[0]
 
-    def state(self, run: str, *, until: set[str], timeout: float = 400) -> dict[str, Any]:
+    def state(self, run: str, *, until: set[str]) -> dict[str, Any]:
         """The state of a run, once its type is one of `until`."""
-        state: dict[str, Any] = {}
-        deadline = time.monotonic() + timeout
-        while time.monotonic() < deadline:
-            state = self.api(f"flow_runs/{run}")["state"]
-            if state["type"] in until:
-                return state
+        deadline = time.monotonic() + TIMEOUT_S
+        while (state := self.api(f"flow_runs/{run}")["state"])["type"] not in until:
+            assert time.monotonic() < deadline, f"{state}\n{self.log('worker')}"
             time.sleep(0.5)
-        raise AssertionError(f"{state}\n{(self.home / 'worker.log').read_text()[-4000:]}")
+        return state
 
-    def lose_worker_after(self, stage: str, deployment: str, home: Path, timeout: float = 400) -> dict[str, str]:
-        """Ask for a run and kill its worker once a stage is stored; then there is a new one.
-
-        Returns:
-            Digests of what had been stored by then.
-        """
-        self.start_run(deployment, home)
-        deadline = time.monotonic() + timeout
-        while not digests(home, (stage,)) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        before = digests(home)
-        assert before, (self.home / "worker.log").read_text()[-4000:]
+    def lose_worker_once(self, happened: Callable[[], object], run: str) -> None:
+        """Kill the worker as soon as something has happened, in the middle of a run; then there is a new worker."""
+        deadline = time.monotonic() + TIMEOUT_S
+        while not happened():
+            state = self.api(f"flow_runs/{run}")["state"]
+            assert state["type"] not in ENDED and time.monotonic() < deadline, f"{state}\n{self.log('worker')}"
+            time.sleep(0.2)
         self.replace_worker()
-        return before
+
+    def log(self, name: str) -> str:
+        """The end of what the server or the workers said."""
+        return (self.home / f"{name}.log").read_text()[-4000:]
 
     def plan(self, run: str) -> list[dict[str, str]]:
         """What a run said it would do."""
@@ -148,6 +145,8 @@ def server(home: Path) -> Iterator[Service]:
         "PREFECT_HOME": str(home / "prefect"),
         "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        # A new schedule is seen when the scheduler next looks, by itself once a minute.
+        "PREFECT_SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2",
         "PREFECT_WORKER_QUERY_SECONDS": "2",
         "DO_NOT_TRACK": "1",
         "NO_COLOR": "1",
@@ -164,7 +163,7 @@ def server(home: Path) -> Iterator[Service]:
             preexec_fn=die_with_parent,
         )
     try:
-        deadline = time.monotonic() + 300
+        deadline = time.monotonic() + TIMEOUT_S
         while True:
             try:
                 made.api("health")

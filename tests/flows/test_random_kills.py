@@ -23,7 +23,7 @@ TIMED = {"report"}
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
+@pytest.mark.timeout(2400)
 def test_twenty_killed_runs_end_in_the_digests_of_an_undisturbed_one(smoke_home, tmp_path):
     with server(tmp_path) as service:  # to start one for each run would take longer than all the rest
         kill_and_run_again(service.environment, tmp_path, deterministic(smoke_home))
@@ -65,13 +65,17 @@ def kill_and_run_again(environment, folder, expected):
 
 def waits_for_work(process, home, count):
     """Wait until a run is past the start of Prefect and has stored `count` artefacts; False where it ends before."""
-    began, stored = time.time(), len(digests(home))
+    began, stored = time.time(), num_stored(home)
     while process.poll() is None:
         locks = (path.stat().st_mtime for path in (home / "locks").glob("*") if path.name != "store")
-        if any(time_s > began for time_s in locks) and len(digests(home)) >= stored + count:
+        if any(time_s > began for time_s in locks) and num_stored(home) >= stored + count:
             return True
         time.sleep(0.02)
     return False
+
+
+def num_stored(home):
+    return sum(1 for _ in home.glob("artefacts/*/*/run.json"))
 
 
 def check_all(home):
