@@ -42,30 +42,11 @@ def make(patch, home, kind, workers):
     patch.setenv("CTLEV_RUNNER", kind)
     patch.setenv("CTLEV_WORKERS", str(workers))
     recordings = run(ingest, dataset=STUDIO)
-    frames = run(encode, recordings=recordings, encoding=COUNTED, windows=WINDOWS)
-    asked = run(
-        condition_samples,
-        poses=recordings,
-        recordings=recordings,
-        frames=frames,
-        condition=ConditionChoice(name="body_motion"),
-        encoding=COUNTED,
-        windows=WINDOWS,
-        count=5,
-        order="random",
-        views="labelled",
-        seed=1,
-    )
-    run(
-        simulate,
-        recordings=recordings,
-        frames=frames,
-        conditions=asked,
-        sampling=SamplingChoice(name="smpl_esim"),
-        encoding=COUNTED,
-        windows=WINDOWS,
-        seed=2,
-    )
+    given = {"recordings": recordings, "encoding": COUNTED, "windows": WINDOWS}
+    given["frames"] = run(encode, **given)
+    motions = {"condition": ConditionChoice(name="body_motion"), "order": "random", "views": "labelled"}
+    asked = run(condition_samples, poses=recordings, count=5, seed=1, **motions, **given)
+    run(simulate, conditions=asked, sampling=SamplingChoice(name="smpl_esim"), seed=2, **given)
     found = {}
     for record in sorted(home.glob("artefacts/*/*/run.json")):
         Store(home).check(record.parent)
