@@ -21,7 +21,8 @@ _CAPTION = (
 def prior_figures(
     rows: Sequence[dict[str, Any]], options: Mapping[str, Mapping[str, Any]], metric: str
 ) -> list[Curves]:
-    """Label error and distance to real frames over steps of training; none where it was not varied for both starts.
+    """Label error, distance to real frames, and the error of a model trained on them too, over steps of fine-tuning;
+    none where those were not varied for both starts.
 
     Args:
         rows: of the table `scores`.
@@ -41,6 +42,7 @@ def prior_figures(
     for title, prefix, wanted in (
         ("Are labels found in the frames?", f"{LABELS_OF} ", metric),
         ("How far are the frames from real ones?", "", distance),
+        ("What does a model learn from real frames and these?", "real+", metric),
     ):
         series: dict[str, tuple[list[float], list[float]]] = {}
         spans: dict[str, tuple[list[float], list[float]]] = {}

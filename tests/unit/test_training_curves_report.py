@@ -32,6 +32,7 @@ ROWS = [
     row("labels of few", "error_px", 9.0),
     row("labels of random_300", "error_px", 8.5),
     row("labels of random_30", "error_px", 14.0),
+    *(row(f"real+{name}", "error_px", 4.0 + number) for number, name in enumerate(OPTIONS)),
     row("shuffled labels of synthetic", "error_px", 20.0),
     row("labels of event_gan", "error_px", 1.0),
     *(row(name, "kid_event_x", 0.5, task="distance") for name in OPTIONS),
@@ -40,12 +41,14 @@ ROWS = [
 
 
 def test_lines_are_means_over_fine_tunings_by_steps_and_start():
-    labels, distances = prior_figures(ROWS, OPTIONS, "error_px")
+    labels, distances, learnt = prior_figures(ROWS, OPTIONS, "error_px")
     assert labels.series == {PRE_TRAINED: ([30, 300], [9, 7]), RANDOM: ([30, 300], [14, 8.5])}
     low, high = (ends[1] for ends in labels.spans[PRE_TRAINED])
     # Half an interval of .5 in each, and of two fine-tunings 1.96 times their standard error, sqrt(2) / sqrt(2).
     assert (low, high) == pytest.approx((7 - (0.5**2 + 1.96**2) ** 0.5, 7 + (0.5**2 + 1.96**2) ** 0.5))
     assert distances.series == {PRE_TRAINED: ([30, 300], [1, 0]), RANDOM: ([30, 300], [3, 2])}
+    assert learnt.series == {PRE_TRAINED: ([30, 300], [5, 4]), RANDOM: ([30, 300], [7, 6])}
+    assert len(prior_figures([r for r in ROWS if "real" not in r["setting"]], OPTIONS, "error_px")) == 2
     assert labels.log_x and (labels.y_label, distances.y_label) == ("error_px", "fd_event_x")
 
 
