@@ -99,6 +99,41 @@ def cluster_bootstrap(
     return low, high
 
 
+def ratio_bootstrap(
+    sums: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    groups: Sequence[str] | np.ndarray,
+    *,
+    level: float = 0.95,
+    num_resamples: int = 500,
+    seed: int = 0,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """What `cluster_bootstrap` gives for scores that are quotients of two sums over rows, with the same draws.
+
+    A group's rows are added up once, so that a replicate costs a product a group and no pass over rows.
+
+    Args:
+        sums: by name, what each row adds to numerator [N] and denominator [N] >= 0.
+        groups: [N] recording or sequence of each row.
+        level: probability each interval should cover.
+        num_resamples: bootstrap replicates; one in which a denominator is 0 is left out.
+        seed: of the resampling.
+    Returns:
+        The lower and the upper ends by name; both empty with fewer than two groups.
+    """
+    names, index = np.unique(np.asarray(groups), return_inverse=True)
+    if len(names) < 2 or not sums:
+        return {}, {}
+    columns = np.array([np.bincount(index, weights=column) for pair in sums.values() for column in pair])
+    found = np.concatenate([draws @ columns.T for draws in _draws(len(names), num_resamples, seed)])
+    totals, counts = found[:, ::2], found[:, 1::2]
+    usable = (counts > 0).all(axis=1)
+    if not usable.any():
+        return {}, {}
+    ends = np.quantile(totals[usable] / counts[usable], [(1 - level) / 2, (1 + level) / 2], axis=0)
+    low, high = (dict(zip(sums, end.tolist(), strict=True)) for end in ends)
+    return low, high
+
+
 def _draws(group_count: int, num_resamples: int, seed: int) -> Iterator[np.ndarray]:
     """How often each group is drawn in each replicate, [replicates, group_count], in pieces that fit into memory."""
     generator = np.random.default_rng(seed)

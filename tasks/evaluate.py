@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,8 @@ from ctlev_core.feature_distances import (
     name_distance,
 )
 from ctlev_core.frame_sequences import name_recordings
-from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap
+from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap, ratio_bootstrap
+from ctlev_core.joint_errors import quotients
 from ctlev_core.score_groups import Group, class_groups, origin_groups, subject_groups
 from ctlev_core.score_requirements import check_distances, check_frames, check_metrics
 from data_contracts import tables
@@ -48,7 +49,7 @@ class _DistanceScores(Stage):
         check_distances(arguments["downstream"], arguments["distances"])
 
 
-@partial(_ModelScores, version=7, schema=tables.SCORES, raw_files=None)
+@partial(_ModelScores, version=8, schema=tables.SCORES, raw_files=None)
 def score_model(
     out: Output,
     model: Manifest,
@@ -179,30 +180,18 @@ def _score(
         return metric.module.compute(pick(chosen), labels.take(chosen), metric.options)
 
     every = np.arange(len(members))
-    # Names are compared, and joints aligned, once rather than for each of many resamplings.
-    resampled = compute
+    few = len(set(recordings.tolist())) < MIN_RECORDINGS
     if hasattr(metric.module, "compute_sums"):
-        resampled = _quotients(metric.module.compute_sums(pick(every), labels, metric.options))
-    elif hasattr(metric.module, "prepare"):
-        resampled = metric.module.prepare(pick(every), labels, metric.options)
-    scores = resampled(every)
-    if len(set(recordings.tolist())) < MIN_RECORDINGS:
-        return scores, {}, {}
-    low, high = cluster_bootstrap(resampled, recordings)
-    return scores, low, high
-
-
-def _quotients(
-    sums: dict[str, tuple[np.ndarray, np.ndarray]],
-) -> Callable[[np.ndarray], dict[str, float]]:
-    """The scores of any rows from the sums of each."""
-
-    def compute(chosen: np.ndarray) -> dict[str, float]:
-        if not all(count[chosen].any() for _, count in sums.values()):
+        sums = metric.module.compute_sums(pick(every), labels, metric.options)
+        if not all(count.any() for _, count in sums.values()):
             raise ValueError("nothing to score in these rows")
-        return {name: float(total[chosen].sum() / count[chosen].sum()) for name, (total, count) in sums.items()}
-
-    return compute
+        scores = quotients(sums)
+        return (scores, {}, {}) if few else (scores, *ratio_bootstrap(sums, recordings))
+    # Names are compared once rather than for each of many resamplings.
+    prepared = hasattr(metric.module, "prepare")
+    resampled = metric.module.prepare(pick(every), labels, metric.options) if prepared else compute
+    scores = resampled(every)
+    return (scores, {}, {}) if few else (scores, *cluster_bootstrap(resampled, recordings))
 
 
 def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manifest], split: str) -> None:

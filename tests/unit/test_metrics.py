@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, precision_score, recall_score
 
-from ctlev_core.intervals import bootstrap_interval, cluster_bootstrap, compute_spread
+from ctlev_core.intervals import bootstrap_interval, cluster_bootstrap, compute_spread, ratio_bootstrap
 from ctlev_core.metrics import classification, frechet, mpjpe2d, oks, pck2d
 from data_contracts.labels import Labels
 
@@ -211,3 +211,24 @@ def test_spread_over_seeds():
     assert compute_spread([6.123]).text(1) == "6.1"
     with pytest.raises(ValueError, match="finite value"):
         compute_spread([1.0, float("nan")])
+
+
+def test_intervals_of_quotients_are_those_of_resampled_rows():
+    """Some rows have nothing to count, and one score can be counted in two recordings alone: others leave it empty."""
+    random = np.random.default_rng(3)
+    groups = random.integers(0, 7, 60).astype(str)
+    counts = random.integers(0, 3, 60).astype(float)
+    rare = np.where(np.isin(groups, ["2", "5"]), 1.0, 0.0)
+    sums = {"often": (random.random(60) * counts, counts), "rarely": (random.random(60) * rare, rare)}
+
+    def compute(rows):
+        if not all(count[rows].any() for _, count in sums.values()):
+            raise ValueError("nothing to score")
+        return {name: total[rows].sum() / count[rows].sum() for name, (total, count) in sums.items()}
+
+    expected = cluster_bootstrap(compute, groups, num_resamples=200, seed=5)
+    found = ratio_bootstrap(sums, groups, num_resamples=200, seed=5)
+    assert found[0] == pytest.approx(expected[0], rel=1e-12) and found[1] == pytest.approx(expected[1], rel=1e-12)
+    assert ratio_bootstrap(sums, np.full(60, "one")) == ({}, {}) == ratio_bootstrap({}, groups)
+    nothing = {"never": (np.zeros(60), np.zeros(60))}
+    assert ratio_bootstrap(nothing, groups) == ({}, {})
