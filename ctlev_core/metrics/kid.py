@@ -12,12 +12,12 @@ from pydantic import Field
 from ctlev_core.kernel_distance import kernel_distance
 from data_contracts.config import Frozen
 
-VERSION = 1
+VERSION = 2
 INPUT = "features"
 
 
 class Options(Frozen):
-    """Subsets, as torch-fidelity and clean-fid draw them."""
+    """Subsets, as torch-fidelity and clean-fid draw them, where they are fewer pairs than all rows at once."""
 
     subset_size: int = Field(default=1000, ge=0, description="rows of a subset; 0 = all rows at once")
     num_subsets: int = Field(default=100, ge=1, description="subsets the mean is taken over")
