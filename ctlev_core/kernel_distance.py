@@ -3,9 +3,9 @@
 Source: Binkowski et al., Demystifying MMD GANs, ICLR 2018, section 3 and eq. 4; torch-fidelity and clean-fid for the
 subsets (100 of 1,000 rows each, drawn without replacement, the mean taken). Differences: where all rows at once are no
 more pairs than the subsets have together, they are taken, which has the same expectation and varies less (some 10,000
-rows with the published subsets); the draws have a seed; and the kernel is centred at a point of the data. That changes no MMD, for
-k(x, y) - k(x, o) - k(o, y) + k(o, o) differs by functions of x alone and of y alone, and they cancel; but it is free of
-the large equal terms which would cancel only to rounding.
+rows with the published subsets); the draws have a seed; and the kernel is centred at a point of the data. That changes
+no MMD, for k(x, y) - k(x, o) - k(o, y) + k(o, o) differs by functions of x alone and of y alone, which cancel; but it
+is free of the large equal terms which would cancel only to rounding.
 """
 
 from __future__ import annotations
