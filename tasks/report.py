@@ -47,7 +47,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=11, schema=tables.REPORT)
+@stage(version=12, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,

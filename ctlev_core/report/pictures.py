@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -86,7 +86,7 @@ def _of_median_activity(manifest: Manifest, rows: np.ndarray) -> int:
 
 
 def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest]) -> ImageGrid:
-    """Condition, real frame of the same moment where there is one, and the frame of each generator.
+    """Condition, real frame of the same moment or at least class where there is one, and the frame of each generator.
 
     Args:
         conditions: what was asked for.
@@ -97,7 +97,8 @@ def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: l
     matches = _same_moments(synthetic.column("source_id"), real)
     matched = np.flatnonzero([match is not None for match in matches])
     rows_of = matched if len(matched) >= GRID_COLUMNS else np.arange(len(synthetic))
-    chosen = rows_of[spread(len(rows_of), GRID_COLUMNS)]
+    names = synthetic.column("class_name")
+    chosen = rows_of[evenly_by_class([names[row] for row in rows_of], GRID_COLUMNS)]
     rows: list[tuple[str, list[np.ndarray]]] = []
     if "images.npy" in conditions.files:
         asked = {name: row for row, name in enumerate(conditions.column("sample_id"))}
@@ -109,10 +110,42 @@ def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: l
         blank = np.full_like(synthetic.array("frames")[0], 128)
         caption += " Grey: no real frame shows that moment." if any(match is None for match in found) else ""
         rows.append(("real, same moment", [blank if match is None else match for match in found]))
+    elif "images.npy" not in conditions.files:
+        rows += _same_classes([names[row] for row in chosen], real)
     for name, frames in generated.items():
         rows.append((name, [np.asarray(frames.array("frames")[row]) for row in chosen if row < len(frames)]))
-    captions = [synthetic.column("class_name")[row] for row in chosen]
-    return ImageGrid("Asked for, and sampled", rows, column_labels=captions, caption=caption)
+    return ImageGrid("Asked for, and sampled", rows, column_labels=[names[row] for row in chosen], caption=caption)
+
+
+def evenly_by_class(class_names: Sequence[str], count: int) -> np.ndarray:
+    """Indices of at most `count` rows, evenly spread over the classes and over the rows of each.
+
+    Classes take turns in what is sampled, so that rows a fixed number apart may all be of one class.
+    """
+    if len(class_names) <= count:
+        return np.arange(len(class_names))
+    members: dict[str, list[int]] = {}
+    for row, name in enumerate(class_names):
+        members.setdefault(name, []).append(row)
+    classes = [list(members)[index] for index in np.resize(spread(len(members), count), count)]
+    columns = [members[name][column * len(members[name]) // count] for column, name in enumerate(sorted(classes))]
+    return np.array(sorted(set(columns)), np.int64)
+
+
+def _same_classes(class_names: Sequence[str], real: list[Manifest]) -> list[tuple[str, list[np.ndarray]]]:
+    """A row of real test frames of these classes, the later set of frames first; none where they show no such class."""
+    shown: dict[str, list[np.ndarray]] = {name: [] for name in class_names}
+    for manifest in reversed(real):
+        names = manifest.column("class_name")
+        for row in manifest.rows_where(split="test"):
+            if names[row] in shown and len(shown[names[row]]) < GRID_COLUMNS:
+                shown[names[row]].append(np.asarray(manifest.array("frames")[row]))
+    if not all(shown.values()):
+        return []
+    taken = [list(class_names[:column]).count(name) for column, name in enumerate(class_names)]
+    return [
+        ("real, same class", [shown[name][n % len(shown[name])] for n, name in zip(taken, class_names, strict=True)])
+    ]
 
 
 def _same_moments(source_ids: list[str], real: list[Manifest]) -> list[np.ndarray | None]:

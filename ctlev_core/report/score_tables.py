@@ -31,7 +31,7 @@ _METRICS = {
     "auc": "share of joints within a limit, averaged over limits",
     "oks_ap": "share of poses whose similarity to the truth reaches the limit it names",
     "accuracy": "share of frames whose class is told right",
-    "binary_accuracy": "the same for one class against the others",
+    "binary_accuracy": "share told right where a class is told from the others, half of the frames its own",
 }
 _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
 _ENOUGH = 5

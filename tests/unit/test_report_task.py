@@ -6,7 +6,7 @@ import pytest
 from report_artefacts import SETTINGS, Experiment
 
 from ctlev_core.provenance import read_provenance
-from ctlev_core.report.pictures import runs, sample_grid, steps
+from ctlev_core.report.pictures import evenly_by_class, runs, sample_grid, steps
 from ctlev_core.report.report_files import publish_report
 from ctlev_core.run_comparison import compare_runs, read_run
 from ctlev_core.traced_scores import PAIRED_SAMPLES, TRACED_SCORES
@@ -105,6 +105,42 @@ def test_grids_show_the_real_frame_of_the_same_moment(experiment):
     assert "Grey" not in grid.caption
     without = sample_grid(experiment.conditions, {"synthetic": experiment.generated[0]}, [])
     assert [label for label, _ in without.rows] == ["condition", "synthetic"]
+
+
+@pytest.mark.parametrize("num_classes", [1, 3, 10, 24])
+def test_classes_that_take_turns_are_all_seen(num_classes):
+    """Evenly spread rows of 480 are 48 apart: all of one class where 24 or 3 take turns."""
+    names = [f"class {row % num_classes}" for row in range(480)]
+    chosen = evenly_by_class(names, 10)
+    assert len({names[row] for row in chosen}) == min(num_classes, 10) and len(set(chosen)) == 10
+    assert (np.diff(chosen) > 0).all() and chosen[0] < 60 and chosen[-1] > 400
+    assert evenly_by_class(names[:7], 10).tolist() == list(range(7))
+
+
+def test_frames_of_words_stand_beside_real_ones_of_their_class(experiment):
+    class Words:
+        files = ()
+
+        def column(self, name):
+            return {"class_name": ["x", "y", "x"], "source_id": ["w:0"] * 3, "split": ["test"] * 3}[name]
+
+        def array(self, _):
+            return np.arange(3, dtype=np.uint8)[:, None, None, None] * np.ones((1, 4, 4, 3), np.uint8)
+
+        def rows_where(self, split):
+            return np.arange(3)
+
+        def __len__(self):
+            return 3
+
+    class Real(Words):
+        def column(self, name):
+            columns = {"sample_id": ["r0", "r1", "r2"], "recording_id": ["r"] * 3, "class_name": ["y", "x", "z"]}
+            return columns.get(name, [0] * 3)
+
+    rows = dict(sample_grid(Words(), {"synthetic": Words()}, [Real()]).rows)
+    assert [int(image[0, 0, 0]) for image in rows["real, same class"]] == [1, 0, 1]  # of x there is one only
+    assert "real, same class" not in dict(sample_grid(Words(), {"synthetic": Words()}, [experiment.frames]).rows)
 
 
 def test_runs_are_rows_that_follow_in_the_time_of_one_recording():
