@@ -19,6 +19,7 @@ from ctlev_core.report import pictures
 from ctlev_core.report.contact_sheet import contact_sheet_sections
 from ctlev_core.report.copies import copy_sections
 from ctlev_core.report.costs import cost_table, options_table, versions_table
+from ctlev_core.report.distances import floor_tables
 from ctlev_core.report.html import Curves, Folded, Section, render_report
 from ctlev_core.report.nearest_classes import nearest_sections
 from ctlev_core.report.paper_numbers import paper_section
@@ -104,6 +105,7 @@ def report(
     copied = copy_sections(frames, generated, copies)
     looks = realism_sections(realism.table.to_pylist(), realism.attached(DISTRIBUTIONS).to_pylist())
     refused = refusal_sections(shown)
+    floors = floor_tables(scores)
     sheet = contact_sheet_sections(frames, frame_conditions, conditions)
     _, by_class = group_tables(rows, settings)
     words = _verdict(rows, settings, list(shown), paired)
@@ -126,6 +128,7 @@ def report(
             *looks[:1],
             *_training_of_generators(checkpoints, checkpoint_names),
             *_folded("Class by class", by_class),
+            *_folded("How to read the distances", floors),
             *_folded("Closest pairs of generated and training frames", copied[1:]),
             *_folded("More on how real frames look", looks[1:]),
             *_folded("What was learnt from, and asked for", sheet),
@@ -137,7 +140,7 @@ def report(
         ],
     )
     (out.folder / PAGE).write_text(page, encoding="utf-8")
-    kept = [table for table in (*results, *by_class, *copied, *refused) if isinstance(table, Table)]
+    kept = [table for table in (*results, *by_class, *floors, *copied, *refused) if isinstance(table, Table)]
     (out.folder / LATEX).write_text(render_latex(kept, title=title, lead=notice), encoding="utf-8")
     (out.folder / MARKDOWN).write_text(render_markdown(kept, title=title, lead=notice, verdict=words), encoding="utf-8")
     write_provenance(out.folder / PROVENANCE, records)

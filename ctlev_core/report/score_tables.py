@@ -107,7 +107,8 @@ def score_tables(rows: list[Row], settings: Sequence[str], paired: PairedScores)
             "of held-out real frames; alone they do not tell whether labels are right. In brackets 95 %, from halves "
             "by recording."
         )
-        found.append(_pivot("How far from real frames?", distances, "frames", caption))
+        counts = ("real training frames", "frames compared")
+        found.append(_pivot("How far from real frames?", distances, "frames", caption, counts))
     return found
 
 
@@ -222,7 +223,13 @@ def _heading(metric: str) -> str:
     return f"{metric} {'↓' if lower_is_better(metric) else '↑'}"
 
 
-def _pivot(title: str, rows: list[Row], first: str, caption: str) -> Table:
+def _pivot(
+    title: str,
+    rows: list[Row],
+    first: str,
+    caption: str,
+    counts: tuple[str, str] = ("frames trained on", "frames scored"),
+) -> Table:
     """Settings down, metrics across."""
     metrics = list(dict.fromkeys(row["metric"] for row in rows))
     body: list[list[Cell]] = []
@@ -230,8 +237,7 @@ def _pivot(title: str, rows: list[Row], first: str, caption: str) -> Table:
         of_setting = [row for row in rows if row["setting"] == setting]
         cells: list[Cell] = [cell_text([row for row in of_setting if row["metric"] == metric]) for metric in metrics]
         body.append([setting, *cells, of_setting[0]["num_train"], of_setting[0]["num_samples"]])
-    columns = [first, *map(_heading, metrics), "frames trained on", "frames scored"]
-    return Table(title, columns, body, caption=caption)
+    return Table(title, [first, *map(_heading, metrics), *counts], body, caption=caption)
 
 
 def _by_group(title: str, rows: list[Row], settings: Sequence[str], caption: str = "", first: str = "classes") -> Table:

@@ -1,0 +1,33 @@
+"""The table of the report with what a distance between two sets of frames has to be read with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ctlev_core.feature_distances import DISTANCE_ESTIMATES
+from ctlev_core.report.tables import Cell, Table
+from data_contracts.manifest import Manifest
+
+_CAPTION = (
+    "A distance between small sets is larger than between large ones, even where both show the same. So it stands here "
+    "beside distances of equally small halves, whole recordings to one half or the other: of the frames and the real "
+    "training frames, and of the real training frames among themselves, the floor, with the central 95 % over random "
+    "halvings in brackets."
+)
+
+
+def floor_tables(scores: Sequence[Manifest]) -> list[Table]:
+    """One row a set of frames and score; none where no distance was measured."""
+    body: list[list[Cell]] = []
+    for manifest in scores:
+        if f"{DISTANCE_ESTIMATES.name}.parquet" not in manifest.files:
+            continue
+        for row in manifest.attached(DISTANCE_ESTIMATES).to_pylist():
+            floor = None
+            if row["floor"] is not None:
+                floor = f"{row['floor']:.3f} [{row['floor_low']:.3f}, {row['floor_high']:.3f}]"
+            halved = None if row["halved"] is None else f"{row['halved']:.3f}"
+            counts = [row[name] for name in ("num_predicted", "num_target", "num_features")]
+            body.append([row["setting"], row["metric"], f"{row['value']:.3f}", halved, floor, *counts])
+    columns = ["frames", "score", "all", "halves", "halves of real frames", "number", "real frames", "features"]
+    return [Table("How to read the distances", columns, body, caption=_CAPTION)] if body else []
