@@ -23,7 +23,7 @@ TIMED = {"report"}
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(2400)
+@pytest.mark.timeout(3600)
 def test_twenty_killed_runs_end_in_the_digests_of_an_undisturbed_one(smoke_home, tmp_path):
     with server(tmp_path) as service:  # to start one for each run would take longer than all the rest
         kill_and_run_again(service.environment, tmp_path, deterministic(smoke_home))
