@@ -32,11 +32,17 @@ RESERVED = ("real", "synthetic", "more_real", "faithful")
 
 
 class Baseline(Frozen):
-    """Another generator to compare with, from the same frames and the same labels to sample from."""
+    """Another generator to compare with, from the same frames and the same labels to sample from.
+
+    What is left out is the experiment's own: with `poses` alone it is the same generator, asked for other poses.
+    """
 
     condition: ConditionChoice
     generator: GeneratorChoice
     sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
+    poses: DatasetChoice | None = Field(
+        None, description="another dataset whose poses it is asked for; None = those of the experiment"
+    )
 
     @property
     def sampling_choice(self) -> SamplingChoice:
@@ -55,10 +61,10 @@ class Experiment(Frozen):
     """One experiment: data, generator, how much to sample, and what to train and score with it.
 
     `baselines` are rows of the tables: a baseline `X` adds the settings `X` and `real+X` beside `synthetic` and
-    `real+synthetic`, where those are asked for; `more_real` adds `more_real` and `real+more_real`, `scaling` and
-    `keep_faithful` the settings named in their descriptions. `sampling` are the generator's `SampleOptions`.
-    `feature_extractor` is the classifier, trained on real frames, in whose features real and synthetic frames are
-    compared; None leaves the comparison out.
+    `real+synthetic`, where those are asked for; `more_real` adds `more_real` and `real+more_real`, `scaling`,
+    `keep_faithful` and `together` the settings named in their descriptions. `sampling` are the generator's
+    `SampleOptions`. `feature_extractor` is the classifier, trained on real frames, in whose features real and synthetic
+    frames are compared; None leaves the comparison out.
     """
 
     name: str = Field(pattern=NAME_PATTERN, description="names the experiment and its report")
@@ -115,6 +121,10 @@ class Experiment(Frozen):
         "frames finds best: settings `faithful` and `real+faithful`",
     )
     baselines: dict[str, Baseline] = Field(default_factory=dict, description="other generators, by a name of each")
+    together: tuple[str, ...] = Field(
+        (),
+        description="further settings, of frames of several generators, such as `real+synthetic+event_gan`",
+    )
     downstream: DownstreamChoice
     settings: tuple[Setting, ...] = Field(("real", "synthetic", "real+synthetic"), min_length=1)
     downstream_seeds: tuple[int, ...] = Field((0,), min_length=1, description="one training per setting and seed")
@@ -129,6 +139,20 @@ class Experiment(Frozen):
     realism_reference: DatasetChoice | None = Field(
         None, description="recordings that the experiment's own are compared with, number by number, in the report"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _baselines_are_like_the_experiment(cls, values: Any) -> Any:
+        """What a baseline leaves out is the experiment's own; sampling options only where the generator is."""
+        if not isinstance(values, dict) or not isinstance(values.get("baselines"), dict):
+            return values
+        filled = {}
+        for name, baseline in values["baselines"].items():
+            if isinstance(baseline, dict):
+                left_out = ("condition",) if "generator" in baseline else ("condition", "generator", "sampling")
+                baseline = {key: values[key] for key in left_out if key in values} | baseline
+            filled[name] = baseline
+        return {**values, "baselines": filled}
 
     @field_validator("baselines")
     @classmethod
@@ -153,6 +177,15 @@ class Experiment(Frozen):
             raise ValueError(f"round_to_counts needs encoding 'event_histogram', got {self.encoding.name!r}")
         return self
 
+    @model_validator(mode="after")
+    def _parts_are_known(self) -> Experiment:
+        known = {"real", *self.generator_names, *(["more_real"] if self.more_real else [])}
+        for setting in self.together:
+            parts = setting.split("+")
+            if len(parts) < 2 or len(set(parts)) < len(parts) or not set(parts) <= known:
+                raise ValueError(f"together joins different ones of {', '.join(sorted(known))} by +, got {setting!r}")
+        return self
+
     @property
     def sampling_choice(self) -> SamplingChoice:
         """The generator's sampling options as a plug-in choice."""
@@ -170,7 +203,8 @@ class Experiment(Frozen):
         more = None if self.more_real is None else self.more_real.dataset
         others = (self.poses, self.target, self.feature_extractor, self.realism_reference, more)
         optional = [choice for choice in others if choice]
-        compared = [c for b in self.baselines.values() for c in (b.condition, b.generator, b.sampling_choice)]
+        baselines = self.baselines.values()
+        compared = [c for b in baselines for c in (b.condition, b.generator, b.sampling_choice, b.poses) if c]
         return [*chosen, *optional, *compared, *self.metrics, *self.distances]
 
     @property
@@ -189,7 +223,7 @@ class Experiment(Frozen):
         makers = list(self.generator_names)
         makers += ["faithful"] * (self.keep_faithful is not None) + ["more_real"] * (self.more_real is not None)
         names = [setting.replace("synthetic", name) for setting in self.settings for name in makers]
-        names += [f"real+{share_name(share)}" for share in sorted(self.scaling)]
+        names += [f"real+{share_name(share)}" for share in sorted(self.scaling)] + list(self.together)
         return list(dict.fromkeys(names))
 
 

@@ -1,4 +1,4 @@
-"""Make the frames of the baselines: other generators, asked for the same labels as the experiment's own."""
+"""Make the frames of the baselines: other generators asked for the same labels, or the same one for other labels."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from flows.prepare_dataset import (
 )
 from flows.settings import flow
 from tasks.finetune import finetune
+from tasks.ingest import ingest
 from tasks.sample import sample, simulate
 from tasks.stage import call_flow, call_together, numbered
 
@@ -45,7 +46,10 @@ def baselines(experiment: Experiment, dataset: PreparedDataset | None = None) ->
 
 def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: int) -> BaselineFrames:
     baseline, seed, label = experiment.baselines[name], experiment.seed + number, numbered(name, number)
-    asked = condition_asked_samples(experiment, dataset.poses, dataset.recordings, dataset.frames, baseline.condition)
+    poses = dataset.poses
+    if baseline.poses is not None:
+        poses = ingest(dataset=baseline.poses, label=f"{baseline.poses.name}, poses of {name}")
+    asked = condition_asked_samples(experiment, poses, dataset.recordings, dataset.frames, baseline.condition)
     if hasattr(plugins.load("generators", baseline.generator.name), "sample_events"):
         synthetic = simulate(
             dataset.recordings,

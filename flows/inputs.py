@@ -8,7 +8,7 @@ from typing import Any
 from ctlev_core import plugins
 from ctlev_core.plugins import PluginError
 from ctlev_core.score_requirements import check_dataset
-from data_contracts.config import Choice
+from data_contracts.config import Choice, DatasetChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
 from data_contracts.study import Study
@@ -90,19 +90,20 @@ def _check_labels(experiment: Experiment) -> None:
 
 def _check_intensity(experiment: Experiment) -> None:
     """Raise `PluginError` where a condition needs intensity frames and a dataset has none, before anything is read."""
-    conditions = {"condition": experiment.condition}
-    conditions |= {f"baselines.{name}.condition": baseline.condition for name, baseline in experiment.baselines.items()}
-    needing = [
-        name
-        for name, choice in conditions.items()
-        if getattr(plugins.load("conditions", choice.name), "NEEDS", "") == "intensity"
-    ]
-    for dataset in (experiment.dataset, experiment.target, experiment.poses) if needing else ():
-        if dataset is None:
+    asked = experiment.poses or experiment.target
+    conditions = {"condition": (experiment.condition, asked)}
+    for name, baseline in experiment.baselines.items():
+        conditions[f"baselines.{name}.condition"] = baseline.condition, baseline.poses or asked
+    for name, (condition, poses) in conditions.items():
+        if getattr(plugins.load("conditions", condition.name), "NEEDS", "") != "intensity":
             continue
-        plugin = plugins.load_options(dataset)
-        if not any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options)):
-            raise PluginError(
-                f"{', '.join(needing)}: needs intensity frames, "
-                f"and dataset {dataset.name!r} with these options has none"
-            )
+        for dataset in (experiment.dataset, poses):
+            if dataset is not None and not _has_intensity(dataset):
+                raise PluginError(
+                    f"{name}: needs intensity frames, and dataset {dataset.name!r} with these options has none"
+                )
+
+
+def _has_intensity(dataset: DatasetChoice) -> bool:
+    plugin = plugins.load_options(dataset)
+    return any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options))

@@ -110,7 +110,7 @@ def report(
     _, by_class = group_tables(rows, settings)
     words = _verdict(rows, settings, list(shown), paired)
     steps = pictures.steps(frames, frame_conditions, conditions, next(iter(shown.values())), _kind(frame_conditions))
-    grid = pictures.sample_grid(conditions, shown, real)
+    grid, *other_grids = pictures.sample_grids(conditions, shown, real)
     write_summary(out.folder, Summary(words, steps, grid))
     page = render_report(
         title=title,
@@ -122,6 +122,7 @@ def report(
             *copied[:1],
             *refused,
             grid,
+            *other_grids,
             *([] if nearest is None else nearest_sections(nearest)),
             *prior_figures(rows, _learnt_with(records), _first_metric(rows)),
             *_figures(rows, frames, conditions, shown, target),

@@ -85,6 +85,23 @@ def _of_median_activity(manifest: Manifest, rows: np.ndarray) -> int:
     return int(candidates[np.argsort(active, kind="stable")[(len(active) - 1) // 2]])
 
 
+def sample_grids(conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest]) -> list[ImageGrid]:
+    """The grid of `sample_grid`, and one of frames alone for each generator that was asked for other labels."""
+    first = next(iter(generated.values())).column("source_id")
+    same, others = {}, []
+    for name, frames in generated.items():
+        if frames.column("source_id") == first:
+            same[name] = frames
+            continue
+        names = frames.column("class_name")
+        chosen = evenly_by_class(names, GRID_COLUMNS)
+        row = (name, [np.asarray(frames.array("frames")[index]) for index in chosen])
+        caption = "It was asked for other labels than the others. One column a sample, none chosen by eye."
+        labels = [names[index] for index in chosen]
+        others.append(ImageGrid(f"Sampled: {name}", [row], column_labels=labels, caption=caption))
+    return [sample_grid(conditions, same, real), *others]
+
+
 def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest]) -> ImageGrid:
     """Condition, real frame of the same moment or at least class where there is one, and the frame of each generator.
 

@@ -1,7 +1,7 @@
 """The 3D route from end to end, at its smallest: bodies, normal maps, samples, a body regressor and its errors."""
 
 import pyarrow.parquet as pq
-from flow_scripts import run_script
+from flow_scripts import artefacts, run_script
 
 SETTINGS = (
     "dataset.options={num_train_recordings: 4, num_test_recordings: 4, num_condition_recordings: 0, joint_set: smpl}",
@@ -26,3 +26,26 @@ def test_sentences_become_event_frames_in_motion_and_bodies_are_scored(tmp_path)
     errors = {(row["setting"], row["metric"]): row["value"] for row in scores if row["group"] == "all"}
     for setting in ("real", "synthetic", "real+synthetic"):
         assert 0 < errors[setting, "mpjpe3d_pa_mm"] <= errors[setting, "mpjpe3d_pelvis_mm"] < 2000
+
+
+FOREIGN = (
+    "dataset.options={num_train_recordings: 4, num_test_recordings: 4, num_condition_recordings: 2, joint_set: smpl}",
+    "baselines={foreign_poses: {poses: {name: text_motion, options: {camera: centred, sentences: [a person jumps]}}}}",
+    "num_synthetic=4",
+    *(setting for setting in SETTINGS if setting.startswith(("windows", "generator", "sampling", "down", "feature"))),
+)
+
+
+def test_one_generator_is_asked_for_poses_of_two_origins(tmp_path):
+    options = [word for setting in FOREIGN for word in ("--set", setting)]
+    finished = run_script("full_experiment", "--preset", "body", *options, home=tmp_path, timeout=550)
+    assert finished.status == 0, finished.errors
+    assert len(artefacts(tmp_path, "finetune")) == 1
+    own, foreign = sorted(artefacts(tmp_path, "sample"), key=lambda made: "person" in made.column("class_name")[0])
+    assert set(foreign.column("class_name")) == {"a person jumps"} and len(own) == len(foreign) == 4
+    rows = pq.read_table(tmp_path / "reports" / "body" / "scores.parquet").to_pylist()
+    trained = {row["setting"]: row["num_train"] for row in rows if row["group"] == "all"}
+    real = trained["real"]
+    assert trained["real+foreign_poses"] == real + 4 and trained["real+synthetic+foreign_poses"] == real + 8
+    page = (tmp_path / "reports" / "body.html").read_text()
+    assert "Sampled: foreign_poses" in page and "<td>real+synthetic+foreign_poses</td>" in page

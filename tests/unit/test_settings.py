@@ -47,6 +47,28 @@ def test_shares_that_are_none_are_refused(override):
         smoke(override)
 
 
+FOREIGN = "baselines={foreign: {poses: {name: text_motion}}, gan: {generator: {name: event_gan}}}"
+
+
+def test_what_a_baseline_leaves_out_is_the_experiments_own():
+    made = smoke(FOREIGN)
+    foreign, gan = made.baselines.values()
+    assert (foreign.condition, foreign.generator, foreign.sampling) == (made.condition, made.generator, made.sampling)
+    assert foreign.poses in made.choices
+    # The sampling options of another generator are other ones.
+    assert (gan.condition, gan.generator.name, gan.sampling, gan.poses) == (made.condition, "event_gan", {}, None)
+
+
+def test_frames_of_several_generators_are_learnt_from_together():
+    names = smoke(FOREIGN, "together=[real+synthetic+foreign, synthetic+foreign]").trained_settings
+    assert names[-2:] == ["real+synthetic+foreign", "synthetic+foreign"]
+    for wrong in ("real+nobody", "real", "real+real", "real+faithful+gan"):
+        with pytest.raises(
+            ValueError, match=r"together joins different ones of foreign, gan, more_real, real, synthetic"
+        ):
+            smoke(FOREIGN, f"together=[{wrong}]")
+
+
 def plan(*overrides):
     with planning() as rows:
         call_flow(full_experiment, smoke(*overrides))

@@ -174,7 +174,7 @@ def test_the_papers_study_says_everything_that_is_missing_at_once():
     for name in values["paths"]:
         assert f"paths.{name}" in message
     assert message.count("paths.inception") == 1  # all six need it
-    assert "  - recognition, zero_shot, pose_dhp19, pose_cdehp, body, body_amass: torchscript" in message
+    assert "  - recognition, zero_shot, pose_dhp19, pose_cdehp, body: torchscript" in message
     assert "extracted_train/" in message  # the expected tree
     assert list(raised.value.asked.experiments) == list(values["experiments"])
 
@@ -189,7 +189,9 @@ def test_a_path_that_is_given_is_no_longer_missing(tmp_path):
     # The same lines of the file serve several experiments, and each has a ControlNet of its own.
     controlnets = {name: part.generator.options["controlnet"] for name, part in parts.items() if "pose" in name}
     assert set(controlnets.values()) == {"paths.controlnet_openpose"}
-    assert parts["body_amass"].generator.options["controlnet"] == "paths.controlnet_normal"
+    assert parts["body"].generator.options["controlnet"] == "paths.controlnet_normal"
+    # The row of AMASS's poses is the same generator, asked for others.
+    assert parts["body"].baselines["amass_poses"].generator == parts["body"].generator
     with pytest.raises(PluginError, match="has no such path; it has stable_diffusion, "):
         load_study("paper", ["paths.nonesuch=1"])
 
