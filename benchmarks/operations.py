@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--home", type=Path, help="of `cached`; without, a new one, where the preset runs first")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--stages", type=int, default=50)
-    parser.add_argument("--shards", type=int, default=2000)
+    parser.add_argument("--shards", type=int, default=10_000)
     parser.add_argument("--seconds", type=float, default=0.1, help="of a shard")
     parser.add_argument("--workers", type=int, default=8, help="processes of `shards`; they sleep")
     parser.add_argument("--work-shards", type=int, default=32, help="of counting and rendering in `runners`")

@@ -54,11 +54,8 @@ def prior_figures(
                     _append(series.setdefault(start, ([], [])), float(num_steps), value)
                     _append(spans.setdefault(start, ([], [])), low, high)
         if series:
-            figures.append(
-                Curves(
-                    title, series, "optimiser steps of fine-tuning", wanted, log_x=True, caption=_CAPTION, spans=spans
-                )
-            )
+            steps, far = "optimiser steps of fine-tuning", not prefix
+            figures.append(Curves(title, series, steps, wanted, log_x=True, log_y=far, caption=_CAPTION, spans=spans))
     return figures
 
 
