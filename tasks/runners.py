@@ -205,6 +205,8 @@ class Ray(_Cluster):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         # Ray would hide the GPUs of a machine from calls that reserve none.
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        # A call that comes too late, from a thread that has not heard of the end, would start a cluster nobody ends.
+        os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
         ray = self._ray = importlib.import_module(self.package)
         own = {} if address else {"num_cpus": count, "include_dashboard": False}
         ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **own)

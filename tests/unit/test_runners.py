@@ -111,6 +111,17 @@ def test_a_process_that_dies_is_an_error_that_says_so(kind, monkeypatch):
         list(map_shards(die, range(2)))
 
 
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("threads", "processes")])
+def test_a_call_after_the_end_of_a_cluster_is_an_error_and_starts_no_other(kind, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    for _ in range(2):
+        cluster = runners.asked_cluster(2)
+        assert cluster.call(abs, -3) == 3
+        cluster.close()
+        with pytest.raises(WorkerError, match=f"{kind}: a call was lost"):
+            cluster.call(abs, -3)
+
+
 def number_and_process(shard):
     return shard, os.getpid()
 
