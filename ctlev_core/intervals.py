@@ -51,13 +51,9 @@ def bootstrap_interval(
     scored = ~np.isnan(values)
     if not scored.any():
         raise ValueError(f"none of the {len(values)} values is scored")
-    _, index = np.unique(names[scored], return_inverse=True)
-    sums, counts = np.bincount(index, weights=values[scored]), np.bincount(index)
-    if len(sums) < 2:
-        return float("nan"), float("nan")
-    means = np.concatenate([(d @ sums) / (d @ counts) for d in _draws(len(sums), num_resamples, seed)])
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
+    sums = {"mean": (values[scored], np.ones(np.count_nonzero(scored)))}
+    low, high = ratio_bootstrap(sums, names[scored], level=level, num_resamples=num_resamples, seed=seed)
+    return low.get("mean", float("nan")), high.get("mean", float("nan"))
 
 
 def cluster_bootstrap(
