@@ -38,12 +38,23 @@ class Service:
     worker: subprocess.Popen | None = None
 
     def api(self, path: str, body: Any = None, method: str | None = None) -> Any:
-        """What the server answers."""
+        """What the server answers; a question that changes nothing is asked again where no answer comes.
+
+        A server on SQLite can be silent for the minute in which one of its writers waits for a lock. Prefect's own
+        client is as patient.
+        """
         data = None if body is None else json.dumps(body).encode()
         headers = {"Content-Type": "application/json"}
         request = urllib.request.Request(f"{self.url}/{path}", data, headers, method=method)
-        with urllib.request.urlopen(request, timeout=60) as response:
-            return json.loads(response.read() or b"null")
+        asks = request.get_method() == "GET" or path.endswith("/filter")
+        deadline = time.monotonic() + TIMEOUT_S
+        while True:
+            try:
+                with urllib.request.urlopen(request, timeout=60 if asks else TIMEOUT_S) as response:
+                    return json.loads(response.read() or b"null")
+            except TimeoutError:
+                if not asks or time.monotonic() > deadline:
+                    raise
 
     def prefect(self, *arguments: str, timeout: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:
         """Run a command of Prefect's, from the repository."""
