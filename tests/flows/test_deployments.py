@@ -1,6 +1,7 @@
 """The deployments of prefect.yaml, served as docs/operations.md says: a server, a pool and a worker on loopback."""
 
 import datetime
+import inspect
 import itertools
 import json
 import re
@@ -14,6 +15,12 @@ from deployment_service import ENDED, TIMEOUT_S, serving, smoke_parameters
 from flow_scripts import REPOSITORY, digests
 
 from data_contracts.published import published_folder, read_latest, read_versions
+from flows import deployments
+from flows.command_line import load_experiment
+from flows.regenerate import load_regeneration
+from flows.speed_vs_error import load_speed_vs_error
+from flows.studies import load_study
+from flows.synthesize import load_synthesis
 from tasks.store import Store
 
 SCRIPTS = {
@@ -29,6 +36,19 @@ def test_every_flow_script_has_a_deployment_with_a_description_and_tags():
         f"flows.deployments.{path.stem}" for path in SCRIPTS.values()
     )
     assert all(item["description"] and item["tags"] and item["work_pool"] == {"name": "ctlev"} for item in listed)
+
+
+def test_defaults_are_presets_that_load():
+    loaders = {
+        "full_experiment": load_study,
+        "speed_vs_error": load_speed_vs_error,
+        "synthesize": load_synthesis,
+        "regenerate": load_regeneration,
+        "evaluate": load_experiment,
+    }
+    for name, load in loaders.items():
+        preset = inspect.signature(getattr(deployments, name).fn).parameters["preset"].default
+        assert load(preset, []), name
 
 
 @pytest.fixture(scope="module")
