@@ -1,13 +1,32 @@
-"""Child processes that never outlive us."""
+"""Child processes that never outlive us, and how many cores there are for them."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 import sys
+from pathlib import Path
+
+CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+"""Of a Linux container: microseconds of processor time it gets, in so many by the clock; or `max`."""
 
 
 def die_with_parent() -> None:
     """Ask the Linux kernel to end the calling process when its parent ends, even by SIGKILL; a no-op elsewhere."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG = 1
+
+
+def num_cores(limit: Path = CPU_LIMIT) -> int:
+    """Cores that this process may use, at least 1: those it may run on, or fewer where its container gets less time.
+
+    More threads than that are worse than few: oneDNN's wait for each other by spinning, and one that is not scheduled
+    holds up all (a training of two threads on one core was seven times slower than one of one).
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = limit.read_text().split()
+        return max(1, min(cores, int(quota) // int(period)))
+    except (OSError, ValueError):  # no such container, or no limit
+        return cores

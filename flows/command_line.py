@@ -15,6 +15,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from ctlev_core.plugins import PluginError, validate_options
+from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.experiment import Experiment
 from data_contracts.study import Study
@@ -188,12 +189,12 @@ def check_home(home: Path) -> None:
 
 
 def use_cores(rows: list[PlannedStage]) -> None:
-    """Torch on all cores, unless everything is cached and torch is not needed at all."""
-    if all(row.cached for row in rows):
+    """Torch on all cores, unless OMP_NUM_THREADS says otherwise, or everything is cached and torch is not needed."""
+    if "OMP_NUM_THREADS" in os.environ or all(row.cached for row in rows):
         return
     import torch
 
-    torch.set_num_threads(os.cpu_count() or 1)
+    torch.set_num_threads(num_cores())
 
 
 def _parse(flow: Any, default_preset: str) -> argparse.Namespace:

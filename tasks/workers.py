@@ -24,6 +24,7 @@ from contextvars import ContextVar, copy_context
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
+from ctlev_core.processes import num_cores
 from tasks.runners import ALONE, Runner, WorkerError, asked_cluster, asked_runner, reply_to, reply_with
 
 R = TypeVar("R")
@@ -168,11 +169,6 @@ def num_workers() -> int:
     if asked and not (asked.isdecimal() and int(asked) >= 1):
         raise ValueError(f"CTLEV_WORKERS must be a positive number, got {asked!r}")
     return int(asked) if asked else num_cores()
-
-
-def num_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def together(calls: Sequence[Callable[[], R]]) -> list[R]:

@@ -26,7 +26,7 @@ from ctlev_core.diffusion.prior import choose_device, load_prior, save_prior
 from ctlev_core.diffusion.ranks import ALONE, Ranks, start_ranks, stop_ranks
 from ctlev_core.diffusion.trainer import TrainingHistory
 from ctlev_core.diffusion.training_options import FineTuningOptions
-from ctlev_core.processes import die_with_parent
+from ctlev_core.processes import die_with_parent, num_cores
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import TrainingError
 from data_contracts.labels import Conditions
@@ -152,7 +152,7 @@ def child_environment(environment: Mapping[str, str], count: int) -> dict[str, s
     }
     root = str(Path(__file__).resolve().parents[2])
     kept["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [kept.get("PYTHONPATH")])])
-    kept.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
+    kept.setdefault("OMP_NUM_THREADS", str(max(1, num_cores() // count)))
     return kept
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 
+from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 
@@ -63,7 +63,7 @@ def render_labelled_normals(
     width, height = image_size
     images = np.empty((len(labels), height, width, 3), dtype=np.uint8)
     rotations = matrix_from_axis_angle(labels.smpl_pose.reshape(-1, 24, 3))
-    workers = workers or os.cpu_count() or 1
+    workers = workers or num_cores()
     for start in range(0, len(labels), BATCH):
         rows = slice(start, start + BATCH)
         vertices, _ = pose_vertices(body, rotations[rows], labels.smpl_betas[rows], labels.smpl_transl[rows])

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError
-from tasks import workers
 from tasks.workers import WorkerError, Workers, current_workers, together
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -190,4 +190,4 @@ def is_running(process):
 
 
 def test_cores_are_those_that_may_be_used():
-    assert 1 <= workers.num_cores() <= (os.cpu_count() or 1)
+    assert 1 <= num_cores() <= (os.cpu_count() or 1)
