@@ -19,6 +19,7 @@ from flows.evaluate import evaluate
 from flows.export_events import export_streams
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
+from flows.speed_vs_error import speed_vs_error, speed_vs_error_of
 from flows.studies import load_study
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
@@ -108,9 +109,9 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
 
 def _study(study: Study) -> ManifestRef:
     parts = study.experiments
-    reports = call_together(*(partial(_one_of_study, part) for part in parts.values()))
+    made = call_together(*(partial(_one_of_study, study, name) for name in parts))
     return study_report(
-        reports,
+        [reports[0] for reports in made] + [page for reports in made for page in reports[1:]],
         title=study.name,
         notice=study.data_notice,
         names=list(parts),
@@ -120,8 +121,18 @@ def _study(study: Study) -> ManifestRef:
     )
 
 
-def _one_of_study(experiment: Experiment) -> ManifestRef:
-    return call_flow(full_experiment, experiment)
+def _one_of_study(study: Study, name: str) -> list[ManifestRef]:
+    """The report of an experiment, then the page on speed against error where its generator is the one measured."""
+    experiment, measured = study.experiments[name], speed_vs_error_of(study)
+    if measured is None or measured.title != name:
+        return [call_flow(full_experiment, experiment)]
+    # First what both need: whoever waited for a stage of the other would keep a process from those that have work.
+    dataset = call_flow(prepare_dataset, experiment)
+    checkpoint = call_flow(train_generator, experiment, dataset)
+    return call_together(
+        lambda: call_flow(full_experiment, experiment),
+        lambda: call_flow(speed_vs_error, measured, dataset, checkpoint),
+    )
 
 
 def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -> tuple[ManifestRef, ManifestRef]:

@@ -14,10 +14,11 @@ from ctlev_core import plugins
 from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.report.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
-from ctlev_core.speed_vs_error_options import KEEP_PRECISION, SamplerLine, SamplerSetting, SpeedVsErrorOptions
 from data_contracts.config import DownstreamChoice, SamplingChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
+from data_contracts.speed_vs_error import KEEP_PRECISION, SamplerLine, SamplerSetting, SpeedVsErrorOptions
+from data_contracts.study import Study
 from flows.command_line import PRESETS, load_experiment, load_preset, main
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
@@ -38,10 +39,11 @@ class SpeedVsError(BaseModel):
     options: SpeedVsErrorOptions
     experiment: Experiment
     feature_extractor: DownstreamChoice
+    title: str
 
     @property
     def name(self) -> str:
-        """Names the page."""
+        """Names the file of the page."""
         return f"{self.experiment.name}_speed_vs_error"
 
     def sampling(self, line: SamplerLine, steps: int) -> SamplingChoice:
@@ -72,11 +74,34 @@ def load_speed_vs_error(preset: str, overrides: list[str]) -> SpeedVsError:
     of_experiment = [override.removeprefix(_OF_EXPERIMENT) for override in overrides if override not in own]
     options = load_preset(SpeedVsErrorOptions, PRESETS / "speed_vs_error", preset, own)
     experiment = load_experiment(options.experiment, of_experiment)
+    return _checked(options, experiment, experiment.name)
+
+
+def speed_vs_error_of(study: Study) -> SpeedVsError | None:
+    """The measurement that is part of a study, if one is.
+
+    Raises:
+        PluginError: no such experiment, or as `load_speed_vs_error`.
+    """
+    options = study.speed_vs_error
+    if options is None:
+        return None
+    experiment = study.experiments.get(options.experiment)
+    if experiment is None:
+        raise PluginError(
+            f"speed_vs_error.experiment: expected an experiment of the study, {', '.join(study.experiments)}; "
+            f"got {options.experiment!r}"
+        )
+    return _checked(options, experiment, options.experiment)
+
+
+def _checked(options: SpeedVsErrorOptions, experiment: Experiment, title: str) -> SpeedVsError:
     if not isinstance(plugins.load_options(experiment.sampling_choice).options, SamplingOptions):
         raise PluginError(f"{options.experiment}: generator {experiment.generator.name!r} has no sampler to compare")
     if experiment.feature_extractor is None:
         raise PluginError(f"{options.experiment}: frames are compared in features, and feature_extractor is null")
-    loaded = SpeedVsError(options=options, experiment=experiment, feature_extractor=experiment.feature_extractor)
+    extractor = experiment.feature_extractor
+    loaded = SpeedVsError(options=options, experiment=experiment, feature_extractor=extractor, title=title)
     for _ in loaded.points():
         pass  # every sampler's options are valid
     for name, study in (("exact_score", options.exact_score), ("precision", options.precision)):
@@ -90,11 +115,18 @@ def load_speed_vs_error(preset: str, overrides: list[str]) -> SpeedVsError:
 
 
 @flow(name="speed-vs-error")
-def speed_vs_error(measured: SpeedVsError) -> ManifestRef:
-    """Sample with every setting under a stopwatch, measure errors, and write the page with the plots."""
+def speed_vs_error(
+    measured: SpeedVsError, dataset: PreparedDataset | None = None, checkpoint: ManifestRef | None = None
+) -> ManifestRef:
+    """Sample with every setting under a stopwatch, measure errors, and write the page with the plots.
+
+    Dataset and checkpoint are made unless they are given.
+    """
     experiment, options = measured.experiment, measured.options
-    dataset = call_flow(prepare_dataset, experiment)
-    checkpoint = call_flow(train_generator, experiment, dataset)
+    if dataset is None:
+        dataset = call_flow(prepare_dataset, experiment)
+    if checkpoint is None:
+        checkpoint = call_flow(train_generator, experiment, dataset)
     conditions, sampling = dataset.sample_conditions, experiment.sampling_choice
     extractor = train_downstream(
         [dataset.frames], downstream=measured.feature_extractor, seed=experiment.seed, label="feature extractor"
@@ -119,7 +151,7 @@ def speed_vs_error(measured: SpeedVsError) -> ManifestRef:
         [of_setting[0] for of_setting in runs[2:]],
         settings=settings[2:],
         own=next((setting for setting, choice in points[2:] if plugins.load_options(choice).options == own), None),
-        title=experiment.name,
+        title=measured.title,
         notice=experiment.data_notice,
         reference_name=_name(points[0][1]),
         converged_name=_name(points[1][1]),

@@ -11,6 +11,7 @@ from data_contracts.experiment import Experiment
 from data_contracts.study import Study
 from flows.command_line import PRESETS, apply_override, load_experiment, read_preset
 from flows.inputs import check_inputs
+from flows.speed_vs_error import speed_vs_error_of
 
 
 def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
@@ -22,10 +23,10 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
 
     Args:
         preset: as `load_preset` takes it.
-        overrides: likewise; those of a study begin with `experiments.NAME.` or `paths.`.
+        overrides: likewise; those of a study begin with `experiments.NAME.`, `paths.` or `speed_vs_error.`.
 
     Raises:
-        PluginError: as `load_experiment`.
+        PluginError: as `load_experiment` and `speed_vs_error_of`.
     """
     values = read_preset(PRESETS, preset)
     parts, paths = values.get("experiments"), values.pop("paths", {})
@@ -48,6 +49,7 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
         apply_override(values, override)
     study = validate_options(Study, values, where)
     check_inputs(study, thoroughly=None in paths.values())
+    speed_vs_error_of(study)
     return study
 
 

@@ -9,17 +9,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.report.html import render_report
+from ctlev_core.report.report_files import PAGE
+from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
 from ctlev_core.report.speed_vs_error import SpeedPage
-from ctlev_core.speed_vs_error_options import SamplerSetting
 from data_contracts import tables
 from data_contracts.manifest import Manifest, ManifestRef
+from data_contracts.speed_vs_error import SamplerSetting
 from tasks.stage import Output, stage
 
-PAGE = "speed_vs_error.html"
 TABLE = f"{tables.SPEED_VS_ERROR.name}.parquet"
 
 
-@stage(version=1, schema=tables.REPORT)
+@stage(version=2, schema=tables.REPORT)
 def speed_report(
     out: Output,
     extractor: Manifest,
@@ -36,7 +37,7 @@ def speed_report(
     converged_name: str,
     feature_extractor: str,
 ) -> pa.Table:
-    """Write the page and the table of all measurements.
+    """Write `report.html`, the table of all measurements, and `summary.json` for the page of a study.
 
     Args:
         out: of the stage.
@@ -47,7 +48,7 @@ def speed_report(
         shown: timed samples of every setting, of the same seed.
         settings: of `shown`.
         own: the setting of `settings` that the experiment samples with, if it is among them.
-        title: name of the experiment.
+        title: what the experiment is called.
         notice: what data these are.
         reference_name: sampler and steps of the reference.
         converged_name: and of what counts as converged.
@@ -80,6 +81,8 @@ def speed_report(
     )
     (out.folder / PAGE).write_text(html, encoding="utf-8")
     pq.write_table(table, out.folder / TABLE)
+    chart = next(iter(page.charts()), None)
+    write_speed_summary(out.folder, SpeedSummary(title, page.recommendation(), chart, page.settings()))
     return pa.table({"table": [tables.SPEED_VS_ERROR.name], "file": [TABLE]})
 
 

@@ -30,12 +30,12 @@ from ctlev_core.sampling_errors import (
     label_error,
     pixel_error,
 )
-from ctlev_core.speed_vs_error_options import ExactScoreOptions, PrecisionOptions, SamplerSetting
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice, SamplingChoice
 from data_contracts.labels import Conditions
 from data_contracts.manifest import Manifest, conditions_of
+from data_contracts.speed_vs_error import ExactScoreOptions, PrecisionOptions, SamplerSetting
 from tasks.stage import Output, stage
 
 

@@ -12,11 +12,20 @@ import pyarrow.parquet as pq
 from ctlev_core.report.html import Links, render_report
 from ctlev_core.report.report_files import LATEX, MARKDOWN, PAGE, published_files
 from ctlev_core.report.score_tables import PairedScores
-from ctlev_core.report.study import Part, study_sections, study_tables, study_verdict
+from ctlev_core.report.speed_summary import read_speed_summary
+from ctlev_core.report.study import (
+    Part,
+    speed_sections,
+    speed_table,
+    study_sections,
+    study_tables,
+    study_verdict,
+)
 from ctlev_core.report.summary import read_summary
 from ctlev_core.report.tables import render_latex, render_markdown
 from data_contracts import tables
 from data_contracts.manifest import Manifest
+from data_contracts.study import SPEED_VS_ERROR
 from tasks.stage import Output, stage
 
 
@@ -35,7 +44,7 @@ def study_report(
 
     Args:
         out: where.
-        reports: of the experiments.
+        reports: of the experiments; then that on speed against error, if it was measured on one of them.
         title: of the page; its links lead to the folder of that name, where the pages are published.
         notice: first line.
         names: of the experiments, likewise the following.
@@ -44,23 +53,32 @@ def study_report(
     """
     parts = [
         _part(report.ref.path, name, trained, generators)
-        for report, name, trained, generators in zip(reports, names, settings, generator_names, strict=True)
+        for report, name, trained, generators in zip(
+            reports[: len(names)], names, settings, generator_names, strict=True
+        )
     ]
+    measured = [read_speed_summary(report.ref.path) for report in reports[len(names) :]]
+    folders = [*names, *(SPEED_VS_ERROR for _ in measured)]
     shown, words = study_tables(parts), study_verdict(parts)
     links = [(f"{part.question} (`{part.name}`)", f"{title}/{part.name}/{PAGE}") for part in parts]
+    links += [(f"Speed against error (`{speed.experiment}`)", f"{title}/{SPEED_VS_ERROR}/{PAGE}") for speed in measured]
     page = render_report(
         title=title,
         lead=notice,
         verdict=words,
         steps=parts[0].summary.steps,
-        sections=[*study_sections(parts, shown), Links("Everything else, experiment by experiment", links)],
+        sections=[
+            *study_sections(parts, shown),
+            *(section for speed in measured for section in speed_sections(parts, speed)),
+            Links("Everything else, experiment by experiment", links),
+        ],
     )
     (out.folder / PAGE).write_text(page, encoding="utf-8")
-    kept = [table for of_part in shown for table in of_part]
+    kept = [table for of_part in shown for table in of_part] + [speed_table(parts, speed) for speed in measured]
     (out.folder / LATEX).write_text(render_latex(kept, title=title, lead=notice), encoding="utf-8")
     (out.folder / MARKDOWN).write_text(render_markdown(kept, title=title, lead=notice, verdict=words), encoding="utf-8")
     files = []
-    for name, report in zip(names, reports, strict=True):
+    for name, report in zip(folders, reports, strict=True):
         (out.folder / name).mkdir()
         for path in published_files(report.ref.path):
             files.append(f"{name}/{path.name}")

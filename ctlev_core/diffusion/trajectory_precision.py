@@ -20,8 +20,8 @@ from ctlev_core.diffusion.prior import Prior, choose_device, conditions_to_tenso
 from ctlev_core.diffusion.sampling import cached_condition_embedding
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.schedulers import make_scheduler
-from ctlev_core.speed_vs_error_options import KEEP_PRECISION
 from data_contracts.labels import Conditions
+from data_contracts.speed_vs_error import KEEP_PRECISION
 
 REFERENCE = torch.float64
 PRECISIONS = (

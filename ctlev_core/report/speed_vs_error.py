@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.report.html import ImageGrid, Section, Table
+from ctlev_core.report.html import Curves, ImageGrid, Section, Table
 from ctlev_core.report.measurement_charts import (
     CONVERGED_LINE,
     REFERENCE_LINE,
@@ -38,6 +38,7 @@ from ctlev_core.windows import spread
 QUICK = (5, 10)
 """Evaluations of the network in which a quick setting is looked for."""
 GRID_COLUMNS = 10
+UNKNOWN = "There are too few conditions or recordings for intervals, so nothing can be recommended."
 
 Point = tuple[str, int]
 """A line and its number of steps."""
@@ -108,19 +109,13 @@ class SpeedPage:
     features: str
 
     def verdict(self) -> str:
-        """The recommendation, in a few sentences."""
-        reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
+        """What to use, what to use in a hurry, and what the experiment uses, in a sentence or two each."""
+        reference = self._known_reference()
+        if reference is None:
+            return UNKNOWN
         found = recommend(self.rows)
-        if reference is None or reference["high"] is None:
-            return "There are too few conditions or recordings for intervals, so nothing can be recommended."
-        band = f"the reference, {self.reference_name}, has {_text(reference)}"
-        sentences = [f"No setting stays within the interval of {band}, Frechet distance to {HELD_OUT}."]
+        sentences = [self._recommendation(reference, found.default)]
         if found.default is not None:
-            fewer = reference["evaluations"] / found.default["evaluations"]
-            sentences = [
-                f"Recommended: {_named(found.default)}, {fewer:.0f} times fewer than the reference's. Frechet distance "
-                f"to {HELD_OUT} {found.default['value']:.3g}; {band}."
-            ]
             pixels = self._row(found.default["line"], PIXEL_RMS, CONVERGED, found.default["num_inference_steps"])
             if pixels is not None:
                 sentences.append(f"Its images differ from the converged solution by {pixels['value']:.2g} grey levels.")
@@ -129,24 +124,49 @@ class SpeedPage:
                 f"Of {QUICK[0]} to {QUICK[1]} evaluations: {_named(found.quick)}, {found.quick['value']:.3g}, "
                 f"{_where(found.quick, reference)}."
             )
+        return " ".join([*sentences, *self._own_setting(reference)])
+
+    def recommendation(self) -> str:
+        """The verdict without what is used in a hurry: for a page that is about something else."""
+        reference = self._known_reference()
+        if reference is None:
+            return UNKNOWN
+        found = self._recommendation(reference, recommend(self.rows).default)
+        return " ".join([found, *self._own_setting(reference)])
+
+    def _known_reference(self) -> Row | None:
+        """The reference's distance to held-out real frames, where it has an interval."""
+        reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
+        return None if reference is None or reference["high"] is None else reference
+
+    def _recommendation(self, reference: Row, default: Row | None) -> str:
+        band = f"the reference, {self.reference_name}, has {_text(reference)}"
+        if default is None:
+            return f"No setting stays within the interval of {band}, Frechet distance to {HELD_OUT}."
+        fewer = reference["evaluations"] / default["evaluations"]
+        return (
+            f"Recommended: {_named(default)}, {fewer:.0f} times fewer than the reference's. Frechet distance "
+            f"to {HELD_OUT} {default['value']:.3g}; {band}."
+        )
+
+    def _own_setting(self, reference: Row) -> list[str]:
         own = None if self.own is None else self._row(self.own[0], FD, HELD_OUT, self.own[1])
-        if own is not None:
-            sentences.append(
-                f"The experiment's own setting, {_named(own)}: {own['value']:.3g}, {_where(own, reference)}."
-            )
-        return " ".join(sentences)
+        if own is None:
+            return []
+        return [f"The experiment's own setting, {_named(own)}: {own['value']:.3g}, {_where(own, reference)}."]
 
     def sections(self) -> list[Section]:
         """Charts, tables and pictures, the generator's first."""
         return [
-            *self._charts(),
-            self._settings(),
+            *self.charts(),
+            self.settings(),
             self._grid(),
             *exact_score_sections(self.rows),
             *precision_sections(self.rows),
         ]
 
-    def _charts(self) -> list[Section]:
+    def charts(self) -> list[Curves]:
+        """Errors over evaluations, the distance to real frames first."""
         reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
         floor = self._row(REFERENCE_LINE, FD + OF_HALVES, REFERENCE)
         count = 0 if reference is None else reference["num_samples"]
@@ -179,7 +199,7 @@ class SpeedPage:
         }
         return [chart(title, *parts) for title, parts in shown.items() if parts[0]]
 
-    def _settings(self) -> Table:
+    def settings(self) -> Table:
         """Every setting with its costs and errors."""
         of_generator = [row for row in self.rows if row["study"] == "generator"]
         label = next((row["metric"] for row in of_generator if row["against"] == LABELS), "")

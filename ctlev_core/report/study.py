@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ctlev_core.report import paper_numbers
-from ctlev_core.report.html import Folded, Section
+from ctlev_core.report.html import Folded, Section, Text
 from ctlev_core.report.score_tables import PairedScores, cell_text, score_tables, trained_rows
+from ctlev_core.report.speed_summary import SpeedSummary
 from ctlev_core.report.summary import Summary
 from ctlev_core.report.tables import Cell, Table
 
@@ -88,6 +89,25 @@ def study_sections(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> 
         sections.append(replace(part.summary.grid, title=f"{part.question} (`{part.name}`): asked for, and sampled"))
         sections += _published(part.published)
     return [*sections, *tables[-1], *_published(paper_numbers.DISTANCES)]
+
+
+def speed_sections(parts: Sequence[Part], speed: SpeedSummary) -> list[Section | Folded]:
+    """What is recommended, with the chart that says why, and every setting behind a fold."""
+    title, table = f"Speed against error: {_heading(parts, speed)}", speed_table(parts, speed)
+    if speed.chart is None:
+        return [Text(title, speed.recommendation), Folded(table.title, [table])]
+    chart = replace(speed.chart, title=title, caption=f"{speed.recommendation} {speed.chart.caption}")
+    return [chart, Folded(table.title, [table])]
+
+
+def speed_table(parts: Sequence[Part], speed: SpeedSummary) -> Table:
+    """Costs and errors of every setting of the sampler."""
+    return replace(speed.settings, title=f"Speed against error, every setting: {_heading(parts, speed)}")
+
+
+def _heading(parts: Sequence[Part], speed: SpeedSummary) -> str:
+    (part,) = (part for part in parts if part.name == speed.experiment)
+    return f"{part.question} (`{part.name}`)"
 
 
 def _published(table: Table | None) -> list[Folded]:

@@ -3,9 +3,11 @@
 import re
 
 import numpy as np
+import pytest
 
 from ctlev_core.report.html import Curves, render_report
 from ctlev_core.report.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
+from ctlev_core.report.speed_summary import SUMMARY_FILE, SpeedSummary, read_speed_summary, write_speed_summary
 from ctlev_core.report.speed_vs_error import SpeedPage, recommend
 from ctlev_core.sampling_errors import (
     CONTROLNET,
@@ -18,6 +20,7 @@ from ctlev_core.sampling_errors import (
     REFERENCE,
     WALL,
 )
+from data_contracts.errors import DataError
 
 
 def row(line, steps, value, metric=FD, against=HELD_OUT, low=None, high=None, study="generator"):
@@ -103,6 +106,44 @@ def test_the_verdict_says_what_was_found():
     assert "The experiment's own setting, UniPC in 5 evaluations: 8, above the interval." in text
     worse = [*ROWS, row("UniPC", 20, 4.0)]
     assert page(worse).verdict().startswith("No setting stays within the interval")
+
+
+def test_the_recommendation_is_the_verdict_without_what_is_used_in_a_hurry():
+    made = page([*ROWS, row("UniPC", 20, 3.1)], own=("UniPC", 20))
+    text = made.recommendation()
+    assert text.startswith("Recommended: UniPC in 10 evaluations, 25 times fewer than the reference's.")
+    assert text.endswith("The experiment's own setting, UniPC in 20 evaluations: 3.1, within the interval.")
+    assert "grey levels" in made.verdict() and "Of 5 to 10 evaluations" in made.verdict()
+    assert "grey levels" not in text and "Of 5 to 10 evaluations" not in text
+    assert "nothing can be recommended" in page([row(REFERENCE_LINE, 250, 3.0)]).recommendation()
+
+
+def summary_of(rows):
+    made = page(rows)
+    return SpeedSummary("pose", made.recommendation(), next(iter(made.charts()), None), made.settings())
+
+
+@pytest.mark.parametrize("rows", [ROWS, ROWS[2:4]], ids=["with a chart", "costs alone"])
+def test_summaries_come_back_as_they_were(tmp_path, rows):
+    summary = summary_of(rows)
+    assert (summary.chart is None) == (rows is not ROWS)
+    write_speed_summary(tmp_path, summary)
+    back = read_speed_summary(tmp_path)
+    assert (back.experiment, back.recommendation) == ("pose", summary.recommendation)
+    # As a reader sees them: JSON has lists where the originals have tuples and sets.
+    assert rendered(back) == rendered(summary)
+
+
+def rendered(summary):
+    charts = [] if summary.chart is None else [summary.chart]
+    return render_report(title="", lead="", verdict="", sections=[*charts, summary.settings])
+
+
+@pytest.mark.parametrize("damage", ["", "{}", '{"experiment": "a", "recommendation": "", "chart": null}', "[]"])
+def test_damaged_summaries_are_refused(tmp_path, damage):
+    (tmp_path / SUMMARY_FILE).write_text(damage)
+    with pytest.raises(DataError, match=r"summary\.json: is not the summary of speed against error"):
+        read_speed_summary(tmp_path)
 
 
 def test_charts_have_the_references_interval_and_tables_every_setting():

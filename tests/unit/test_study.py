@@ -3,16 +3,19 @@
 import json
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
 from report_artefacts import SETTINGS, Experiment
 
 from ctlev_core.plugins import PluginError, load_options
-from ctlev_core.report.html import ImageGrid, Step
+from ctlev_core.report.html import Curves, ImageGrid, Step
 from ctlev_core.report.report_files import publish_report
+from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
 from ctlev_core.report.study import distances_table
 from ctlev_core.report.summary import SUMMARY_FILE, Summary, read_summary, write_summary
+from ctlev_core.report.tables import Table
 from ctlev_core.run_comparison import read_run
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment as Options
@@ -21,6 +24,7 @@ from data_contracts.study import Study
 from flows.command_line import PRESETS, load_experiment, load_preset
 from flows.costs import estimate_costs
 from flows.inputs import InputsMissing
+from flows.speed_vs_error import speed_vs_error_of
 from flows.studies import load_study
 from tasks.report import report
 from tasks.stage import Output
@@ -46,13 +50,48 @@ def reports(tmp_path_factory):
 def published(reports, tmp_path_factory):
     """The folder of reports with a study's."""
     home = tmp_path_factory.mktemp("study")
+    publish_study(reports, home)
+    return home / "reports"
+
+
+def publish_study(folders, home):
     made = home / "made"
     made.mkdir()
-    manifests = [Manifest(ManifestRef(key="k", path=folder), None, (), ()) for folder in reports]
+    manifests = [Manifest(ManifestRef(key="k", path=folder), None, (), ()) for folder in folders]
     shown = {"settings": [list(SETTINGS)] * 2, "generator_names": [["synthetic", "gan"]] * 2}
-    study_report.function(Output(made, made), manifests, title="both", notice="Data: `x`.", names=PARTS, **shown)
+    found = study_report.function(
+        Output(made, made), manifests, title="both", notice="Data: `x`.", names=PARTS, **shown
+    )
     publish_report(ManifestRef(key="k", path=made), home, "both")
-    return home / "reports"
+    return found
+
+
+CHART = Curves("Distance", {"UniPC": ([5.0, 10.0], [8.0, 3.0])}, "evaluations", "distance", caption="Lower is better.")
+
+
+@pytest.mark.parametrize("chart", [CHART, None], ids=["with a chart", "without"])
+def test_speed_against_error_is_a_section_with_a_link_to_its_page(reports, tmp_path, chart):
+    folder = tmp_path / "speed"
+    folder.mkdir()
+    settings = Table("Every setting", ["sampler", "U-Net"], [["UniPC", "10"]], bold={(0, 0)})
+    write_speed_summary(folder, SpeedSummary("second", "Recommended: UniPC.", chart, settings))
+    (folder / "report.html").write_text("the page")
+    pq.write_table(pa.table({"line": ["UniPC"]}), folder / "speed_vs_error.parquet")
+    found, home = publish_study([*reports, folder], tmp_path), tmp_path / "reports"
+    page = (home / "both.html").read_text()
+    texts = ["Quality of the frames</h2>", "Speed against error: 2D pose (<code>second</code>)</h2>"]
+    texts += ["Recommended: UniPC."]
+    texts += ["Lower is better.", "<svg"] if chart is not None else []
+    texts += ["Speed against error, every setting: 2D pose (<code>second</code>)</h2>", 'href="both/speed_vs_error/']
+    place = page.index("<section")  # behind the list of contents
+    for text in texts:
+        place = page.index(text, place) + 1
+    assert page.count('href="both/') == 3
+    files = home / "both" / "speed_vs_error"
+    assert sorted(path.name for path in files.iterdir()) == ["report.html", "speed_vs_error.parquet"]
+    for suffix in ("tex", "md"):
+        assert "Speed against error, every setting" in (home / "both" / f"tables.{suffix}").read_text()
+    assert "speed_vs_error/speed_vs_error.parquet" in found["file"].to_pylist()
 
 
 def test_the_page_has_every_experiment_its_samples_the_papers_numbers_and_all_distances(published):
@@ -164,6 +203,58 @@ def test_wrong_studies_are_refused(tmp_path, content, message):
     path.write_text(json.dumps({"name": "s", **content}))
     with pytest.raises(PluginError, match=message):
         load_study(str(path), [])
+
+
+SPEED = {
+    "experiment": "a",
+    "reference": {"options": {"scheduler": "ddpm"}, "steps": [12]},
+    "converged": {"steps": [16]},
+    "lines": {"UniPC": {"steps": [3, 6]}},
+}
+
+
+def load_measured(folder, speed, overrides=(), **parts):
+    path = folder / "study.yaml"
+    parts = {name: {"extends": "smoke", "name": name} | part for name, part in ({"a": {}, "b": {}} | parts).items()}
+    path.write_text(json.dumps({"name": "s", "experiments": parts, "speed_vs_error": speed}))
+    return load_study(str(path), list(overrides))
+
+
+def test_a_study_measures_the_generator_of_one_of_its_experiments(tmp_path):
+    study = load_measured(tmp_path, SPEED, ["speed_vs_error.num_images=5", "experiments.a.sampling.palette=rgb"])
+    measured = speed_vs_error_of(study)
+    assert measured.experiment == study.experiments["a"] and measured.title == "a"
+    assert measured.options.num_images == 5
+    points = [(setting.line, setting.num_inference_steps) for setting, _ in measured.points()]
+    assert points == [("reference", 12), ("converged", 16), ("UniPC", 3), ("UniPC", 6)]
+    assert {choice.options["palette"] for _, choice in measured.points()} == {"rgb"}
+    assert speed_vs_error_of(load_measured(tmp_path, SPEED, ["speed_vs_error=null"])) is None
+    assert speed_vs_error_of(load_study("all_routes", [])) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "part", "message"),
+    [
+        ({"experiment": "smoke"}, {}, r"speed_vs_error\.experiment: .* of the study, a, b; got 'smoke'"),
+        ({"steps": 3}, {}, r"unknown option 'speed_vs_error\.steps'; known: experiment, num_images"),
+        ({"reference": {"steps": [1, 2]}}, {}, "reference: expected one number of steps"),
+        ({"lines": {"x": {"options": {"scheduler": "euler"}, "steps": [3]}}}, {}, "scheduler"),
+        ({}, {"feature_extractor": None}, "a: frames are compared in features, and feature_extractor is null"),
+        (
+            {},
+            {"generator": {"name": "smpl_esim"}, "condition": {"name": "body_motion"}, "sampling": {}},
+            "a: generator 'smpl_esim' has no sampler to compare",
+        ),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(tmp_path, changes, part, message):
+    with pytest.raises(PluginError, match=message):
+        load_measured(tmp_path, SPEED | changes, a=part)
+
+
+def test_no_experiment_takes_the_folder_of_speed_against_error(tmp_path):
+    with pytest.raises(PluginError, match="no experiment can be called 'speed_vs_error'"):
+        load_measured(tmp_path, None, speed_vs_error={})
 
 
 def test_the_papers_study_says_everything_that_is_missing_at_once():

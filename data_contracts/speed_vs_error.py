@@ -1,4 +1,4 @@
-"""What `flows/speed_vs_error.py` measures. Imports nothing heavy."""
+"""What is measured of sampling on both axes, its cost and its error."""
 
 from __future__ import annotations
 
@@ -71,7 +71,10 @@ class SpeedVsErrorOptions(Frozen):
     their own are compared with it image by image.
     """
 
-    experiment: str = Field(description="preset whose tuned generator is sampled from, or path of a .yaml file")
+    experiment: str = Field(
+        description="whose tuned generator is sampled from: a preset or the path of a .yaml file; in a study the name "
+        "of one of its experiments"
+    )
     num_images: int = Field(48, ge=2, description="conditions of the experiment, evenly spread, to sample from")
     seeds: tuple[int, ...] = Field((0, 1), min_length=1, description="every condition is sampled with each")
     reference: SamplerLine
