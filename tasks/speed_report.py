@@ -81,8 +81,9 @@ def speed_report(
     )
     (out.folder / PAGE).write_text(html, encoding="utf-8")
     pq.write_table(table, out.folder / TABLE)
-    chart = next(iter(page.charts()), None)
-    write_speed_summary(out.folder, SpeedSummary(title, page.recommendation(), chart, page.settings()))
+    # Image by image a few samples tell solvers apart; distances of distributions seldom do.
+    charts = [*page.solution_charts(), *page.distance_charts()[:1]]
+    write_speed_summary(out.folder, SpeedSummary(title, page.recommendation(), charts, page.settings()))
     return pa.table({"table": [tables.SPEED_VS_ERROR.name], "file": [TABLE]})
 
 

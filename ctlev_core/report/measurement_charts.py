@@ -35,13 +35,29 @@ def find_row(
 
 def lines_of(rows: Sequence[Row], metric: str, against: str, study: str = "generator") -> Series:
     """Each line's values over its evaluations; the reference and what has converged are no lines."""
-    points = [row for row in rows_of(rows, metric, against, study) if row["evaluations"] > 0]
-    points = [row for row in points if row["line"] not in (REFERENCE_LINE, CONVERGED_LINE)]
-    series = {}
-    for line in dict.fromkeys(row["line"] for row in points):
-        of_line = sorted((row for row in points if row["line"] == line), key=lambda row: row["evaluations"])
-        series[line] = ([row["evaluations"] for row in of_line], [row["value"] for row in of_line])
-    return series
+    points = _points_of_lines(rows_of(rows, metric, against, study))
+    return {
+        line: ([row["evaluations"] for row in of_line], [row["value"] for row in of_line])
+        for line, of_line in points.items()
+    }
+
+
+def intervals_of(rows: Sequence[Row], metric: str, against: str, study: str = "generator") -> Series:
+    """The ends of the intervals of what `lines_of` gives; NaN where one is not known."""
+    points = _points_of_lines(rows_of(rows, metric, against, study))
+    return {line: (_ends(of_line, "low"), _ends(of_line, "high")) for line, of_line in points.items()}
+
+
+def _points_of_lines(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    points = [row for row in rows if row["evaluations"] > 0 and row["line"] not in (REFERENCE_LINE, CONVERGED_LINE)]
+    return {
+        line: sorted((row for row in points if row["line"] == line), key=lambda row: row["evaluations"])
+        for line in dict.fromkeys(row["line"] for row in points)
+    }
+
+
+def _ends(rows: Sequence[Row], end: str) -> list[float]:
+    return [float("nan") if row[end] is None else row[end] for row in rows]
 
 
 def chart(
@@ -51,15 +67,16 @@ def chart(
     band_name: str,
     y_label: str,
     caption: str,
+    intervals: Series | None = None,
 ) -> Curves:
-    """Errors over evaluations, with the hatched interval of `band` across the chart."""
+    """Errors over evaluations with their intervals, and the hatched interval of `band` across the chart."""
     values = [value for _, y in series.values() for value in y]
-    spans: dict[str, tuple[list[float], list[float]]] = {}
+    spans = dict(intervals or {})
     if band is not None and band["high"] is not None:
         x = [value for x, _ in series.values() for value in x]
         across = np.geomspace(min(x), max(x), _BAND_BARS).tolist()
         series = series | {band_name: (across, [band["value"]] * _BAND_BARS)}
-        spans = {band_name: ([band["low"]] * _BAND_BARS, [band["high"]] * _BAND_BARS)}
+        spans[band_name] = [band["low"]] * _BAND_BARS, [band["high"]] * _BAND_BARS
         values += [band["low"], band["high"]]
     return Curves(
         title,

@@ -1,4 +1,4 @@
-"""What the page of a study shows of a page on speed against error: its recommendation, a chart, and its table.
+"""What the page of a study shows of a page on speed against error: its recommendation, charts, and its table.
 
 It is kept as JSON beside that page.
 """
@@ -6,6 +6,7 @@ It is kept as JSON beside that page.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,13 +23,13 @@ class SpeedSummary:
     Attributes:
         experiment: whose generator was measured.
         recommendation: in a sentence or two.
-        chart: of errors over evaluations; None where no distance was measured.
+        charts: of errors over evaluations, the most telling first.
         settings: costs and errors of every setting.
     """
 
     experiment: str
     recommendation: str
-    chart: Curves | None
+    charts: Sequence[Curves]
     settings: Table
 
 
@@ -36,7 +37,7 @@ def write_speed_summary(folder: Path, summary: SpeedSummary) -> None:
     """Write `summary.json`."""
     content = {
         **vars(summary),
-        "chart": None if summary.chart is None else vars(summary.chart),
+        "charts": [vars(chart) for chart in summary.charts],
         "settings": {**vars(summary.settings), "bold": sorted(summary.settings.bold)},
     }
     (folder / SUMMARY_FILE).write_text(json.dumps(content), encoding="utf-8")
@@ -51,11 +52,11 @@ def read_speed_summary(folder: Path) -> SpeedSummary:
     path = folder / SUMMARY_FILE
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        chart, settings = content["chart"], content["settings"]
+        settings = content["settings"]
         return SpeedSummary(
             content["experiment"],
             content["recommendation"],
-            None if chart is None else Curves(**chart),
+            [Curves(**chart) for chart in content["charts"]],
             Table(**{**settings, "bold": {(row, column) for row, column in settings["bold"]}}),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -15,6 +15,7 @@ from ctlev_core.report.measurement_charts import (
     Row,
     chart,
     find_row,
+    intervals_of,
     lines_of,
     rows_of,
 )
@@ -110,63 +111,76 @@ class SpeedPage:
 
     def verdict(self) -> str:
         """What to use, what to use in a hurry, and what the experiment uses, in a sentence or two each."""
-        reference = self._known_reference()
+        reference, quick = self._known_reference(), recommend(self.rows).quick
         if reference is None:
             return UNKNOWN
-        found = recommend(self.rows)
-        sentences = [self._recommendation(reference, found.default)]
-        if found.default is not None:
-            pixels = self._row(found.default["line"], PIXEL_RMS, CONVERGED, found.default["num_inference_steps"])
-            if pixels is not None:
-                sentences.append(f"Its images differ from the converged solution by {pixels['value']:.2g} grey levels.")
-        if found.quick is not None:
-            sentences.append(
-                f"Of {QUICK[0]} to {QUICK[1]} evaluations: {_named(found.quick)}, {found.quick['value']:.3g}, "
-                f"{_where(found.quick, reference)}."
-            )
-        return " ".join([*sentences, *self._own_setting(reference)])
+        sentences = (
+            []
+            if quick is None
+            else [
+                f"Of {QUICK[0]} to {QUICK[1]} evaluations: {_named(quick)}, {quick['value']:.3g}, "
+                f"{_where(quick, reference)}."
+            ]
+        )
+        return " ".join([*self._recommendation(reference), *sentences, *self._own_setting(reference)])
 
     def recommendation(self) -> str:
         """The verdict without what is used in a hurry: for a page that is about something else."""
         reference = self._known_reference()
         if reference is None:
             return UNKNOWN
-        found = self._recommendation(reference, recommend(self.rows).default)
-        return " ".join([found, *self._own_setting(reference)])
+        return " ".join([*self._recommendation(reference), *self._own_setting(reference)])
 
     def _known_reference(self) -> Row | None:
         """The reference's distance to held-out real frames, where it has an interval."""
         reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
         return None if reference is None or reference["high"] is None else reference
 
-    def _recommendation(self, reference: Row, default: Row | None) -> str:
+    def _recommendation(self, reference: Row) -> list[str]:
+        default = recommend(self.rows).default
         band = f"the reference, {self.reference_name}, has {_text(reference)}"
         if default is None:
-            return f"No setting stays within the interval of {band}, Frechet distance to {HELD_OUT}."
+            return [f"No setting stays within the interval of {band}, Frechet distance to {HELD_OUT}."]
         fewer = reference["evaluations"] / default["evaluations"]
-        return (
+        return [
             f"Recommended: {_named(default)}, {fewer:.0f} times fewer than the reference's. Frechet distance "
-            f"to {HELD_OUT} {default['value']:.3g}; {band}."
-        )
+            f"to {HELD_OUT} {default['value']:.3g}; {band}.",
+            *self._resolution(reference, default),
+            *(f"Its images differ from the converged solution by {pixels}." for pixels in self._pixels(default)),
+        ]
+
+    def _resolution(self, reference: Row, default: Row) -> list[str]:
+        """How large a difference so few samples could show: half the interval of the paired one."""
+        excess = self._at((default["line"], default["num_inference_steps"]), FD + EXCESS, HELD_OUT)
+        if excess is None or excess["low"] is None or excess["high"] is None:
+            return []
+        share = (excess["high"] - excess["low"]) / 2 / reference["value"]
+        return [f"With {excess['num_samples']} samples a difference of less than {share:.0%} does not show."]
+
+    def _pixels(self, row: Row) -> list[str]:
+        found = self._row(row["line"], PIXEL_RMS, CONVERGED, row["num_inference_steps"])
+        return [] if found is None else [f"{found['value']:.2g} grey levels"]
 
     def _own_setting(self, reference: Row) -> list[str]:
         own = None if self.own is None else self._row(self.own[0], FD, HELD_OUT, self.own[1])
         if own is None:
             return []
-        return [f"The experiment's own setting, {_named(own)}: {own['value']:.3g}, {_where(own, reference)}."]
+        found = ", ".join([f"{own['value']:.3g}", _where(own, reference), *self._pixels(own)])
+        return [f"The experiment's own setting, {_named(own)}: {found}."]
 
     def sections(self) -> list[Section]:
         """Charts, tables and pictures, the generator's first."""
         return [
-            *self.charts(),
+            *self.distance_charts(),
+            *self.solution_charts(),
             self.settings(),
             self._grid(),
             *exact_score_sections(self.rows),
             *precision_sections(self.rows),
         ]
 
-    def charts(self) -> list[Curves]:
-        """Errors over evaluations, the distance to real frames first."""
+    def distance_charts(self) -> list[Curves]:
+        """Distances over evaluations: to held-out real frames, and to the reference's samples."""
         reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
         floor = self._row(REFERENCE_LINE, FD + OF_HALVES, REFERENCE)
         count = 0 if reference is None else reference["num_samples"]
@@ -188,16 +202,19 @@ class SpeedPage:
                 "Between halves of the samples, because halves of the reference's own samples show what a perfect "
                 "copy of its distribution would get: hatched, 95 % of random halves.",
             ),
-            "Difference from the converged solution": (
-                lines_of(self.rows, PIXEL_RMS, CONVERGED),
-                None,
-                "",
-                "RMS, grey levels of 255",
-                f"Image by image from the same noise, against {self.converged_name}. Only solvers that draw no noise "
-                "of their own approach it; it says how exactly they solve, not how good the image is.",
-            ),
         }
         return [chart(title, *parts) for title, parts in shown.items() if parts[0]]
+
+    def solution_charts(self) -> list[Curves]:
+        """Differences from the converged solution over evaluations; none where all solvers draw noise."""
+        series = lines_of(self.rows, PIXEL_RMS, CONVERGED)
+        caption = (
+            f"Image by image from the same noise, against {self.converged_name}; bars are 95 % intervals. Only solvers "
+            "that draw no noise of their own approach it; it says how exactly they solve, not how good the image is."
+        )
+        intervals = intervals_of(self.rows, PIXEL_RMS, CONVERGED)
+        title, y_label = "Difference from the converged solution", "RMS, grey levels of 255"
+        return [chart(title, series, None, "", y_label, caption, intervals)] if series else []
 
     def settings(self) -> Table:
         """Every setting with its costs and errors."""

@@ -92,12 +92,13 @@ def study_sections(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> 
 
 
 def speed_sections(parts: Sequence[Part], speed: SpeedSummary) -> list[Section | Folded]:
-    """What is recommended, with the chart that says why, and every setting behind a fold."""
+    """What is recommended, with a chart that says why; further charts and every setting behind a fold."""
     title, table = f"Speed against error: {_heading(parts, speed)}", speed_table(parts, speed)
-    if speed.chart is None:
+    if not speed.charts:
         return [Text(title, speed.recommendation), Folded(table.title, [table])]
-    chart = replace(speed.chart, title=title, caption=f"{speed.recommendation} {speed.chart.caption}")
-    return [chart, Folded(table.title, [table])]
+    first, *others = speed.charts
+    shown = replace(first, title=title, caption=f"{speed.recommendation} The chart: {first.title}. {first.caption}")
+    return [shown, Folded(table.title, [*others, replace(table, title="Costs and errors")] if others else [table])]
 
 
 def speed_table(parts: Sequence[Part], speed: SpeedSummary) -> Table:

@@ -1,6 +1,7 @@
 """Studies: presets of several experiments, and the page that tells them as one."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -67,22 +68,25 @@ def publish_study(folders, home):
 
 
 CHART = Curves("Distance", {"UniPC": ([5.0, 10.0], [8.0, 3.0])}, "evaluations", "distance", caption="Lower is better.")
+OTHER = replace(CHART, title="Another")
 
 
-@pytest.mark.parametrize("chart", [CHART, None], ids=["with a chart", "without"])
-def test_speed_against_error_is_a_section_with_a_link_to_its_page(reports, tmp_path, chart):
+@pytest.mark.parametrize("charts", [[CHART], [CHART, OTHER], []], ids=["a chart", "two charts", "no chart"])
+def test_speed_against_error_is_a_section_with_a_link_to_its_page(reports, tmp_path, charts):
     folder = tmp_path / "speed"
     folder.mkdir()
     settings = Table("Every setting", ["sampler", "U-Net"], [["UniPC", "10"]], bold={(0, 0)})
-    write_speed_summary(folder, SpeedSummary("second", "Recommended: UniPC.", chart, settings))
+    write_speed_summary(folder, SpeedSummary("second", "Recommended: UniPC.", charts, settings))
     (folder / "report.html").write_text("the page")
     pq.write_table(pa.table({"line": ["UniPC"]}), folder / "speed_vs_error.parquet")
     found, home = publish_study([*reports, folder], tmp_path), tmp_path / "reports"
     page = (home / "both.html").read_text()
     texts = ["Quality of the frames</h2>", "Speed against error: 2D pose (<code>second</code>)</h2>"]
     texts += ["Recommended: UniPC."]
-    texts += ["Lower is better.", "<svg"] if chart is not None else []
-    texts += ["Speed against error, every setting: 2D pose (<code>second</code>)</h2>", 'href="both/speed_vs_error/']
+    texts += ["The chart: Distance. Lower is better.", "<svg"] if charts else []
+    texts += ["Speed against error, every setting: 2D pose (<code>second</code>)</h2>"]
+    texts += ["Another</h3>", "<svg", "Costs and errors</h3>"] if OTHER in charts else []
+    texts += ["<td", 'href="both/speed_vs_error/']
     place = page.index("<section")  # behind the list of contents
     for text in texts:
         place = page.index(text, place) + 1
