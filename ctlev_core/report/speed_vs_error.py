@@ -155,7 +155,7 @@ class SpeedPage:
         if excess is None or excess["low"] is None or excess["high"] is None:
             return []
         share = (excess["high"] - excess["low"]) / 2 / reference["value"]
-        return [f"With {excess['num_samples']} samples a difference of less than {share:.0%} does not show."]
+        return [f"With {excess['num_samples']} samples, differences below {share:.0%} of the distance do not show."]
 
     def _pixels(self, row: Row) -> list[str]:
         found = self._row(row["line"], PIXEL_RMS, CONVERGED, row["num_inference_steps"])

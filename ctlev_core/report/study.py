@@ -93,12 +93,13 @@ def study_sections(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> 
 
 def speed_sections(parts: Sequence[Part], speed: SpeedSummary) -> list[Section | Folded]:
     """What is recommended, with a chart that says why; further charts and every setting behind a fold."""
-    title, table = f"Speed against error: {_heading(parts, speed)}", speed_table(parts, speed)
-    if not speed.charts:
-        return [Text(title, speed.recommendation), Folded(table.title, [table])]
-    first, *others = speed.charts
-    shown = replace(first, title=title, caption=f"{speed.recommendation} The chart: {first.title}. {first.caption}")
-    return [shown, Folded(table.title, [*others, replace(table, title="Costs and errors")] if others else [table])]
+    table = speed_table(parts, speed)
+    sections: list[Section | Folded] = [Text(f"Speed against error: {_heading(parts, speed)}", speed.recommendation)]
+    for chart in speed.charts[:1]:
+        sections.append(replace(chart, title=f"Speed against error: {chart.title[:1].lower()}{chart.title[1:]}"))
+    others = speed.charts[1:]
+    shown = [*others, replace(table, title="Costs and errors")] if others else [table]
+    return [*sections, Folded(table.title, shown)]
 
 
 def speed_table(parts: Sequence[Part], speed: SpeedSummary) -> Table:

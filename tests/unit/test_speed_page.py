@@ -121,7 +121,7 @@ def test_the_recommendation_is_the_verdict_without_what_is_used_in_a_hurry():
 def test_it_says_what_so_few_samples_cannot_show():
     """Half the interval of the paired difference, 0.6, is 20 % of the reference's distance."""
     made = page([*ROWS, row("UniPC", 10, 0.2, FD + EXCESS, low=-0.5, high=0.7)])
-    assert "With 96 samples a difference of less than 20% does not show." in made.recommendation()
+    assert "With 96 samples, differences below 20% of the distance do not show." in made.recommendation()
     assert "does not show" not in page(ROWS).recommendation()
 
 

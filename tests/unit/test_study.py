@@ -83,7 +83,7 @@ def test_speed_against_error_is_a_section_with_a_link_to_its_page(reports, tmp_p
     page = (home / "both.html").read_text()
     texts = ["Quality of the frames</h2>", "Speed against error: 2D pose (<code>second</code>)</h2>"]
     texts += ["Recommended: UniPC."]
-    texts += ["The chart: Distance. Lower is better.", "<svg"] if charts else []
+    texts += ["Speed against error: distance</h2>", "Lower is better.", "<svg"] if charts else []
     texts += ["Speed against error, every setting: 2D pose (<code>second</code>)</h2>"]
     texts += ["Another</h3>", "<svg", "Costs and errors</h3>"] if OTHER in charts else []
     texts += ["<td", 'href="both/speed_vs_error/']
@@ -164,7 +164,7 @@ def test_the_bundled_study_is_made_of_its_presets():
     assert isinstance(study, Study)
     pose = load_experiment("pose", [])
     assert study.experiments["pose"] == pose.model_copy(update={"num_synthetic": 5})
-    for name in ("body", "objects", "zero_shot"):
+    for name in ("pose_cdehp", "body", "objects", "zero_shot"):
         assert study.experiments[name] == load_experiment(name, [])
     assert load_study("pose", []) == pose
 
@@ -327,6 +327,7 @@ def test_costs_of_smaller_images_and_guidance_are_between_the_counted_ones():
 
 def test_only_the_full_experiment_takes_a_study():
     with pytest.raises(
-        PluginError, match=r"'all_routes' is a study .* name one of its parts instead: pose, body, objects, zero_shot"
+        PluginError,
+        match=r"'all_routes' is a study .* name one of its parts instead: pose, pose_cdehp, body, objects, ",
     ):
         load_experiment("all_routes", [])
