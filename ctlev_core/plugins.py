@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -454,10 +455,13 @@ def load(kind: str, name: str) -> ModuleType:
     Raises:
         PluginError: there is no such plug-in; the message lists the known ones.
     """
+    path = f"ctlev_core.{kind}.{name}"
+    if kind in KINDS and name.isidentifier() and not name.startswith("_") and path in sys.modules:
+        return sys.modules[path]  # without reading its folder once more, which plans would do a thousand times
     known = names(kind)
     if name not in known:
         raise PluginError(f"unknown plug-in {name!r} in {kind}; known: {', '.join(known)}")
-    return importlib.import_module(f"ctlev_core.{kind}.{name}")
+    return importlib.import_module(path)
 
 
 def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: str) -> Any:

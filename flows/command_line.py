@@ -19,7 +19,7 @@ from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.experiment import Experiment
 from data_contracts.study import Study
-from flows import local_server
+from flows import local_server, settings
 from flows.costs import HOW_ESTIMATED, estimate_costs
 from flows.inputs import InputsMissing, check_inputs
 from tasks.stage import PlannedStage, in_one_run, planning
@@ -118,6 +118,25 @@ def print_plan(rows: list[PlannedStage]) -> None:
     print(f"{sum(row.cached for row in rows)} of {len(rows)} stages are cached")
 
 
+def publish_plan(rows: list[PlannedStage], description: str) -> None:
+    """The same as an artefact of the Prefect run that we are in."""
+    from prefect.artifacts import create_table_artifact
+
+    table = [{"stage": row.label, "plan": "cached" if row.cached else "to run", "key": row.key} for row in rows]
+    create_table_artifact(table, key="plan", description=description)
+
+
+def with_plan(script_flow: Any, rows: list[PlannedStage], description: str) -> Any:
+    """A flow of one parameter that does what another does, and publishes the plan first."""
+
+    def run(options: Any) -> Any:
+        publish_plan(rows, description)
+        return script_flow.fn(options)
+
+    run.__name__, run.__doc__ = script_flow.fn.__name__, script_flow.fn.__doc__
+    return settings.flow(name=script_flow.name)(run)
+
+
 def print_costs(asked: Any) -> None:
     """What generators of Stable Diffusion's size would take; nothing for the bundled prior, a matter of minutes."""
     if not isinstance(asked, Experiment | Study):
@@ -153,10 +172,11 @@ def main(
     arguments = _parse(flow, default_preset)
     started = time.perf_counter()
     try:
-        check_home(Path(os.environ["CTLEV_HOME"]))
-        options = load(arguments.preset, arguments.set)
+        home = Path(os.environ["CTLEV_HOME"])
+        check_home(home)
         if not arguments.dry_run:
-            local_server.start(Path(os.environ["CTLEV_HOME"]))
+            local_server.start(home)  # first of all, so that what comes now overlaps with its start-up
+        options = load(arguments.preset, arguments.set)
         with planning() as rows:
             flow.fn(options)
         if arguments.dry_run:
@@ -166,7 +186,7 @@ def main(
         use_cores(rows)
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
-            result = flow(options)
+            result = with_plan(flow, rows, f"preset {arguments.preset}, in {home}")(options)
         described = describe(result, options)
     except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
         if isinstance(error, InputsMissing) and arguments.dry_run:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from prefect import Flow
-from prefect.artifacts import create_table_artifact
 from prefect.logging import get_run_logger
 
 from ctlev_core.diffusion.pretraining import PretrainingOptions
@@ -30,7 +29,7 @@ from flows import regenerate as of_regenerate
 from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
-from flows.command_line import PRESETS, check_home, load_experiment, load_preset, use_cores
+from flows.command_line import PRESETS, check_home, load_experiment, load_preset, publish_plan, use_cores
 from flows.settings import HOME, flow
 from flows.studies import load_study
 from tasks.contact_sheet import publish_contact_sheet
@@ -71,8 +70,7 @@ def _deployable(
         options = load(preset, list(overrides))
         with planning() as rows:
             script_flow.fn(options)
-        plan = [{"stage": row.label, "plan": "cached" if row.cached else "to run", "key": row.key} for row in rows]
-        create_table_artifact(plan, key="plan", description=f"{script_flow.name}, preset {preset}, in {folder}")
+        publish_plan(rows, f"{script_flow.name}, preset {preset}, in {folder}")
         use_cores(rows)
         made = script_flow.fn(options)  # called as a flow it would be a second run of the same name within this one
         if publish is not None:

@@ -94,9 +94,10 @@ def planning() -> Iterator[list[PlannedStage]]:
 
 @contextlib.contextmanager
 def in_one_run() -> Iterator[None]:
-    """Inside this block a flow's stages are tasks of the run it is called from, one after the other.
+    """Inside this block a flow's stages belong to the run it is called from, one after the other.
 
-    For runs that find everything cached: there, runs of their own for inner flows take longer than what is in them.
+    For runs that find everything cached: there, runs of their own for inner flows, and of tasks for stages, take longer
+    than what is in them. The plan that such a run publishes lists its stages; one that is gone by now is a task.
     """
     token = _in_one_run.set(True)
     try:
@@ -169,7 +170,8 @@ class Stage:
             cached = store.find(self.name, key) is not None
             plan.rows.append(PlannedStage(self.name, label, key, cached))
             return ManifestRef(key=key, path=store.folder(self.name, key))
-        return _run_as_task(self, label, key, arguments)
+        found = self.find(key, arguments) if _in_one_run.get() else None
+        return found or _run_as_task(self, label, key, arguments)
 
     def check(self, arguments: dict[str, Any]) -> None:
         """Raise `DataError` where the settings do not go together: where a stage is planned, and where it is run."""

@@ -120,6 +120,19 @@ def test_unknown_names_list_the_known_ones():
         plugins.names("metric")
 
 
+@pytest.mark.parametrize("name", ["__init__", "studio.sys", "../datasets/studio", ""])
+def test_only_names_of_plugins_are_loaded(name):
+    plugins.load("datasets", "studio")
+    with pytest.raises(PluginError, match="unknown plug-in"):
+        plugins.load("datasets", name)
+
+
+def test_a_plugin_is_looked_for_once(monkeypatch):
+    module = plugins.load("datasets", "studio")
+    monkeypatch.setattr(plugins, "names", lambda kind: pytest.fail("its folder was read again"))
+    assert plugins.load("datasets", "studio") is module
+
+
 def test_every_wrong_option_is_named_at_once():
     choice = DatasetChoice(name="folder", options={"root": ".", "test_fraction": 2, "colour": 1})
     with pytest.raises(PluginError) as error:

@@ -1,9 +1,11 @@
 """The whole chain, run as a user would."""
 
+import contextlib
 import json
 import os
 import re
 import signal
+import sqlite3
 import statistics
 import subprocess
 import sys
@@ -156,6 +158,18 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
         differences.append(cached - seconds(bare, cwd=smoke_home, env=environment | quiet))
     assert digests(smoke_home) == before
     assert statistics.median(differences) < 5, differences
+    # Prefect's record of the last of them.
+    with contextlib.closing(sqlite3.connect(smoke_home / "prefect" / "prefect.db")) as database:
+        query = """
+            SELECT artifact.data FROM artifact JOIN flow_run ON flow_run.id = artifact.flow_run_id
+            JOIN flow ON flow.id = flow_run.flow_id
+            WHERE artifact.key = 'plan' AND flow.name = 'full-experiment' AND flow_run.state_name = 'Completed'
+            ORDER BY artifact.created DESC LIMIT 1"""
+        ((plan,),) = database.execute(query)
+    while isinstance(plan, str):
+        plan = json.loads(plan)
+    assert {row["plan"] for row in plan} == {"cached"}
+    assert {row["key"] for row in plan} == {name.partition("/")[2] for name in before}
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -17,7 +18,7 @@ from data_contracts import tables
 from data_contracts.config import RUN_SETTING, DatasetChoice, Frozen, Windows, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import read_manifest
-from tasks.stage import planning, stage
+from tasks.stage import in_one_run, planning, stage
 from tasks.store import Store
 
 
@@ -108,6 +109,37 @@ def test_planning_computes_nothing_and_knows_every_key():
         second(first(windows=Windows()))
     assert [row.cached for row in rows_after] == [True, True]
     assert [row.key for row in rows_after] == [row.key for row in rows] == [ref.key, done.key]
+
+
+DAMAGE = {
+    "removed": shutil.rmtree,
+    "a file cut short": lambda folder: os.truncate(folder / "frames.npy", 10),
+    "another manifest": lambda folder: os.truncate(folder / "manifest.parquet", 10),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_in_one_run_only_what_is_gone_since_the_plan_is_a_task(monkeypatch, damage):
+    tasks = []
+
+    def run_as_task(a_stage, label, key, arguments):
+        tasks.append(label)
+        return a_stage.run(key, arguments)[0]
+
+    monkeypatch.setattr("tasks.stage._run_as_task", run_as_task)
+    source = first(windows=Windows(), label="data")
+    made = second(source)
+    assert tasks == ["first: data", "second"]
+    with planning() as rows, in_one_run():
+        second(first(windows=Windows()))
+    assert all(row.cached for row in rows)
+    with in_one_run():
+        assert second(first(windows=Windows())) == made
+    assert tasks == ["first: data", "second"]
+    DAMAGE[damage](source.path)
+    with in_one_run():
+        assert second(first(windows=Windows(), label="again")) == made
+    assert tasks[2:] == ["first: again"] and calls == ["first", "second", "first"]
 
 
 def test_damaged_artefact_is_set_aside_and_made_anew(home):
