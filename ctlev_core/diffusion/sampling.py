@@ -33,7 +33,7 @@ from ctlev_core.diffusion.prior import (
     encode_prompts,
     load_prior,
 )
-from ctlev_core.diffusion.sampling_devices import device_names, run_on_devices
+from ctlev_core.diffusion.sampling_devices import device_names, run_on_devices, spread_over_cores
 from ctlev_core.diffusion.sampling_memory import ShrinkingBatches
 from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling_shards import Shard, plan_shards
@@ -192,21 +192,37 @@ def sample_checkpoint(
 ) -> np.ndarray:
     """Load a checkpoint folder and sample from it: `sample` of both generators.
 
-    With several devices the shards are dealt out to one process each, batches as with one: the frames are the same.
+    With several devices, or several cores and a small network, the shards are dealt out to one process each, batches as
+    with one: the frames are the same.
     """
     _check_scheduler(checkpoint, options)
     devices, identity = device_names(options.device), _checkpoint_digest(checkpoint)
-    if len(devices) == 1 or not len(conditions):
+    if not len(conditions):
         prior = load_for_sampling(checkpoint, options, devices[0], with_controlnet)
         return sample_frames(prior, conditions, options, seeds=seeds, work=work, identity=identity)
     _check_seeds(conditions, seeds)
     shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
     with _progress(shards) as (missing, report):
         function = functools.partial(_sample_share, checkpoint, options, with_controlnet, _prompts(conditions))
+        num_threads = torch.get_num_threads()
+        if len(devices) == 1:
+            devices = spread_over_cores(devices[0], checkpoint, _num_whole(missing))
+            num_threads //= len(devices)
         shares = [missing[number :: len(devices)] for number in range(len(devices))]
         busy = [number for number, share in enumerate(shares) if share]
-        run_on_devices(function, [devices[number] for number in busy], [shares[number] for number in busy], report)
+        if len(devices) == 1:
+            function(devices[0], missing, report)
+        else:
+            run_on_devices(
+                function, [devices[number] for number in busy], [shares[number] for number in busy], report, num_threads
+            )
     return _read(shards)
+
+
+def _num_whole(shards: list[Shard]) -> int:
+    """Shards, without one that is hardly worth a process."""
+    sizes = [len(shard) for shard in shards]
+    return sum(sizes) // max(sizes) if sizes else 0
 
 
 def _sample_share(
@@ -219,6 +235,8 @@ def _sample_share(
     report: Callable[[int], None],
 ) -> None:
     """What the process of one device does."""
+    if not shards:
+        return
     prior = load_for_sampling(checkpoint, options, device, with_controlnet)
     for shard in shards:
         _check_conditions(prior, shard.conditions, shard.seeds)

@@ -10,10 +10,13 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any
 
 import torch
 
+SMALL_BYTES = 500_000_000
+"""Weights of more use several threads well, and fill the memory when they are read twice."""
 END_TIMEOUT_S = 10.0
 """After being asked to end, a process has so long."""
 
@@ -37,11 +40,29 @@ def device_names(asked: str) -> list[str]:
     return names
 
 
+def spread_over_cores(device: str, checkpoint: Path, most: int) -> list[str]:
+    """The device as often as processes are to share it.
+
+    A small network gains little from a second thread of a CPU, and as much as there is to gain from a second process.
+
+    Args:
+        device: a name.
+        checkpoint: folder or file of the weights.
+        most: processes there is work for.
+    """
+    kind = torch.device("cuda" if torch.cuda.is_available() else "cpu").type if device == "auto" else device
+    files = [checkpoint] if checkpoint.is_file() else checkpoint.glob("*/*.safetensors")
+    if kind != "cpu" or sum(file.stat().st_size for file in files) > SMALL_BYTES:
+        return [device]
+    return [device] * max(min(torch.get_num_threads(), most), 1)
+
+
 def run_on_devices(
     function: Callable[[str, Any, Callable[[int], None]], None],
     devices: Sequence[str],
     shares: Sequence[Any],
     report: Callable[[int], None],
+    num_threads: int,
 ) -> None:
     """Call `function(device, share, report)` in a process for each device, side by side.
 
@@ -52,6 +73,7 @@ def run_on_devices(
         devices: names.
         shares: what each device has to do.
         report: is called here with the numbers reported there.
+        num_threads: of torch in each process.
     Raises:
         RuntimeError: a process was ended from outside, for example because memory ran out.
         Exception: what a call raised, with the traceback of its process as a note.
@@ -63,7 +85,7 @@ def run_on_devices(
     try:
         for device, share in zip(devices, shares, strict=True):
             ours, theirs = context.Pipe(duplex=False)
-            arguments = (function, device, share, torch.get_num_threads(), theirs)
+            arguments = (function, device, share, num_threads, theirs)
             process = context.Process(target=_serve, args=arguments, name=f"sampling on {device}", daemon=True)
             process.start()
             theirs.close()  # so that its end is seen here when the process is gone
@@ -107,7 +129,7 @@ def _serve(
     num_threads: int,
     connection: Connection,
 ) -> None:
-    """What a process does. As many threads as in the process that started it: sums then run in the same order."""
+    """What a process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(num_threads)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core.diffusion.sampling_devices import device_names, run_on_devices
+from ctlev_core.diffusion import sampling_devices
+from ctlev_core.diffusion.sampling_devices import device_names, run_on_devices, spread_over_cores
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from data_contracts.errors import DataError
 
@@ -46,7 +47,7 @@ def act(device, share, report):
 
 def test_reports_come_from_all_processes():
     reported = []
-    run_on_devices(report_share, ["cpu", "cpu"], [[1, 2], [30]], reported.append)
+    run_on_devices(report_share, ["cpu", "cpu"], [[1, 2], [30]], reported.append, 1)
     assert sorted(reported) == [1, 2, 30]
 
 
@@ -56,7 +57,7 @@ def test_reports_come_from_all_processes():
 def test_the_first_failure_ends_the_other_processes(deed, error, message):
     started = time.monotonic()
     with pytest.raises(error, match=message) as caught:
-        run_on_devices(act, ["cpu", "cpu"], [deed, "sleep"], lambda _: None)
+        run_on_devices(act, ["cpu", "cpu"], [deed, "sleep"], lambda _: None, 1)
     assert time.monotonic() - started < 110, "the process that slept was not waited for"
     if deed == "raise":
         assert "in act" in "".join(caught.value.__notes__)
@@ -88,3 +89,15 @@ def test_two_processes_make_the_frames_of_one(tmp_path, monkeypatch):
     assert np.array_equal(sample("cpu,cpu", "two"), one)
     assert sorted(path.name for path in (tmp_path / "two").iterdir()) == shards
     assert kept.stat().st_mtime_ns == written_ns
+
+
+def test_small_networks_on_a_cpu_have_a_process_a_core(tmp_path, monkeypatch):
+    (tmp_path / "unet").mkdir()
+    (tmp_path / "unet" / "model.safetensors").write_bytes(bytes(100))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    assert spread_over_cores("cpu", tmp_path, 9) == ["cpu"] * 4
+    assert spread_over_cores("cpu", tmp_path, 2) == ["cpu"] * 2
+    assert spread_over_cores("cpu", tmp_path, 0) == ["cpu"]
+    assert spread_over_cores("cuda:0", tmp_path, 9) == ["cuda:0"]
+    monkeypatch.setattr(sampling_devices, "SMALL_BYTES", 99)
+    assert spread_over_cores("cpu", tmp_path, 9) == ["cpu"]
