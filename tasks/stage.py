@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib
 import importlib.metadata
@@ -27,6 +28,7 @@ import os
 import platform
 import resource
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
@@ -74,6 +76,8 @@ class _Plan:
 
 _plan: ContextVar[_Plan | None] = ContextVar("ctlev_plan", default=None)
 _in_one_run: ContextVar[bool] = ContextVar("ctlev_in_one_run", default=False)
+_being_made: dict[str, threading.Lock] = {}
+"""By key. Locks of this process, before those of the store, which hold against all."""
 
 
 @contextlib.contextmanager
@@ -193,7 +197,12 @@ class Stage:
             return found, True
         workers = current_workers()
         if workers is not None:
-            return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
+            # Whoever else wants this artefact waits here, and leaves the processes to those who have work for them.
+            with _being_made.setdefault(key, threading.Lock()):
+                found = self.find(key, arguments)
+                if found is not None:
+                    return found, True
+                return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
         store, upstream = Store(), _upstream(arguments)
         with store.lock(key):
             found = self._find(store, key, upstream)  # another process may have just finished it
@@ -219,7 +228,7 @@ class Stage:
         folder.mkdir(parents=True)
         work.mkdir(parents=True, exist_ok=True)
         opened = {name: _opened(value) for name, value in arguments.items()}
-        started, wall, cpu = time.time(), time.perf_counter(), time.process_time()
+        started, wall, cpu = time.time(), time.perf_counter(), _cpu_seconds()
         try:
             table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
@@ -234,7 +243,7 @@ class Stage:
             "upstream": upstream,
             "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
             "wall_seconds": round(time.perf_counter() - wall, 3),
-            "cpu_seconds": round(time.process_time() - cpu, 3),
+            "cpu_seconds": round(_cpu_seconds() - cpu, 3),
             # Highest of the process so far, which is what decides whether a machine is large enough.
             "process_peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
             "versions": _versions(),
@@ -342,6 +351,13 @@ def _material(value: Any) -> Any:
     raise DataError(f"a stage argument must be a manifest, options or a plain value, got {type(value).__name__}")
 
 
+def _cpu_seconds() -> float:
+    """Processor seconds of this process, and of those it started that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(of.ru_utime + of.ru_stime for of in used)
+
+
+@functools.cache
 def _versions() -> dict[str, str]:
     packages = ("ctlev", "torch", "numpy", "diffusers", "transformers", "numba", "pyarrow", "prefect")
     found = {"python": platform.python_version(), "platform": platform.platform(), "cores": str(os.cpu_count())}

@@ -1,12 +1,16 @@
 """Keys, caching, crashes and provenance of a stage, without Prefect."""
 
+import contextlib
 import json
 import os
 import shutil
 import subprocess
 import sys
 import textwrap
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +22,7 @@ from data_contracts import tables
 from data_contracts.config import RUN_SETTING, DatasetChoice, Frozen, Windows, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import read_manifest
+from tasks import workers
 from tasks.stage import in_one_run, planning, stage
 from tasks.store import Store
 
@@ -140,6 +145,52 @@ def test_in_one_run_only_what_is_gone_since_the_plan_is_a_task(monkeypatch, dama
     with in_one_run():
         assert second(first(windows=Windows(), label="again")) == made
     assert tasks[2:] == ["first: again"] and calls == ["first", "second", "first"]
+
+
+class OneProcess:
+    """In the place of `tasks.workers`: computes here, one call after the other."""
+
+    def __init__(self):
+        self.calls, self.begun, self.go_on = [], threading.Event(), threading.Event()
+
+    def call(self, function, module, name, key, arguments):
+        self.calls.append(name)
+        self.begun.set()
+        assert self.go_on.wait(30)
+        with no_workers():
+            return {"first": first, "second": second}[name].run(key, arguments)
+
+
+@contextlib.contextmanager
+def no_workers():
+    token = workers._current.set(None)
+    try:
+        yield
+    finally:
+        workers._current.reset(token)
+
+
+def test_who_waits_for_an_artefact_takes_no_process_from_others():
+    source, _ = run(first, windows=Windows())
+    process = OneProcess()
+    token = workers._current.set(process)
+    try:
+        with ThreadPoolExecutor(3) as threads:
+            asked = [threads.submit(copy_context().run, run, second, source)]
+            assert process.begun.wait(30)
+            asked.append(threads.submit(copy_context().run, run, second, source))
+            other = threads.submit(copy_context().run, run, first, windows=Windows(), seed=1)
+            deadline = time.monotonic() + 30
+            while len(process.calls) < 2 and time.monotonic() < deadline:
+                time.sleep(0.01)
+            assert process.calls == ["second", "first"], "the second who asks for `second` waits outside"
+            process.go_on.set()
+            made, found = (call.result() for call in asked)
+        assert made[0] == found[0] and (made[1], found[1]) == (False, True)
+        assert not other.result()[1]
+        assert sorted(calls) == ["first", "first", "second"]
+    finally:
+        workers._current.reset(token)
 
 
 def test_damaged_artefact_is_set_aside_and_made_anew(home):
