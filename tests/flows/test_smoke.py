@@ -61,6 +61,18 @@ def test_every_artefact_is_whole_and_says_where_it_came_from(smoke_home):
     assert not list((smoke_home / "tmp").iterdir()) and not list((smoke_home / "work").iterdir())
 
 
+def ask_prefect(home, query):
+    """Rows of the database that the private servers of scripts leave behind."""
+    with contextlib.closing(sqlite3.connect(home / "prefect" / "prefect.db")) as database:
+        return database.execute(query).fetchall()
+
+
+def test_prefect_has_recorded_every_stage_that_was_computed(smoke_home):
+    messages = ask_prefect(smoke_home, "SELECT message FROM task_run_state WHERE name = 'Completed'")
+    recorded = {message.rpartition(" ")[2] for (message,) in messages if ", key " in (message or "")}
+    assert recorded >= {name.partition("/")[2][:12] for name in digests(smoke_home)}
+
+
 GENERATORS = {
     "synthetic": ("sample", "generators/controlnet", "conditions/skeleton"),
     "event_gan": ("sample", "generators/event_gan", "conditions/intensity_pair"),
@@ -159,13 +171,12 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
     assert digests(smoke_home) == before
     assert statistics.median(differences) < 5, differences
     # Prefect's record of the last of them.
-    with contextlib.closing(sqlite3.connect(smoke_home / "prefect" / "prefect.db")) as database:
-        query = """
-            SELECT artifact.data FROM artifact JOIN flow_run ON flow_run.id = artifact.flow_run_id
-            JOIN flow ON flow.id = flow_run.flow_id
-            WHERE artifact.key = 'plan' AND flow.name = 'full-experiment' AND flow_run.state_name = 'Completed'
-            ORDER BY artifact.created DESC LIMIT 1"""
-        ((plan,),) = database.execute(query)
+    query = """
+        SELECT artifact.data FROM artifact JOIN flow_run ON flow_run.id = artifact.flow_run_id
+        JOIN flow ON flow.id = flow_run.flow_id
+        WHERE artifact.key = 'plan' AND flow.name = 'full-experiment' AND flow_run.state_name = 'Completed'
+        ORDER BY artifact.created DESC LIMIT 1"""
+    ((plan,),) = ask_prefect(smoke_home, query)
     while isinstance(plan, str):
         plan = json.loads(plan)
     assert {row["plan"] for row in plan} == {"cached"}
