@@ -12,7 +12,8 @@ processor, in a hundred task runs; all that processors do is scheduling, the sta
 
 `runners`: shards within one stage, in threads, processes, Dask and Ray where they are installed: sleeping ones, a fifth
 as many, and how much sooner two workers have counted events and rendered bodies than one has; that needs two idle
-cores.
+cores. Before them what the machine has to give: two processes that know nothing of each other, beside one alone. Where
+two cores are two threads of one core's hardware, that is less than two, and no runner can do better.
 
 By the clock, and in processor seconds of all processes. Targets are judged by the latter, but for `cached` and what a
 second worker gains: on a busy machine the clock shows what others do. Each part ends in its targets, met or missed,
@@ -31,6 +32,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -204,6 +206,8 @@ def runners(new_home: Path, count: int, seconds: float, workers: int, work_shard
     """Shards of one stage on each runner: what waiting costs, and what a second worker gains."""
     print(f"\nrunners: {count} of {1000 * seconds:g} ms on {workers} workers; {work_shards} with work, on 1 and 2")
     print(f"{'':10} {'start s':>8} {'beyond sleep':>13} {'processors':>11} {'encode, 1 / 2':>15} {'render, 1 / 2':>15}")
+    apart = {work: apart_speed_up(new_home, work, work_shards) for work in ("encode", "render")}
+    print(f"{'apart':10} {'':38} {apart['encode']:15.2f} {apart['render']:15.2f}", flush=True)
     targets: list[tuple[str, float, float, str, bool]] = []
     for runner in [name for name, package in RUNNERS.items() if importlib.util.find_spec(package)]:
         given = {"work": "sleep", "shards": count, "seconds": seconds, "workers": workers, "runner": runner}
@@ -225,7 +229,8 @@ def runners(new_home: Path, count: int, seconds: float, workers: int, work_shard
             flush=True,
         )
         for work, ratio in ratios.items():
-            targets.append((f"{work}, two workers of {runner}", ratio, SPEED_UP_WANTED, "x", True))
+            said = f"{work}, two workers of {runner} (two processes apart: {apart[work]:.2f})"
+            targets.append((said, ratio, SPEED_UP_WANTED, "x", True))
         share = 100 * script.cpu_s[0] / work_s
         targets.append((f"shards in {runner}, scheduling", share, 100 * OVERHEAD_WANTED, "%", False))
     return [
@@ -233,6 +238,19 @@ def runners(new_home: Path, count: int, seconds: float, workers: int, work_shard
         for what, measured, wanted, unit, at_least in targets
         for line in judge(what, measured, wanted, unit, at_least=at_least)
     ]
+
+
+def apart_speed_up(new_home: Path, work: str, shards: int) -> float:
+    """Shards a second of two processes side by side, each with all of them, over those of one alone."""
+    given = {"work": work, "shards": shards, "seconds": 0.0, "workers": 1, "runner": "threads"}
+
+    def seconds(_: int) -> float:
+        timed = json.loads(in_process("time_map", new_home / "runners", **given).run())
+        return timed["seconds"] - timed["start_s"]
+
+    alone = seconds(0)
+    with ThreadPoolExecutor(2) as threads:
+        return 2 * alone / statistics.mean(threads.map(seconds, range(2)))
 
 
 def _children_cpu_s() -> float:
