@@ -44,6 +44,9 @@ from data_contracts.labels import Conditions
 
 logger = logging.getLogger(__name__)
 
+SHARDS_A_PROCESS = 4
+"""Fewer are sampled before another process has started, which takes some ten seconds of imports."""
+
 
 @torch.no_grad()
 def sample_latents(
@@ -206,7 +209,7 @@ def sample_checkpoint(
         function = functools.partial(_sample_share, checkpoint, options, with_controlnet, _prompts(conditions))
         num_threads = torch.get_num_threads()
         if len(devices) == 1:
-            devices = spread_over_cores(devices[0], checkpoint, _num_whole(missing))
+            devices = spread_over_cores(devices[0], checkpoint, _num_whole(missing) // SHARDS_A_PROCESS)
             num_threads //= len(devices)
         shares = [missing[number :: len(devices)] for number in range(len(devices))]
         busy = [number for number, share in enumerate(shares) if share]
