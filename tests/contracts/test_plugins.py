@@ -6,24 +6,24 @@ import sys
 
 import pytest
 
-from ctlev_core import plugins
+from ctlev_core import plugin_contracts, plugins
 from ctlev_core.plugins import PluginError
 from data_contracts.config import DatasetChoice, Frozen, MetricChoice
 
 PROTOCOLS = {
-    "datasets": plugins.Dataset,
-    "formats": plugins.Format,
-    "motions": plugins.MotionFormat,
-    "encodings": plugins.Encoding,
-    "conditions": plugins.Condition,
-    "generators": plugins.Generator,
-    "downstream": plugins.Downstream,
-    "metrics": plugins.Metric,
+    "datasets": plugin_contracts.Dataset,
+    "formats": plugin_contracts.Format,
+    "motions": plugin_contracts.MotionFormat,
+    "encodings": plugin_contracts.Encoding,
+    "conditions": plugin_contracts.Condition,
+    "generators": plugin_contracts.Generator,
+    "downstream": plugin_contracts.Downstream,
+    "metrics": plugin_contracts.Metric,
 }
 CONDITIONS_BY_NEEDS = {
-    None: plugins.Condition,
-    "intensity": plugins.ConditionOfPairs,
-    "motion": plugins.ConditionOfMotions,
+    None: plugin_contracts.Condition,
+    "intensity": plugin_contracts.ConditionOfPairs,
+    "motion": plugin_contracts.ConditionOfMotions,
 }
 WITHOUT_OPTIONS = ("formats", "motions")
 ALL = [(kind, name) for kind in plugins.KINDS for name in plugins.names(kind)]
@@ -34,7 +34,7 @@ def protocol_of(kind, module):
     if kind == "conditions":
         return CONDITIONS_BY_NEEDS[getattr(module, "NEEDS", None)]
     if kind == "generators" and hasattr(module, "sample_events"):
-        return plugins.EventGenerator
+        return plugin_contracts.EventGenerator
     return PROTOCOLS[kind]
 
 

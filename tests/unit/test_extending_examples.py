@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctlev_core import event_files, motion_formats, plugins
+from ctlev_core import event_files, motion_formats, plugin_contracts, plugins
 from ctlev_core.labelling import labels_at_windows, labels_in_image
 from ctlev_core.report import verdict
 from ctlev_core.skeletons import JOINT_SETS
@@ -31,14 +31,14 @@ BLOCKS = {
     if (match := re.match(r"# ctlev_core/(\w+)/(\w+)\.py\n.*", block, re.DOTALL))
 }
 PROTOCOLS = {
-    "datasets": plugins.Dataset,
-    "formats": plugins.Format,
-    "motions": plugins.MotionFormat,
-    "encodings": plugins.Encoding,
-    "conditions": plugins.Condition,
-    "generators": plugins.Generator,
-    "downstream": plugins.Downstream,
-    "metrics": plugins.Metric,
+    "datasets": plugin_contracts.Dataset,
+    "formats": plugin_contracts.Format,
+    "motions": plugin_contracts.MotionFormat,
+    "encodings": plugin_contracts.Encoding,
+    "conditions": plugin_contracts.Condition,
+    "generators": plugin_contracts.Generator,
+    "downstream": plugin_contracts.Downstream,
+    "metrics": plugin_contracts.Metric,
 }
 SIZE = (40, 30)
 NUM_JOINTS = len(JOINT_SETS["dhp19"].joints)
@@ -165,7 +165,7 @@ def test_examples_import_nothing_heavy(installed):
 
 
 def test_the_page_names_every_function_of_the_contracts():
-    contracts = [value for value in vars(plugins).values() if getattr(value, "_is_protocol", False)]
+    contracts = [value for value in vars(plugin_contracts).values() if getattr(value, "_is_protocol", False)]
     functions = {name for contract in contracts for name, _ in inspect.getmembers(contract, inspect.isfunction)}
     attributes = {name for contract in contracts for name in contract.__annotations__}
     assert len(contracts) >= 20

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from ctlev_core import plugins
+from ctlev_core import plugin_contracts, plugins
 from ctlev_core.metrics import pve
 from ctlev_core.plugins import PluginError
 from ctlev_core.score_requirements import check_dataset, check_distances, check_frames, check_labels, check_metrics
@@ -60,13 +60,13 @@ def test_predictions_hold_what_a_model_says_it_predicts():
 
 
 CONTRACTS = {
-    "train_sequences": plugins.DownstreamOfSequences,
-    "predict_sequences": plugins.DownstreamOfSequences,
-    "input_files": plugins.MetricWithFiles,
-    "check_joint_set": plugins.MetricOfSkeletons,
-    "compute_rows": plugins.MetricOfRows,
-    "prepare": plugins.PreparedMetric,
-    "compute_sums": plugins.MetricOfSums,
+    "train_sequences": plugin_contracts.DownstreamOfSequences,
+    "predict_sequences": plugin_contracts.DownstreamOfSequences,
+    "input_files": plugin_contracts.MetricWithFiles,
+    "check_joint_set": plugin_contracts.MetricOfSkeletons,
+    "compute_rows": plugin_contracts.MetricOfRows,
+    "prepare": plugin_contracts.PreparedMetric,
+    "compute_sums": plugin_contracts.MetricOfSums,
 }
 
 

@@ -1,0 +1,392 @@
+"""What a plug-in of each kind must have, and what it may have, as Protocols.
+
+A plug-in is a module of `ctlev_core/<kind>/`, found by its name (`ctlev_core.plugins`). Beside the functions below each
+has `VERSION` (raise it when its output changes) and `class Options(Frozen)`. Heavy imports (torch, diffusers, numba) go
+inside functions, because the plan of an experiment loads every plug-in's options and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from ctlev_core.body.motion_clip import MotionClip
+from data_contracts.config import Frozen
+from data_contracts.events import Events, SensorSize
+from data_contracts.labels import BodyMotions, Conditions, History, ImageTrack, Labels, Recording
+
+
+class Dataset(Protocol):
+    """Where recordings come from. `list_recordings` is cheap and raises before anything long starts."""
+
+    VERSION: int
+    Options: type[Frozen]
+
+    def list_recordings(self, options: Any) -> list[Recording]:
+        """Every recording of every split, in a stable order."""
+        ...
+
+    def read_events(self, recording: Recording, options: Any) -> Events:
+        """The events of one recording, checked. Not called where `recording.has_events` is False."""
+        ...
+
+    def read_labels(self, recording: Recording, options: Any) -> Labels:
+        """The label track of one recording; a class-only dataset returns one row."""
+        ...
+
+
+class DatasetWithChunks(Dataset, Protocol):
+    """A dataset whose recordings may be larger than memory."""
+
+    def read_event_chunks(self, recording: Recording, options: Any) -> Iterator[Events]:
+        """The events of `read_events` in consecutive pieces."""
+        ...
+
+
+class DatasetWithWindows(Dataset, Protocol):
+    """A dataset whose authors cut recordings into windows in a way of their own."""
+
+    def read_windows(self, recording: Recording, options: Any) -> np.ndarray:
+        """Index ranges [W, 2] int64 into the events of `read_events`, in order; used by the window method `dataset`."""
+        ...
+
+
+class DatasetWithWindowLabels(DatasetWithWindows, Protocol):
+    """A dataset whose authors also have a rule of their own for the label of a window."""
+
+    def read_window_labels(self, recording: Recording, options: Any) -> Labels:
+        """One row for each range of `read_windows`."""
+        ...
+
+
+class DatasetWithSynonyms(Dataset, Protocol):
+    """A dataset whose classes have several names, such as the WordNet lemmas of N-ImageNet."""
+
+    def read_synonyms(self, options: Any) -> dict[str, list[str]]:
+        """The names of each class that has more than its `class_name`; prompts draw from them."""
+        ...
+
+
+class DatasetWithEventImages(Dataset, Protocol):
+    """A dataset that releases finished event images of some recordings."""
+
+    def read_event_images(self, recording: Recording, options: Any) -> ImageTrack:
+        """Of a recording with `has_event_images`."""
+        ...
+
+
+class DatasetWithIntensity(Dataset, Protocol):
+    """A dataset with grey pictures taken beside the events, what Event-GAN learns from."""
+
+    def read_intensity_frames(self, recording: Recording, options: Any) -> ImageTrack:
+        """Of a recording with `has_intensity`."""
+        ...
+
+
+class Format(Protocol):
+    """A raw event file format.
+
+    One whose files carry no signature says `HAS_SIGNATURE = False`: its `sniff` takes what is merely plausible, and
+    is asked only where no other format knows the file (`ctlev_core.event_files.find_format`).
+    """
+
+    VERSION: int
+    SUFFIXES: tuple[str, ...]
+
+    def sniff(self, path: Path) -> bool:
+        """Does the content look like this format?"""
+        ...
+
+    def read(self, path: Path) -> Events:
+        """The whole file, checked with `check_events`."""
+        ...
+
+    def read_chunks(self, path: Path, num_events: int) -> Iterator[Events]:
+        """The events of `read` in consecutive pieces of about `num_events`, in memory that does not grow with the file.
+
+        Every piece is checked and has the sensor size of the whole file.
+        """
+        ...
+
+
+class MotionFormat(Protocol):
+    """A file format of motions: poses over time.
+
+    `HAS_SIGNATURE = False` has the meaning that it has for a `Format` (`ctlev_core.motion_formats.find_format`).
+    """
+
+    VERSION: int
+    SUFFIXES: tuple[str, ...]
+
+    def sniff(self, path: Path) -> bool:
+        """Does the content look like this format?"""
+        ...
+
+    def read(self, path: Path) -> MotionClip:
+        """Every frame of the file, checked with `check_clip`: metres, y up, the poses those of SMPL's 24 joints."""
+        ...
+
+
+class MotionFormatWithoutRate(MotionFormat, Protocol):
+    """A motion format whose files need not say how fast they are; `RATE_HZ` is what it assumes."""
+
+    RATE_HZ: float
+
+    def read(self, path: Path, rate_hz: float = ...) -> MotionClip:
+        """As `MotionFormat.read`, at `rate_hz` frames a second where the file does not say."""
+        ...
+
+
+class Encoding(Protocol):
+    """Events to arrays, arrays to images and back."""
+
+    VERSION: int
+    Options: type[Frozen]
+
+    def encode(self, events: Events, windows: np.ndarray, options: Any) -> np.ndarray:
+        """[N, C, H, W] of the event index ranges `windows` [N, 2] int64: uint16 counts, or float32."""
+        ...
+
+    def render_image(self, histogram: np.ndarray, options: Any) -> np.ndarray:
+        """Images [N, H, W, 3] uint8 of the counts."""
+        ...
+
+    def map_points(self, points: np.ndarray, sensor_size: SensorSize, options: Any) -> np.ndarray:
+        """Points [..., 2] in sensor pixels to image pixels."""
+        ...
+
+
+class Condition(Protocol):
+    """Labels to what the generator is asked for."""
+
+    VERSION: int
+    Options: type[Frozen]
+
+    def render(self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int]) -> Conditions:
+        """One condition a row; `seeds` (one a row) feeds what is drawn at random, for example a class synonym."""
+        ...
+
+
+class ConditionOfPairs(Protocol):
+    """A condition made of the grey pictures taken at a window's start and end: `NEEDS = "intensity"`."""
+
+    VERSION: int
+    NEEDS: str
+    Options: type[Frozen]
+
+    def render(
+        self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int], pairs: np.ndarray
+    ) -> Conditions:
+        """As `Condition.render`; `pairs` [N, H, W, 2] uint8 are the pictures, in image pixels."""
+        ...
+
+
+class ConditionOfMotions(Protocol):
+    """A condition that is what a body does around the moment it is labelled at: `NEEDS = "motion"`."""
+
+    VERSION: int
+    NEEDS: str
+    Options: type[Frozen]
+
+    def render(
+        self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int], motions: BodyMotions
+    ) -> Conditions:
+        """As `Condition.render`; row i of `motions` is the body of row i of `labels`."""
+        ...
+
+
+class Generator(Protocol):
+    """Learns frames from conditions, then makes new frames for new conditions."""
+
+    VERSION: int
+    Options: type[Frozen]
+    SampleOptions: type[Frozen]
+
+    def prior_folders(self, options: Any) -> list[Path]:
+        """The folders of the pre-trained weights, checked to be there; their content enters the cache key."""
+        ...
+
+    def train(
+        self, frames: np.ndarray, conditions: Conditions, options: Any, *, seed: int, out: Path, work: Path
+    ) -> History:
+        """Write a checkpoint folder to `out`; keep resumable state in `work`."""
+        ...
+
+    def sample(
+        self, checkpoint: Path, conditions: Conditions, options: Any, *, seeds: Sequence[int], work: Path
+    ) -> np.ndarray:
+        """Frames [N, H, W, 3] uint8; row i depends on conditions[i] and seeds[i] alone."""
+        ...
+
+
+class GeneratorOfNames(Generator, Protocol):
+    """A generator that reads words, and can tell which names are alike to it."""
+
+    def embed_names(self, checkpoint: Path, names: Sequence[str]) -> np.ndarray:
+        """[N, D] vectors of N names, to be compared by their cosines."""
+        ...
+
+
+class EventGenerator(Protocol):
+    """Simulates events instead of frames, and learns nothing; its events are encoded as the real ones are."""
+
+    VERSION: int
+    Options: type[Frozen]
+    SampleOptions: type[Frozen]
+
+    def sample_events(
+        self, conditions: Conditions, sensor_size: SensorSize, options: Any, *, seeds: Sequence[int]
+    ) -> Iterator[Events]:
+        """The events of each row in turn, from its first key pose to its last.
+
+        Those of row i depend on row i of `conditions` and seeds[i] alone. A row may have no events.
+        """
+        ...
+
+
+class Downstream(Protocol):
+    """A model of the task the synthetic data is for."""
+
+    VERSION: int
+    Options: type[Frozen]
+
+    def train(
+        self,
+        frames: np.ndarray,
+        labels: Labels,
+        options: Any,
+        *,
+        seed: int,
+        out: Path,
+        work: Path,
+        parts: Sequence[int] = (),
+        groups: Sequence[str] = (),
+    ) -> History:
+        """Write a model folder to `out`; keep resumable state in `work`.
+
+        `parts` are the rows of each training set, in order (empty: there is one set), and `groups` the subject or
+        recording of each row (empty: each row is its own): what mixing and validation go by.
+        """
+        ...
+
+    def predict(self, model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+        """Named predictions, one row a frame."""
+        ...
+
+
+class DownstreamOfLabels(Downstream, Protocol):
+    """A model that says what it predicts: a metric that compares something else is refused where it is planned.
+
+    `PREDICTS` are those of the following that `predict` returns, N rows each: `joints2d` [N, J, 2] px; `joints3d`
+    [N, J, 3] mm, camera frame; `smpl`, that is `smpl_pose` [N, 72] rad, `smpl_betas` [N, 10] and `smpl_transl`
+    [N, 3] m, camera frame; `classes`, that is `probability` [N, K] and `classes` [K], the names of its columns. None:
+    the model has features alone.
+    """
+
+    PREDICTS: tuple[str, ...]
+
+
+class DownstreamOfSequences(Downstream, Protocol):
+    """A model that can look at several frames of a recording at once. It has both functions, and they are called."""
+
+    def train_sequences(
+        self,
+        frames: np.ndarray,
+        labels: Labels,
+        options: Any,
+        *,
+        seed: int,
+        out: Path,
+        work: Path,
+        parts: Sequence[int],
+        groups: Sequence[str],
+        recordings: Sequence[str],
+    ) -> History:
+        """As `train`; `recordings` name that of each row, whose rows follow one another in time.
+
+        A stretch of rows is one recording where names, groups and parts stay the same. Empty: each row is its own.
+        """
+        ...
+
+    def predict_sequences(self, model: Path, frames: np.ndarray, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+        """As `predict`, with the recording of each row; still one row a frame."""
+        ...
+
+
+class DownstreamWithFiles(Downstream, Protocol):
+    """A model that starts from weights of its own from outside the store."""
+
+    def input_files(self, options: Any) -> list[Path]:
+        """The files it reads, checked to be there; their content enters the cache key."""
+        ...
+
+
+class FeatureExtractor(Downstream, Protocol):
+    """A model in whose features images are compared."""
+
+    def features(self, model: Path, frames: np.ndarray) -> np.ndarray:
+        """Features [N, D] float32 of frames [N, H, W, 3] uint8."""
+        ...
+
+
+class NamedFeatureExtractor(FeatureExtractor, Protocol):
+    """An extractor that learns nothing; by its checksum it knows what scores in its features may be called."""
+
+    def name_score(self, model: Path, score: str) -> str:
+        """Of a metric's score, such as `fd`: `fid` where the features are those it is defined with."""
+        ...
+
+
+class Metric(Protocol):
+    """A score. `INPUT` names what it compares: `joints2d`, `joints3d`, `smpl`, `classes` or `features`."""
+
+    VERSION: int
+    INPUT: str
+    Options: type[Frozen]
+
+    def compute(self, predicted: Any, target: Any, options: Any) -> dict[str, float]:
+        """Named scores; units in the names."""
+        ...
+
+
+class MetricWithFiles(Metric, Protocol):
+    """A metric that reads files of its own, such as a body."""
+
+    def input_files(self, options: Any) -> list[Path]:
+        """The files it reads, checked to be there; options that name them put their content into the cache key."""
+        ...
+
+
+class MetricOfSkeletons(Metric, Protocol):
+    """A metric that needs certain joints: hips to align by, or a head to measure with."""
+
+    def check_joint_set(self, joint_set: str, options: Any) -> None:
+        """Raise `ValueError` for a joint set, a key of `ctlev_core.skeletons.JOINT_SETS` or empty, without them."""
+        ...
+
+
+class MetricOfRows(Metric, Protocol):
+    """A metric that is a mean over rows, so that two models can be compared row by row."""
+
+    def compute_rows(self, predicted: Any, target: Any, options: Any) -> np.ndarray:
+        """One score a row [N], NaN where a row has none."""
+        ...
+
+
+class PreparedMetric(Metric, Protocol):
+    """A metric that can look at all rows once and then score any of them quickly."""
+
+    def prepare(self, predicted: Any, target: Any, options: Any) -> Callable[[np.ndarray], dict[str, float]]:
+        """From row numbers to what `compute` returns for those rows."""
+        ...
+
+
+class MetricOfSums(Metric, Protocol):
+    """A metric whose scores are quotients of sums over rows, so that resampling rows need not compare them again."""
+
+    def compute_sums(self, predicted: Any, target: Any, options: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """For each score of `compute`, by name, numerators [N] and denominators [N] of the rows."""
+        ...
