@@ -65,8 +65,15 @@ class Outcome:
 
     @property
     def judged(self) -> list[str]:
-        """The lines that say whether a target was met."""
-        return [line.strip() for line in self.output.splitlines() if JUDGED.search(line)]
+        """The lines that say whether a target was met, with what some of them list below."""
+        found: list[str] = []
+        listed = False
+        for line in self.output.splitlines():
+            listed = (listed and line.startswith(" ")) or bool(JUDGED.search(line))
+            if listed:
+                found.append(line.strip())
+            listed = listed and (line.endswith(":") or line.startswith(" "))
+        return found
 
 
 def main() -> int:
@@ -104,7 +111,8 @@ def run(benchmark: Benchmark) -> Outcome:
         assert process.stdout is not None
         for line in process.stdout:
             print(line, end="", flush=True)
-            lines.append(line.rpartition("\r")[2].rstrip())  # of a progress bar, what it ended in
+            # Of a progress bar, what it ended in; of warnings, not where this copy lies.
+            lines.append(line.rpartition("\r")[2].rstrip().replace(f"{HERE.parent}/", ""))
     return Outcome(
         name=benchmark.name,
         command=said,

@@ -19,7 +19,7 @@ from flows.evaluate import evaluate
 from flows.export_events import export_streams
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
-from flows.speed_vs_error import speed_vs_error, speed_vs_error_of
+from flows.speed_vs_error import SpeedVsError, speed_vs_error, speed_vs_error_of
 from flows.studies import load_study
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
@@ -108,10 +108,12 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
 
 
 def _study(study: Study) -> ManifestRef:
-    parts = study.experiments
-    made = call_together(*(partial(_one_of_study, study, name) for name in parts))
+    parts, measured = study.experiments, speed_vs_error_of(study)
+    calls = [partial(_one_of_study, part) for part in parts.values()]
+    if measured is not None:
+        calls.append(partial(_measured, measured))
     return study_report(
-        [reports[0] for reports in made] + [page for reports in made for page in reports[1:]],
+        call_together(*calls),
         title=study.name,
         notice=study.data_notice,
         names=list(parts),
@@ -121,18 +123,12 @@ def _study(study: Study) -> ManifestRef:
     )
 
 
-def _one_of_study(study: Study, name: str) -> list[ManifestRef]:
-    """The report of an experiment, then the page on speed against error where its generator is the one measured."""
-    experiment, measured = study.experiments[name], speed_vs_error_of(study)
-    if measured is None or measured.title != name:
-        return [call_flow(full_experiment, experiment)]
-    # First what both need: whoever waited for a stage of the other would keep a process from those that have work.
-    dataset = call_flow(prepare_dataset, experiment)
-    checkpoint = call_flow(train_generator, experiment, dataset)
-    return call_together(
-        lambda: call_flow(full_experiment, experiment),
-        lambda: call_flow(speed_vs_error, measured, dataset, checkpoint),
-    )
+def _one_of_study(experiment: Experiment) -> ManifestRef:
+    return call_flow(full_experiment, experiment)
+
+
+def _measured(measured: SpeedVsError) -> ManifestRef:
+    return call_flow(speed_vs_error, measured)
 
 
 def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -> tuple[ManifestRef, ManifestRef]:

@@ -115,18 +115,11 @@ def _checked(options: SpeedVsErrorOptions, experiment: Experiment, title: str) -
 
 
 @flow(name="speed-vs-error")
-def speed_vs_error(
-    measured: SpeedVsError, dataset: PreparedDataset | None = None, checkpoint: ManifestRef | None = None
-) -> ManifestRef:
-    """Sample with every setting under a stopwatch, measure errors, and write the page with the plots.
-
-    Dataset and checkpoint are made unless they are given.
-    """
+def speed_vs_error(measured: SpeedVsError) -> ManifestRef:
+    """Sample with every setting under a stopwatch, measure errors, and write the page with the plots."""
     experiment, options = measured.experiment, measured.options
-    if dataset is None:
-        dataset = call_flow(prepare_dataset, experiment)
-    if checkpoint is None:
-        checkpoint = call_flow(train_generator, experiment, dataset)
+    dataset = call_flow(prepare_dataset, experiment)
+    checkpoint = call_flow(train_generator, experiment, dataset)
     conditions, sampling = dataset.sample_conditions, experiment.sampling_choice
     extractor = train_downstream(
         [dataset.frames], downstream=measured.feature_extractor, seed=experiment.seed, label="feature extractor"
