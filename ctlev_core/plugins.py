@@ -77,12 +77,12 @@ def load(kind: str, name: str) -> ModuleType:
         PluginError: there is no such plug-in; the message lists the known ones.
     """
     path = f"ctlev_core.{kind}.{name}"
-    if kind in KINDS and name.isidentifier() and not name.startswith("_") and path in sys.modules:
-        return sys.modules[path]  # without reading its folder once more, which plans would do a thousand times
-    known = names(kind)
-    if name not in known:
-        raise PluginError(f"unknown plug-in {name!r} in {kind}; known: {', '.join(known)}")
-    return importlib.import_module(path)
+    # The folder of one that was imported before is not read once more, which plans would do a thousand times.
+    if not (kind in KINDS and name.isidentifier() and not name.startswith("_") and path in sys.modules):
+        known = names(kind)
+        if name not in known:
+            raise PluginError(f"unknown plug-in {name!r} in {kind}; known: {', '.join(known)}")
+    return importlib.import_module(path)  # which waits where another thread has begun to import it
 
 
 def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: str) -> Any:

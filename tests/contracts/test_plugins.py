@@ -3,6 +3,8 @@
 import inspect
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -131,6 +133,20 @@ def test_a_plugin_is_looked_for_once(monkeypatch):
     module = plugins.load("datasets", "studio")
     monkeypatch.setattr(plugins, "names", lambda kind: pytest.fail("its folder was read again"))
     assert plugins.load("datasets", "studio") is module
+
+
+def test_threads_that_load_a_plugin_at_once_get_it_whole(tmp_path, monkeypatch):
+    import ctlev_core.metrics
+
+    (tmp_path / "slow_metric.py").write_text("import time\ntime.sleep(0.5)\nVERSION = 1\n")
+    monkeypatch.setattr(ctlev_core.metrics, "__path__", [*ctlev_core.metrics.__path__, str(tmp_path)])
+    with ThreadPoolExecutor(2) as threads:
+        first = threads.submit(plugins.load, "metrics", "slow_metric")
+        while "ctlev_core.metrics.slow_metric" not in sys.modules:
+            time.sleep(0.01)
+        second = threads.submit(lambda: plugins.load("metrics", "slow_metric").VERSION)
+        assert second.result() == first.result().VERSION == 1
+    del sys.modules["ctlev_core.metrics.slow_metric"]
 
 
 def test_every_wrong_option_is_named_at_once():
