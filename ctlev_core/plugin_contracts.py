@@ -390,3 +390,16 @@ class MetricOfSums(Metric, Protocol):
     def compute_sums(self, predicted: Any, target: Any, options: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """For each score of `compute`, by name, numerators [N] and denominators [N] of the rows."""
         ...
+
+
+BY_KIND: dict[str, type] = {
+    "datasets": Dataset,
+    "formats": Format,
+    "motions": MotionFormat,
+    "encodings": Encoding,
+    "conditions": Condition,
+    "generators": Generator,
+    "downstream": Downstream,
+    "metrics": Metric,
+}
+"""What every module of a kind has; the other Protocols are for those that can do more, or it otherwise."""

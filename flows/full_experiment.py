@@ -6,6 +6,7 @@ python flows/full_experiment.py [--preset NAME] [--set key=value ...] [--dry-run
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import partial
 
 from ctlev_core import plugins
@@ -19,7 +20,7 @@ from flows.evaluate import evaluate
 from flows.export_events import export_streams
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
-from flows.speed_vs_error import SpeedVsError, speed_vs_error, speed_vs_error_of
+from flows.speed_vs_error import speed_vs_error, speed_vs_error_of
 from flows.studies import load_study
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
@@ -109,9 +110,11 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
 
 def _study(study: Study) -> ManifestRef:
     parts, measured = study.experiments, speed_vs_error_of(study)
-    calls = [partial(_one_of_study, part) for part in parts.values()]
+    calls: list[Callable[[], ManifestRef]] = [
+        lambda part=part: call_flow(full_experiment, part) for part in parts.values()
+    ]
     if measured is not None:
-        calls.append(partial(_measured, measured))
+        calls.append(lambda: call_flow(speed_vs_error, measured))
     return study_report(
         call_together(*calls),
         title=study.name,
@@ -121,14 +124,6 @@ def _study(study: Study) -> ManifestRef:
         generator_names=[part.generator_names for part in parts.values()],
         label=study.name,
     )
-
-
-def _one_of_study(experiment: Experiment) -> ManifestRef:
-    return call_flow(full_experiment, experiment)
-
-
-def _measured(measured: SpeedVsError) -> ManifestRef:
-    return call_flow(speed_vs_error, measured)
 
 
 def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -> tuple[ManifestRef, ManifestRef]:

@@ -15,6 +15,8 @@ from typing import Any
 
 import torch
 
+from ctlev_core.diffusion.prior import choose_device
+
 SMALL_BYTES = 500_000_000
 """Weights of more use several threads well, and fill the memory when they are read twice."""
 END_TIMEOUT_S = 10.0
@@ -50,9 +52,8 @@ def spread_over_cores(device: str, checkpoint: Path, most: int) -> list[str]:
         checkpoint: folder or file of the weights.
         most: processes there is work for.
     """
-    kind = torch.device("cuda" if torch.cuda.is_available() else "cpu").type if device == "auto" else device
     files = [checkpoint] if checkpoint.is_file() else checkpoint.glob("*/*.safetensors")
-    if kind != "cpu" or sum(file.stat().st_size for file in files) > SMALL_BYTES:
+    if choose_device(device).type != "cpu" or sum(file.stat().st_size for file in files) > SMALL_BYTES:
         return [device]
     return [device] * max(min(torch.get_num_threads(), most), 1)
 

@@ -12,16 +12,6 @@ from ctlev_core import plugin_contracts, plugins
 from ctlev_core.plugins import PluginError
 from data_contracts.config import DatasetChoice, Frozen, MetricChoice
 
-PROTOCOLS = {
-    "datasets": plugin_contracts.Dataset,
-    "formats": plugin_contracts.Format,
-    "motions": plugin_contracts.MotionFormat,
-    "encodings": plugin_contracts.Encoding,
-    "conditions": plugin_contracts.Condition,
-    "generators": plugin_contracts.Generator,
-    "downstream": plugin_contracts.Downstream,
-    "metrics": plugin_contracts.Metric,
-}
 CONDITIONS_BY_NEEDS = {
     None: plugin_contracts.Condition,
     "intensity": plugin_contracts.ConditionOfPairs,
@@ -37,7 +27,7 @@ def protocol_of(kind, module):
         return CONDITIONS_BY_NEEDS[getattr(module, "NEEDS", None)]
     if kind == "generators" and hasattr(module, "sample_events"):
         return plugin_contracts.EventGenerator
-    return PROTOCOLS[kind]
+    return plugin_contracts.BY_KIND[kind]
 
 
 def keyword_only(function):

@@ -30,16 +30,6 @@ BLOCKS = {
     for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     if (match := re.match(r"# ctlev_core/(\w+)/(\w+)\.py\n.*", block, re.DOTALL))
 }
-PROTOCOLS = {
-    "datasets": plugin_contracts.Dataset,
-    "formats": plugin_contracts.Format,
-    "motions": plugin_contracts.MotionFormat,
-    "encodings": plugin_contracts.Encoding,
-    "conditions": plugin_contracts.Condition,
-    "generators": plugin_contracts.Generator,
-    "downstream": plugin_contracts.Downstream,
-    "metrics": plugin_contracts.Metric,
-}
 SIZE = (40, 30)
 NUM_JOINTS = len(JOINT_SETS["dhp19"].joints)
 EVENTS_A_WINDOW = 200
@@ -137,7 +127,7 @@ def test_there_is_an_example_of_every_kind():
 
 @pytest.mark.parametrize(("kind", "name"), sorted(BLOCKS))
 def test_examples_keep_their_contracts(kind, name):
-    module, protocol = plugins.load(kind, name), PROTOCOLS[kind]
+    module, protocol = plugins.load(kind, name), plugin_contracts.BY_KIND[kind]
     assert module.VERSION >= 1 and module.__doc__
     assert all(hasattr(module, attribute) for attribute in protocol.__annotations__)
     for function, expected in inspect.getmembers(protocol, inspect.isfunction):
