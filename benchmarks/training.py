@@ -245,7 +245,7 @@ class Networks:
             if network is not None:
                 network.zero_grad(set_to_none=True)
         with self._autocast():
-            loss = denoising_loss(self._denoiser, self._schedule, batch, generator_for(0, 1), None)
+            loss = denoising_loss(self._denoiser, self._schedule, batch, generator_for(0, 1))
         loss.backward()
 
     def count_flops(self, batch: Batch) -> int:

@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from ctlev_core.render.camera_paths import Motion, sample_camera_path
+from ctlev_core.render.objects import NAMES
 from ctlev_core.sensor_choice import check_sensor_preset, read_sensor, sensor_preset_files
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
@@ -34,35 +35,7 @@ if TYPE_CHECKING:
 
 VERSION = 1
 
-# The first name is the class name. Names are of the thing itself: no parts, no other class, and no noun that the
-# prior draws as something else.
-SYNONYMS: dict[str, list[str]] = {
-    "airplane": ["airplane", "plane", "aircraft"],
-    "bicycle": ["bicycle", "bike", "cycle"],
-    "boat": ["boat", "sailboat", "ship"],
-    "butterfly": ["butterfly", "moth"],
-    "car": ["car", "sedan", "automobile"],
-    "cat": ["cat", "kitten", "kitty"],
-    "chair": ["chair", "seat"],
-    "clock": ["clock", "watch", "timepiece"],
-    "cup": ["cup", "mug", "teacup"],
-    "dog": ["dog", "puppy", "hound"],
-    "fish": ["fish", "goldfish"],
-    "flower": ["flower", "blossom", "bloom"],
-    "guitar": ["guitar", "acoustic guitar"],
-    "hammer": ["hammer", "mallet"],
-    "house": ["house", "home", "cottage"],
-    "key": ["key", "door key", "latchkey"],
-    "ladder": ["ladder", "stepladder"],
-    "lamp": ["lamp", "desk lamp", "lantern"],
-    "pine": ["pine", "pine tree", "fir"],
-    "scissors": ["scissors", "shears"],
-    "shoe": ["shoe", "sneaker", "trainer"],
-    "star": ["star", "pentagram"],
-    "umbrella": ["umbrella", "parasol"],
-    "windmill": ["windmill", "mill"],
-}
-CLASSES = tuple(SYNONYMS)
+CLASSES = tuple(NAMES)
 """The ordinary classes, nouns of `ctlev_core.render.objects.OBJECTS` with outlines of their own."""
 
 HELD_OUT = (
@@ -173,7 +146,7 @@ def list_recordings(options: Options) -> list[Recording]:
 def read_synonyms(options: Options) -> dict[str, list[str]]:
     """Names to draw from, by class name, of the chosen ordinary classes; a composition has one name only."""
     chosen = options.classes or CLASSES
-    return {name: SYNONYMS[name] for name in chosen if name in SYNONYMS}
+    return {name: NAMES[name] for name in chosen if name in NAMES}
 
 
 def read_labels(recording: Recording, options: Options) -> Labels:

@@ -9,10 +9,8 @@ Arrays and options reach them as files in the work folder, and results come back
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,17 +21,12 @@ import torch
 
 from ctlev_core.diffusion.finetuning import Tune, fine_tune, forget_weights
 from ctlev_core.diffusion.prior import choose_device, load_prior, save_prior
-from ctlev_core.diffusion.ranks import ALONE, Ranks, start_ranks, stop_ranks
+from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.trainer import TrainingHistory
 from ctlev_core.diffusion.training_options import FineTuningOptions
-from ctlev_core.processes import die_with_parent, num_cores
+from ctlev_core.diffusion.training_processes import JOB_FILE, run_rank, train_in_processes
 from data_contracts.config import ConditionChoice
-from data_contracts.errors import TrainingError
 from data_contracts.labels import Conditions
-
-JOB_FILE, HISTORY_FILE = "job.json", "history.json"
-LAUNCHER_VARIABLES = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
-LAUNCHER_PREFIXES = ("TORCHELASTIC_", "GROUP_", "ROLE_")
 
 
 def train_checkpoint(
@@ -121,61 +114,24 @@ def _train_in_processes(
 ) -> TrainingHistory:
     folder = Path(job["work"]) / "job"
     folder.mkdir(parents=True, exist_ok=True)
-    for left in (HISTORY_FILE, *(f"error_{rank}.txt" for rank in range(count))):
-        (folder / left).unlink(missing_ok=True)
     np.save(folder / "frames.npy", frames, allow_pickle=False)
     if conditions.images is not None:
         np.save(folder / "conditions.npy", conditions.images, allow_pickle=False)
     plain = options.model_dump(mode="json", include=set(FineTuningOptions.model_fields))
     written = {**job, "options": plain, "prompts": conditions.prompts, "with_images": conditions.images is not None}
     (folder / JOB_FILE).write_text(json.dumps(written))
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
-    environment = child_environment(os.environ, count)
-    child = subprocess.Popen([*command, "-m", __name__, str(folder)], env=environment, preexec_fn=die_with_parent)
-    try:
-        code = child.wait()
-    finally:
-        child.terminate()
-    if code != 0 or not (folder / HISTORY_FILE).is_file():
-        errors = {rank: folder / f"error_{rank}.txt" for rank in range(count)}
-        said = [f"process {rank}: {path.read_text()}" for rank, path in errors.items() if path.is_file()]
-        raise TrainingError(f"training in {count} processes failed: {'; '.join(said) or f'torchrun ended with {code}'}")
-    return TrainingHistory(**json.loads((folder / HISTORY_FILE).read_text()))
+    return train_in_processes(count, __name__, folder)
 
 
-def child_environment(environment: Mapping[str, str], count: int) -> dict[str, str]:
-    """Ours, without what an outer launcher says of its own processes, and with the cores shared out."""
-    kept = {
-        name: value
-        for name, value in environment.items()
-        if name not in LAUNCHER_VARIABLES and not name.startswith(LAUNCHER_PREFIXES)
-    }
-    root = str(Path(__file__).resolve().parents[2])
-    kept["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [kept.get("PYTHONPATH")])])
-    kept.setdefault("OMP_NUM_THREADS", str(max(1, num_cores() // count)))
-    return kept
-
-
-def run_rank(folder: Path) -> None:
-    """What each of the processes does; `folder` is where the job was written."""
-    die_with_parent()
+def _train_rank(folder: Path, ranks: Ranks, device: torch.device) -> TrainingHistory:
     job = json.loads((folder / JOB_FILE).read_text())
-    rank = int(os.environ["RANK"])
-    try:
-        options = FineTuningOptions(**job["options"])
-        ranks, device = start_ranks(options.device)
-        images = np.load(folder / "conditions.npy", mmap_mode="r") if job["with_images"] else None
-        frames = np.load(folder / "frames.npy", mmap_mode="r")
-        made_by = None if job["made_by"] is None else ConditionChoice(**job["made_by"])
-        conditions = Conditions(tuple(job["prompts"]), images, made_by=made_by)
-        history = _train(frames, conditions, options, job, ranks, device)
-    except Exception as error:
-        (folder / f"error_{rank}.txt").write_text(str(error))
-        raise
-    if rank == 0:
-        (folder / HISTORY_FILE).write_text(json.dumps(dataclasses.asdict(history)))
-    stop_ranks()
+    images = np.load(folder / "conditions.npy", mmap_mode="r") if job["with_images"] else None
+    frames = np.load(folder / "frames.npy", mmap_mode="r")
+    made_by = None if job["made_by"] is None else ConditionChoice(**job["made_by"])
+    conditions = Conditions(tuple(job["prompts"]), images, made_by=made_by)
+    return _train(frames, conditions, FineTuningOptions(**job["options"]), job, ranks, device)
 
 
 if __name__ == "__main__":
-    run_rank(Path(sys.argv[1]))
+    job_folder = Path(sys.argv[1])
+    run_rank(job_folder, _train_rank, device=json.loads((job_folder / JOB_FILE).read_text())["options"]["device"])

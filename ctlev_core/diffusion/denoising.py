@@ -9,11 +9,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-MAX_SAMPLE_WEIGHT = 5.0
-"""Highest weight of the error of a network that predicts the latents; at little noise snr + 1 grows without bound.
 
-With 20 the steps with little noise took most of the gradient, and those that decide layout and prompt learnt slower.
-"""
+@dataclass(frozen=True)
+class Emphasis:
+    """Which time steps a training dwells on; the options of `TrainingOptions` of the same names."""
+
+    snr_gamma: float | None = None
+    max_sample_weight: float = 5.0
+    timestep_power: float = 1.0
+
+    def draw(self, count: int, num_timesteps: int, generator: torch.Generator) -> Tensor:
+        """Time steps [count] int64 in 0 .. num_timesteps - 1, of density proportional to t ** (timestep_power - 1)."""
+        if self.timestep_power == 1.0:
+            return torch.randint(0, num_timesteps, (count,), generator=generator)
+        shares = torch.rand(count, generator=generator, dtype=torch.float64) ** (1 / self.timestep_power)
+        return (num_timesteps * shares).long().clamp(max=num_timesteps - 1)
+
+
+PLAIN = Emphasis()
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +106,16 @@ class NoiseSchedule:
             return noisy, noise if self.prediction_type == "epsilon" else latents
         return noisy, self._scheduler.get_velocity(latents, noise, timesteps)
 
-    def loss_weights(self, timesteps: Tensor, snr_gamma: float | None) -> Tensor:
+    def loss_weights(self, timesteps: Tensor, emphasis: Emphasis = PLAIN) -> Tensor:
         """Weights [B] of the squared errors.
 
         With `snr_gamma` min-SNR weights: min(snr, gamma) of the error in the latents, which over snr is of that in the
         noise and over snr + 1 of that in v. Without: 1; for networks that predict the latents what makes the loss equal
-        to that of v, snr + 1, up to `MAX_SAMPLE_WEIGHT` and with mean 1 over the schedule.
+        to that of v, snr + 1, up to `max_sample_weight` and with mean 1 over the schedule.
         """
-        alpha_bar = self.alphas_cumprod[timesteps]
+        alpha_bar, snr_gamma = self.alphas_cumprod[timesteps], emphasis.snr_gamma
         if snr_gamma is None and self.prediction_type == "sample":
-            weights = (1 / (1 - self.alphas_cumprod)).clamp(max=MAX_SAMPLE_WEIGHT)
+            weights = (1 / (1 - self.alphas_cumprod)).clamp(max=emphasis.max_sample_weight)
             return weights[timesteps] / weights.mean()
         if snr_gamma is None:
             return torch.ones(len(timesteps))
@@ -115,16 +128,20 @@ class NoiseSchedule:
 
 
 def denoising_loss(
-    denoiser: Denoiser, schedule: NoiseSchedule, batch: Batch, generator: torch.Generator, snr_gamma: float | None
+    denoiser: Denoiser,
+    schedule: NoiseSchedule,
+    batch: Batch,
+    generator: torch.Generator,
+    emphasis: Emphasis = PLAIN,
 ) -> Tensor:
     """Weighted mean squared error of the prediction at random time steps; noise comes from the CPU stream."""
-    timesteps = torch.randint(0, schedule.num_timesteps, (len(batch.latents),), generator=generator)
+    timesteps = emphasis.draw(len(batch.latents), schedule.num_timesteps, generator)
     noise = torch.randn(batch.latents.shape, generator=generator)
     device = batch.latents.device
     noisy, target = schedule.noised(batch.latents, noise.to(device), timesteps.to(device))
     predicted = denoiser.predict(noisy, timesteps.to(device), batch.embeddings, batch.conditions)
     error = (predicted.float() - target.float()).square().mean(dim=(1, 2, 3))
-    return (schedule.loss_weights(timesteps, snr_gamma).to(device) * error).mean()
+    return (schedule.loss_weights(timesteps, emphasis).to(device) * error).mean()
 
 
 def validation_losses(
@@ -149,7 +166,7 @@ def validation_losses(
             rows = slice(start, start + batch_size)
             part = Batch(batch.latents[rows], embeddings[rows], None if conditions is None else conditions[rows])
             with torch.no_grad():
-                loss = denoising_loss(denoiser, schedule, part, generator_for(seed, start), None)
+                loss = denoising_loss(denoiser, schedule, part, generator_for(seed, start))
             total += float(loss) * len(part.latents)
         losses.append(total / count)
     return losses[0], losses[1]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import logging
 import math
+import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
@@ -16,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ctlev_core.diffusion import procedural_images
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
@@ -30,9 +32,12 @@ from ctlev_core.diffusion.prior import (
     save_prior,
 )
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
+from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.small_prior import IMAGE_SIZE, WIDTHS, PredictionType, build_prior
-from ctlev_core.diffusion.training import Trainer, run_training, sample_rows
+from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
+from ctlev_core.diffusion.training import run_training, sample_rows
 from ctlev_core.diffusion.training_options import TrainingOptions
+from ctlev_core.diffusion.training_processes import JOB_FILE, run_rank, train_in_processes
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
 from data_contracts.labels import History
@@ -72,10 +77,12 @@ class PretrainingOptions(Frozen):
     condition: procedural_images.ConditionKind = Field(
         default="skeleton", description="what the ControlNet is steered by: skeletons, or normal maps of bodies"
     )
-    tune: Literal["both", "controlnet"] = Field(
-        default="both", description="U-Net and ControlNet together, or a ControlNet for the U-Net of `start` alone"
+    tune: Literal["both", "controlnet", "unet"] = Field(
+        default="both",
+        description="U-Net and ControlNet together, a ControlNet for the U-Net of `start` alone, or a U-Net without "
+        "ControlNet",
     )
-    people_share: float = Field(default=procedural_images.PEOPLE_SHARE, ge=0, le=1, description="people among scenes")
+    diet: procedural_images.Diet = Field(default=procedural_images.DEFAULT_DIET, description="what the pictures are of")
     condition_dropout: float = Field(default=0.2, ge=0, le=1, description="share of people without their condition")
     image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
     widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
@@ -95,6 +102,19 @@ class PretrainingOptions(Frozen):
     workers: int = Field(
         default=1, ge=0, json_schema_extra=RUN_SETTING, description="processes that draw; 0 = in the same one"
     )
+    num_processes: int = Field(
+        default=1,
+        gt=0,
+        json_schema_extra=RUN_SETTING,
+        description="processes that share the `gradient_accumulation` batches of a step evenly",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> PretrainingOptions:
+        if self.num_processes > 1 and self.max_seconds is not None:
+            raise ValueError("max_seconds must be null with several processes, which would not end together")
+        Ranks(0, self.num_processes).batches(self.training.gradient_accumulation)
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +154,7 @@ class ImageStream:
         rng = np.random.default_rng([options.seed, STYLE_STREAM, number])
         batch = []
         for row in rows:
-            image, caption = procedural_images.apply_style(scenes[row], rng)
+            image, caption = procedural_images.apply_style(scenes[row], rng, options.diet)
             condition = scenes[row].condition
             steered = condition is not None and rng.random() >= options.condition_dropout
             caption = "" if rng.random() < options.text_dropout else caption
@@ -144,7 +164,7 @@ class ImageStream:
     def _scenes(self, block: int) -> list[procedural_images.Scene]:
         if self._block[0] != block:
             options = self._options
-            wanted = options.block_scenes, options.image_size, options.condition, options.people_share
+            wanted = options.block_scenes, options.image_size, options.condition, options.diet
             if self._pool is None:
                 self._block = (block, procedural_images.draw_block(options.seed, block, *wanted))
             else:
@@ -174,7 +194,7 @@ def draw_validation_rows(options: PretrainingOptions, draw: DrawScene) -> list[R
     for index in range(VALIDATION_IMAGES):
         rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + index])
         scene = draw(rng, options.image_size)
-        image, caption = procedural_images.apply_style(scene, rng)
+        image, caption = procedural_images.apply_style(scene, rng, options.diet)
         rows.append(Row(image, caption, scene.condition))
     return rows
 
@@ -188,13 +208,13 @@ def new_prior(options: PretrainingOptions) -> Prior:
     """The prior before training: fitted patch code, trained tokenizer and random networks, or those of `start`."""
     start = start_folder(options)
     if start is not None:
-        return load_prior(start)
+        return load_prior(start, with_controlnet=options.tune != "unet")
     scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
     rng = np.random.default_rng([options.seed, STYLE_STREAM])
     images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
     vae: PatchAutoencoder = fit_patch_autoencoder(images_to_tensor(images))
     corpus = procedural_images.caption_corpus()
-    return build_prior(
+    prior = build_prior(
         corpus,
         vae,
         seed=options.seed,
@@ -202,13 +222,15 @@ def new_prior(options: PretrainingOptions) -> Prior:
         image_size=options.image_size,
         prediction_type=options.prediction_type,
     )
+    return dataclasses.replace(prior, controlnet=None) if options.tune == "unet" else prior
 
 
 def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:
     """The untrained prior and the trainer of what learns; patch code and text encoder stay as they are."""
     prior = new_prior(options)
+    learning = {"both": (prior.unet, prior.controlnet), "controlnet": (prior.controlnet,), "unet": (prior.unet,)}
     parameters = []
-    for model in (prior.unet, prior.controlnet) if options.tune == "both" else (prior.controlnet,):
+    for model in learning[options.tune]:
         if model is not None:
             parameters += list(model.train().requires_grad_(True).parameters())
     identity = hashlib.sha256(json.dumps(cache_material(options), sort_keys=True).encode()).hexdigest()
@@ -216,36 +238,53 @@ def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:
 
 
 def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
-    """Pre-train U-Net and ControlNet together; write the averaged weights, in half precision, to `out`.
+    """Pre-train the networks; write the averaged weights, in half precision, to `out`.
 
     Args:
-        options: size, length and mixture.
+        options: size, length and mixture; `num_processes` changes nothing but the order of sums.
         out: becomes a diffusers folder.
         work: resumable state; a killed run goes on from there.
     Returns:
-        Loss curves; the validation losses are of people with their own and with somebody else's condition. Those of
-        objects with their own and with another's caption are logged beside them: both gaps must grow, or the prior
-        does not heed what it is asked for.
+        Loss curves; the validation losses are of people with their own and with somebody else's condition, or, where
+        no ControlNet learns, of objects with their own and with another's caption. Both pairs are logged: both gaps
+        must grow, or the prior does not heed what it is asked for.
+    Raises:
+        TrainingError: the loss stayed not finite, or one of several processes failed.
     """
+    if options.num_processes == 1:
+        return _pretrain(options, out, work, ALONE)
+    folder = work / "job"
+    folder.mkdir(parents=True, exist_ok=True)
+    job = {"options": options.model_dump(mode="json"), "out": str(out), "work": str(work)}
+    (folder / JOB_FILE).write_text(json.dumps(job))
+    return train_in_processes(options.num_processes, __name__, folder)
+
+
+def _pretrain(options: PretrainingOptions, out: Path, work: Path, ranks: Ranks) -> TrainingHistory:
     prior, trainer = prepare(options)
     denoiser = Denoiser(prior.unet, prior.controlnet)
     schedule = NoiseSchedule(prior.scheduler_config)
-    draw_person = partial(procedural_images.draw_person, condition=options.condition)
-    people = make_batch(prior, draw_validation_rows(options, draw_person))
-    objects = make_batch(prior, draw_validation_rows(options, procedural_images.draw_thing))
+    draw_thing = partial(procedural_images.draw_thing, diet=options.diet)
+    validation = {"own caption": make_batch(prior, draw_validation_rows(options, draw_thing))}
+    if prior.controlnet is not None:
+        draw_person = partial(procedural_images.draw_person, condition=options.condition)
+        people = make_batch(prior, draw_validation_rows(options, draw_person))
+        validation = {"own condition": people, **validation}
     stream = ImageStream(prior, options)
 
     def validate() -> tuple[float, float]:
-        losses = validation_losses(denoiser, schedule, people, seed=options.seed, batch_size=32)
-        of_objects = validation_losses(denoiser, schedule, objects, seed=options.seed, batch_size=32)
-        speed = trainer.step * options.training.batch_size / max(trainer.seconds, 1e-9)
+        losses = {
+            name: validation_losses(denoiser, schedule, batch, seed=options.seed, batch_size=32)
+            for name, batch in validation.items()
+        }
+        images = trainer.step * options.training.batch_size * options.training.gradient_accumulation
+        speed = images / max(trainer.seconds, 1e-9)
         loss = trainer.history.loss[-1] if trainer.history.loss else math.nan
+        told = "; ".join(f"{name} {true:.4f}, another's {shuffled:.4f}" for name, (true, shuffled) in losses.items())
         logger.info(
-            "step %d, %.0f s, %.1f img/s, loss %.4f, validation: own condition %.4f, another's %.4f; "
-            "own caption %.4f, another's %.4f",
-            trainer.step, trainer.seconds, speed, loss, *losses, *of_objects,
-        )  # fmt: skip
-        return losses
+            "step %d, %.0f s, %.1f img/s, loss %.4f, validation: %s", trainer.step, trainer.seconds, speed, loss, told
+        )
+        return next(iter(losses.values()))
 
     try:
         history = run_training(
@@ -258,8 +297,19 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
             validate=validate,
             max_seconds=options.max_seconds or math.inf,
             description="pre-training",
+            ranks=ranks,
         )
     finally:
         stream.close()
-    save_prior(prior, out, torch.float16)
+    if ranks.rank == 0:
+        save_prior(prior, out, torch.float16)
     return history
+
+
+def _pretrain_rank(folder: Path, ranks: Ranks, device: torch.device) -> TrainingHistory:
+    job = json.loads((folder / JOB_FILE).read_text())
+    return _pretrain(PretrainingOptions(**job["options"]), Path(job["out"]), Path(job["work"]), ranks)
+
+
+if __name__ == "__main__":
+    run_rank(Path(sys.argv[1]), _pretrain_rank, device="cpu")

@@ -12,12 +12,14 @@ Scene i is a function of (seed, i) alone, style s of scene i of (seed, i, s).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from pydantic import Field, field_validator
 
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motions import SEEN, UNSEEN, pose_at, sample_style
@@ -27,25 +29,22 @@ from ctlev_core.camera import is_inside, project
 from ctlev_core.conditions import normals
 from ctlev_core.render.compositions import RELATIONS, all_compositions
 from ctlev_core.render.object_drawing import draw_composition, draw_object
-from ctlev_core.render.objects import COLOURS, OBJECTS
+from ctlev_core.render.objects import COLOURS, NAMES, OBJECTS
 from ctlev_core.render.scene import render_person, sample_background, sample_subject
 from ctlev_core.render.skeleton import draw_skeleton
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_TO_DHP19
 from ctlev_core.virtual_camera import CameraRange, sample_camera
+from data_contracts.config import Frozen
 
 ConditionKind = Literal["skeleton", "normals"]
-PEOPLE_SHARE = 0.5
 MOTION_SHARE = 0.55
 """Of the people, how many take their pose from a procedural motion, never a held-out one; the others' is random."""
 POSE_NOISE_RAD = 0.15
-PLAIN_SHARE = {"people": 0.4, "things": 0.75}
-"""How many scenes have a plain background, so that their line drawings are clean."""
-COMPOSITION_SHARE = 0.2
-"""How many of the things are two objects in one picture."""
+PLAIN_PEOPLE_SHARE = 0.4
+"""How many people stand before a plain background, so that their line drawings are clean."""
 THING_SIZE = (0.6, 0.95)
 CAMERA = CameraRange(distance_m=(3.0, 4.2), pitch_rad=(-0.3, 0.5), focal_per_side=(1.3, 1.9))
-STYLES = ("photo", "grey", "lines", "coloured lines")
-STYLE_WEIGHTS = (0.22, 0.1, 0.34, 0.34)
+Style = Literal["photo", "grey", "lines", "coloured lines"]
 SAY_STYLE_SHARE = 0.6
 GRAIN_SHARE = 0.1
 PERSON_CAPTIONS = (
@@ -79,6 +78,37 @@ EXTRA_WORDS = """
     blossom bloom acoustic mallet cottage latchkey stepladder fir shears sneaker trainer pentagram parasol mill
     small large big tall round square bright dark old new fast slow left right front back side view of the in on with
 """
+
+
+class Diet(Frozen):
+    """What the pictures are of, in shares."""
+
+    people_share: float = Field(default=0.5, ge=0, le=1, description="people among scenes; the others are things")
+    styles: dict[Style, Annotated[float, Field(ge=0)]] = Field(
+        default={"photo": 0.22, "grey": 0.1, "lines": 0.34, "coloured lines": 0.34}, description="they sum to 1"
+    )
+    plain_share: float = Field(
+        default=0.75, ge=0, le=1, description="things on a plain background, whose line drawings are clean"
+    )
+    composition_share: float = Field(
+        default=0.2, ge=0, le=1, description="two things in one picture, of those of things"
+    )
+    bare_caption_share: float = Field(
+        default=0.0, ge=0, le=1, description="captions of things without colour and style, as fine-tuning's prompts are"
+    )
+    other_names_share: float = Field(
+        default=0.0, ge=0, le=1, description="how many nouns a caption calls by any of their names"
+    )
+
+    @field_validator("styles")
+    @classmethod
+    def _check_sum(cls, styles: dict[Style, float]) -> dict[Style, float]:
+        if abs(sum(styles.values()) - 1) > 1e-6:
+            raise ValueError(f"the shares of styles must sum to 1, got {sum(styles.values()):g}")
+        return styles
+
+
+DEFAULT_DIET = Diet()
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +172,7 @@ def draw_person(rng: np.random.Generator, size: int, condition: ConditionKind = 
     _, joints = joint_transforms(load_body(), rotations[None], subject.betas, transl[None])
     camera = sample_camera(rng, joints[0], (size, size), CAMERA)
     background = sample_background(rng, (size, size), colour=True)
-    if rng.random() < PLAIN_SHARE["people"]:
+    if rng.random() < PLAIN_PEOPLE_SHARE:
         background[:] = background.mean(axis=(0, 1))
     linear = render_person(rng, subject, rotations, transl, camera, background, (size, size))
     image = (np.clip(linear, 0, 1) ** (1 / 2.2) * 255).round().astype(np.uint8)
@@ -160,14 +190,14 @@ def draw_person(rng: np.random.Generator, size: int, condition: ConditionKind = 
     return Scene(image, draw_skeleton(joints2d, visible, "dhp19", (size, size)), "person")
 
 
-def draw_thing(rng: np.random.Generator, size: int) -> Scene:
+def draw_thing(rng: np.random.Generator, size: int, diet: Diet = DEFAULT_DIET) -> Scene:
     """An object, or two together, on a plain or stained background, without a condition."""
     background = sample_background(rng, (size, size), colour=True) ** (1 / 2.2) * 255
-    if rng.random() < PLAIN_SHARE["things"]:
+    if rng.random() < diet.plain_share:
         background[:] = rng.choice((8, 60, 200, 250)) if rng.random() < 0.5 else background.mean(axis=(0, 1))
     canvas = background.astype(np.uint8)
     first, second = (str(colour) for colour in rng.choice(list(COLOURS), 2))
-    if rng.random() < COMPOSITION_SHARE:
+    if rng.random() < diet.composition_share:
         composition = COMPOSITIONS[rng.integers(len(COMPOSITIONS))]
         image = draw_composition(composition, (first, second), canvas, rng)
         coloured = f"{first} {composition.first} {composition.relation} {second} {composition.second}"
@@ -177,20 +207,20 @@ def draw_thing(rng: np.random.Generator, size: int) -> Scene:
 
 
 def draw_scene(
-    seed: int, index: int, size: int, condition: ConditionKind = "skeleton", people_share: float = PEOPLE_SHARE
+    seed: int, index: int, size: int, condition: ConditionKind = "skeleton", diet: Diet = DEFAULT_DIET
 ) -> Scene:
     """Scene `index` of the stream, a function of its arguments alone."""
     rng = np.random.default_rng([seed, index])
-    return draw_person(rng, size, condition) if rng.random() < people_share else draw_thing(rng, size)
+    return draw_person(rng, size, condition) if rng.random() < diet.people_share else draw_thing(rng, size, diet)
 
 
-def apply_style(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, str]:
+def apply_style(scene: Scene, rng: np.random.Generator, diet: Diet = DEFAULT_DIET) -> tuple[np.ndarray, str]:
     """A random style for a scene.
 
     Returns:
         The picture [S, S, 3] uint8 and its caption.
     """
-    style = str(rng.choice(STYLES, p=STYLE_WEIGHTS))
+    style = str(rng.choice(list(diet.styles), p=list(diet.styles.values())))
     image = scene.image.astype(np.float32)
     if style == "grey" or style == "lines":
         image = np.repeat(image @ np.array([[0.299], [0.587], [0.114]], np.float32), 3, axis=2)
@@ -199,7 +229,7 @@ def apply_style(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, str
     if rng.random() < GRAIN_SHARE:  # of film
         image = image + rng.normal(0, rng.uniform(3, 14), image.shape[:2])[..., None]
     picture = np.clip(image, 0, 255).round().astype(np.uint8)
-    return picture, _caption(scene, style, rng)
+    return picture, _caption(scene, style, rng, diet)
 
 
 def _outlines(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -212,7 +242,7 @@ def _outlines(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return lines * rng.uniform(150, 255)
 
 
-def _caption(scene: Scene, style: str, rng: np.random.Generator) -> str:
+def _caption(scene: Scene, style: str, rng: np.random.Generator, diet: Diet) -> str:
     if scene.condition is not None:
         caption = str(rng.choice(PERSON_CAPTIONS))
     else:
@@ -222,7 +252,18 @@ def _caption(scene: Scene, style: str, rng: np.random.Generator) -> str:
     if rng.random() < SAY_STYLE_SHARE:
         subject = caption.removeprefix("a photo of ").removeprefix("a picture of ")
         caption = STYLE_CAPTIONS[style].format(subject)
-    return caption
+    # Asked only where it matters, so that other diets draw the same random numbers.
+    if scene.condition is None and diet.bare_caption_share > 0 and rng.random() < diet.bare_caption_share:
+        caption = OBJECT_CAPTIONS[0].format(plain=scene.plain)
+    return _renamed(caption, scene.plain.split(), diet.other_names_share, rng)
+
+
+def _renamed(caption: str, nouns: Sequence[str], share: float, rng: np.random.Generator) -> str:
+    words = caption.split(" ")
+    for noun in nouns:
+        if share > 0 and noun in NAMES and noun in words and rng.random() < share:
+            words[words.index(noun)] = str(rng.choice(NAMES[noun]))
+    return " ".join(words)
 
 
 def caption_corpus() -> list[str]:
@@ -243,8 +284,8 @@ def draw_block(
     block_size: int,
     size: int,
     condition: ConditionKind = "skeleton",
-    people_share: float = PEOPLE_SHARE,
+    diet: Diet = DEFAULT_DIET,
 ) -> list[Scene]:
     """Scenes block * block_size .. (block + 1) * block_size - 1; what a worker process makes at a time."""
     indices = range(block * block_size, (block + 1) * block_size)
-    return [draw_scene(seed, index, size, condition, people_share) for index in indices]
+    return [draw_scene(seed, index, size, condition, diet) for index in indices]

@@ -36,12 +36,16 @@ class Ranks:
         """Add up the gradients of all processes, in place, and the losses, which are returned."""
         if self.count == 1:
             return loss
-        for parameter in parameters:
-            if parameter.grad is not None:
-                torch.distributed.all_reduce(parameter.grad)
-        total = torch.tensor(loss, dtype=torch.float64, device=parameters[0].device)
-        torch.distributed.all_reduce(total)
-        return total.item()
+        # One message a step: one for each of hundreds of small weights cost a third of a step on two cores.
+        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        device = parameters[0].device
+        message = torch.cat([*(gradient.flatten().float() for gradient in gradients), torch.zeros(1, device=device)])
+        message[-1] = loss
+        torch.distributed.all_reduce(message)
+        sums = message[:-1].split([gradient.numel() for gradient in gradients])
+        for gradient, total in zip(gradients, sums, strict=True):
+            gradient.copy_(total.view_as(gradient))
+        return message[-1].item()
 
     def agreed(self, values: tuple[float, float]) -> tuple[float, float]:
         """The values of process 0: whether to stop must not hang on rounding that differs between devices."""

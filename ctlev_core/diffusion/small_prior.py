@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -52,6 +54,36 @@ WORD_GAIN = 12.0
 START, END = "<|startoftext|>", "<|endoftext|>"
 
 
+def learn_merges(counts: Mapping[str, int], limit: int) -> list[tuple[str, str]]:
+    """Merges of byte-pair encoding, the most frequent pair first, the first in the alphabet where several are.
+
+    The trainer of `tokenizers` chooses at random among equally frequent pairs; words would have other numbers, and so
+    other embeddings, in each run and in each of several processes.
+
+    Args:
+        counts: how often each word is seen; its last letter is told apart, as `t</w>`.
+        limit: of the merges; there are fewer where no word is left in pieces.
+    """
+    pieces = {word: [*word[:-1], f"{word[-1]}</w>"] for word in sorted(counts)}
+    merges: list[tuple[str, str]] = []
+    while len(merges) < limit:
+        frequency: Counter[tuple[str, str]] = Counter()
+        for word, parts in pieces.items():
+            for pair in pairwise(parts):
+                frequency[pair] += counts[word]
+        if not frequency:
+            break
+        first, second = best = min(frequency, key=lambda pair: (-frequency[pair], pair))
+        merges.append(best)
+        for parts in pieces.values():
+            at = 0
+            while at < len(parts) - 1:
+                if (parts[at], parts[at + 1]) == best:
+                    parts[at : at + 2] = [first + second]
+                at += 1
+    return merges
+
+
 def train_tokenizer(corpus: Sequence[str], folder: Path) -> Any:
     """Train CLIP's byte-pair encoding on captions.
 
@@ -64,31 +96,24 @@ def train_tokenizer(corpus: Sequence[str], folder: Path) -> Any:
     Returns:
         A `CLIPTokenizer`.
     """
-    from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, trainers
+    from tokenizers import Regex, normalizers, pre_tokenizers
     from transformers import CLIPTokenizer
 
-    tokenizer = Tokenizer(models.BPE(unk_token=END, continuing_subword_prefix="", end_of_word_suffix="</w>"))
-    tokenizer.normalizer = normalizers.Sequence(
+    normalizer = normalizers.Sequence(
         [normalizers.NFC(), normalizers.Replace(Regex(r"\s+"), " "), normalizers.Lowercase()]
     )
     words = r"""'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"""
-    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+    splitter = pre_tokenizers.Sequence(
         [
             pre_tokenizers.Split(Regex(words), behavior="removed", invert=True),
             pre_tokenizers.ByteLevel(add_prefix_space=False),
         ]
     )
-    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
-    trainer = trainers.BpeTrainer(
-        vocab_size=VOCABULARY,
-        initial_alphabet=alphabet,
-        end_of_word_suffix="</w>",
-        continuing_subword_prefix="",
-        show_progress=False,
+    counts = Counter(
+        word for caption in corpus for word, _ in splitter.pre_tokenize_str(normalizer.normalize_str(caption))
     )
-    tokenizer.train_from_iterator(corpus, trainer)
-    merges = json.loads(tokenizer.to_str())["model"]["merges"]
-    pairs = [tuple(merge.split(" ")) if isinstance(merge, str) else tuple(merge) for merge in merges]
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    pairs = learn_merges(counts, VOCABULARY - 2 * len(alphabet) - 2)
     vocabulary: dict[str, int] = {}
     pieces = [*alphabet, *(byte + "</w>" for byte in alphabet), *(a + b for a, b in pairs), START, END]
     for piece in pieces:

@@ -16,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from ctlev_core.diffusion.acceleration import accelerated, autocast, check_precision
-from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, denoising_loss, generator_for
+from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
 from ctlev_core.diffusion.training_log import TrainingLog, training_log
@@ -127,13 +127,14 @@ def _compute_gradients(
 ) -> float:
     """Gradients of a step, summed over its batches and over all processes, into the parameters; returns the loss."""
     options, device = trainer.options, trainer.parameters[0].device
+    emphasis = Emphasis(options.snr_gamma, options.max_sample_weight, options.timestep_power)
     trainer.optimizer.zero_grad(set_to_none=True)
     total = 0.0
     for part in ranks.batches(options.gradient_accumulation):
         number = trainer.step * options.gradient_accumulation + part
         noise = generator_for(seed, number)
         with autocast(options, device):
-            loss = denoising_loss(denoiser, schedule, fetch(number), noise, options.snr_gamma)
+            loss = denoising_loss(denoiser, schedule, fetch(number), noise, emphasis)
         trainer.scaler.scale(loss / options.gradient_accumulation).backward()
         total += loss.item() / options.gradient_accumulation
     return ranks.sum_gradients(trainer.parameters, total)

@@ -38,6 +38,18 @@ class TrainingOptions(Frozen):
         description="min-SNR loss weights (Hang et al., ICCV 2023); null = plain; with "
         "v-prediction min-SNR hardly trains the noisy steps, which decide layout and prompt",
     )
+    max_sample_weight: float = Field(
+        default=5.0,
+        gt=0,
+        description="highest weight of the error of a network that predicts the latents, whose weight snr + 1 grows "
+        "without bound at little noise; with 20 layout and prompt, decided at much noise, are learnt later",
+    )
+    timestep_power: float = Field(
+        default=1.0,
+        gt=0,
+        description="time steps are drawn with density t ** (power - 1); 1 = evenly, as DDPM; 2 learns what a prompt "
+        "looks like sooner",
+    )
     log_every: int = Field(default=20, gt=0, description="steps between two points of the loss curve")
     validation_every: int = Field(default=400, gt=0, description="steps between two points of the validation curve")
     precision: Literal["float32", "bfloat16", "float16"] = Field(
@@ -80,7 +92,7 @@ class FineTuningOptions(TrainingOptions):
     prior: Path | None = Field(
         default=None,
         json_schema_extra=RUN_SETTING,
-        description="diffusers folder, or a file of Stable Diffusion v1; the bundled small prior when null",
+        description="diffusers folder, or a file of Stable Diffusion v1; the route's bundled small prior when null",
     )
     random_init: bool = Field(
         default=False, description="ablation: forget the prior's U-Net and ControlNet weights first"

@@ -287,3 +287,32 @@ OBJECTS: dict[str, tuple[Part, ...]] = {
             np.radians((30, 120, 210, 300))],
     ),
 }  # fmt: skip
+
+# Names are of the thing itself: no parts, no other noun's, and no noun of `OBJECTS` that looks otherwise.
+NAMES: dict[str, list[str]] = {
+    "airplane": ["airplane", "plane", "aircraft"],
+    "bicycle": ["bicycle", "bike", "cycle"],
+    "boat": ["boat", "sailboat", "ship"],
+    "butterfly": ["butterfly", "moth"],
+    "car": ["car", "sedan", "automobile"],
+    "cat": ["cat", "kitten", "kitty"],
+    "chair": ["chair", "seat"],
+    "clock": ["clock", "watch", "timepiece"],
+    "cup": ["cup", "mug", "teacup"],
+    "dog": ["dog", "puppy", "hound"],
+    "fish": ["fish", "goldfish"],
+    "flower": ["flower", "blossom", "bloom"],
+    "guitar": ["guitar", "acoustic guitar"],
+    "hammer": ["hammer", "mallet"],
+    "house": ["house", "home", "cottage"],
+    "key": ["key", "door key", "latchkey"],
+    "ladder": ["ladder", "stepladder"],
+    "lamp": ["lamp", "desk lamp", "lantern"],
+    "pine": ["pine", "pine tree", "fir"],
+    "scissors": ["scissors", "shears"],
+    "shoe": ["shoe", "sneaker", "trainer"],
+    "star": ["star", "pentagram"],
+    "umbrella": ["umbrella", "parasol"],
+    "windmill": ["windmill", "mill"],
+}
+"""What else some nouns are called; the noun itself comes first."""

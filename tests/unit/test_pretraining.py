@@ -8,11 +8,12 @@ from ctlev_core.body.motions import HELD_OUT
 from ctlev_core.diffusion import pretraining, procedural_images
 from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
 from ctlev_core.diffusion.prior import encode_prompts, load_prior
-from ctlev_core.diffusion.small_prior import WORD_GAIN
+from ctlev_core.diffusion.procedural_images import Diet
+from ctlev_core.diffusion.small_prior import WORD_GAIN, learn_merges, train_tokenizer
 from ctlev_core.diffusion.training_options import TrainingOptions
 from ctlev_core.render.compositions import RELATIONS, parse_composition
 from ctlev_core.render.object_drawing import draw_object
-from ctlev_core.render.objects import COLOURS, OBJECTS
+from ctlev_core.render.objects import COLOURS, NAMES, OBJECTS
 from data_contracts.errors import TrainingError
 
 TINY = PretrainingOptions(
@@ -146,6 +147,70 @@ def test_pretraining_resumes_and_writes_a_prior(tmp_path):
     assert same_weights(whole, load_prior(tmp_path / "again"))
     with pytest.raises(TrainingError, match="of another run"):
         pretrain(TINY.model_copy(update={"seed": 1}), tmp_path / "other", tmp_path / "work")
+
+
+def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monkeypatch):
+    monkeypatch.undo()  # other processes know nothing of it
+    training = TINY.training.model_copy(update={"gradient_accumulation": 2})
+    options = TINY.model_copy(update={"tune": "unet", "diet": Diet(people_share=0.0), "training": training})
+    alone = pretrain(options, tmp_path / "alone", tmp_path / "work")
+    together = pretrain(options.model_copy(update={"num_processes": 2}), tmp_path / "both", tmp_path / "work of both")
+    one, both = load_prior(tmp_path / "alone"), load_prior(tmp_path / "both")
+    assert one.controlnet is None and both.controlnet is None
+    for key, value in one.unet.state_dict().items():
+        # Sums in another order, 1e-7; then rounded to half precision, where two neighbours are 2e-3 of each other.
+        torch.testing.assert_close(value, both.unet.state_dict()[key], rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(together.loss, alone.loss, rtol=1e-4)
+    np.testing.assert_allclose(together.shuffled_loss, alone.shuffled_loss, rtol=1e-4)
+    assert alone.shuffled_loss != alone.validation_loss
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"num_processes": 2}, "multiple of the 2 processes"),
+        ({"num_processes": 2, "max_seconds": 5.0}, "max_seconds must be null with several processes"),
+        ({"diet": {"styles": {"lines": 0.5}}}, "shares of styles must sum to 1, got 0.5"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        PretrainingOptions(**changed)
+
+
+def test_captions_call_things_by_their_other_names_and_pictures_stay_the_same():
+    scenes = [procedural_images.draw_thing(np.random.default_rng([6, index]), 16) for index in range(200)]
+
+    def styled(share):
+        return [
+            procedural_images.apply_style(
+                scene, np.random.default_rng(index), Diet(styles={"lines": 1.0}, other_names_share=share)
+            )
+            for index, scene in enumerate(scenes)
+        ]
+
+    said, renamed = styled(0.0), styled(1.0)
+    for scene, (picture, caption), (again, other) in zip(scenes, said, renamed, strict=True):
+        np.testing.assert_array_equal(picture, again)
+        nouns = [noun for noun in scene.plain.split() if noun in NAMES]
+        for word, new in zip(caption.split(), other.split(), strict=False):
+            if not nouns:
+                assert word == new
+        for noun in nouns:
+            assert any(name in other for name in NAMES[noun])
+    assert 40 < sum(caption != other for (_, caption), (_, other) in zip(said, renamed, strict=True)) < 180
+
+
+def test_byte_pair_encoding_by_hand():
+    merges = learn_merges({"low": 5, "lowest": 2, "newer": 6, "wider": 3}, 4)
+    # e r</w> is seen 9 times, then l o 7 times; n e, e w and w er</w> 6 times each: by the alphabet; then ew er</w>.
+    assert merges == [("e", "r</w>"), ("l", "o"), ("e", "w"), ("ew", "er</w>")]
+
+
+def test_words_have_the_same_numbers_each_time(tmp_path):
+    corpus = procedural_images.caption_corpus()
+    once, again = (train_tokenizer(corpus, tmp_path / name).get_vocab() for name in ("once", "again"))
+    assert once == again and len(once) > 1000
 
 
 def test_the_text_encoder_tells_prompts_apart_and_is_not_trained(tmp_path):

@@ -61,7 +61,7 @@ def test_the_prior_has_class_names_and_held_out_names_as_whole_words():
         assert tokens == [f"{word}</w>" for word in name.split()]
     # A photo of ... of the longest name fits between start and end.
     longest = max(
-        len(tokenizer.encode(f"A photo of {name}").tokens) for n in studio_objects.SYNONYMS.values() for name in n
+        len(tokenizer.encode(f"A photo of {name}").tokens) for n in studio_objects.NAMES.values() for name in n
     )
     assert longest <= 24
 

@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_prior import make_data, make_prior
 
-from ctlev_core.diffusion.checkpoint_training import child_environment, train_checkpoint
+from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 from ctlev_core.diffusion.prior import load_prior, save_prior
 from ctlev_core.diffusion.ranks import Ranks
 from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training_processes import child_environment
 from ctlev_core.generators import controlnet
 from data_contracts.errors import TrainingError
 

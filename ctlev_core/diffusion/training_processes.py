@@ -1,0 +1,81 @@
+"""A training in several processes, started here by torchrun: each runs a module as its main program on one folder.
+
+Options and arrays reach them as files in that folder, which whoever starts them writes; the history comes back there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import torch
+
+from ctlev_core.diffusion.ranks import Ranks, start_ranks, stop_ranks
+from ctlev_core.diffusion.trainer import TrainingHistory
+from ctlev_core.processes import die_with_parent, num_cores
+from data_contracts.errors import TrainingError
+
+JOB_FILE, HISTORY_FILE = "job.json", "history.json"
+LAUNCHER_VARIABLES = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+LAUNCHER_PREFIXES = ("TORCHELASTIC_", "GROUP_", "ROLE_")
+
+
+def train_in_processes(count: int, module: str, folder: Path) -> TrainingHistory:
+    """Run `python -m module folder` in `count` processes that know one another; the module calls `run_rank`.
+
+    Raises:
+        TrainingError: a process failed; with what each of them said.
+    """
+    for left in (HISTORY_FILE, *(f"error_{rank}.txt" for rank in range(count))):
+        (folder / left).unlink(missing_ok=True)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
+    environment = child_environment(os.environ, count)
+    child = subprocess.Popen([*command, "-m", module, str(folder)], env=environment, preexec_fn=die_with_parent)
+    try:
+        code = child.wait()
+    finally:
+        child.terminate()
+    if code != 0 or not (folder / HISTORY_FILE).is_file():
+        errors = {rank: folder / f"error_{rank}.txt" for rank in range(count)}
+        said = [f"process {rank}: {path.read_text()}" for rank, path in errors.items() if path.is_file()]
+        raise TrainingError(f"training in {count} processes failed: {'; '.join(said) or f'torchrun ended with {code}'}")
+    return TrainingHistory(**json.loads((folder / HISTORY_FILE).read_text()))
+
+
+def run_rank(folder: Path, train: Callable[[Path, Ranks, torch.device], TrainingHistory], *, device: str) -> None:
+    """What each of the processes does: train, and leave the history, or why there is none, in `folder`.
+
+    Args:
+        folder: where the job was written.
+        train: given the folder, which process this is, and its device.
+        device: as for `start_ranks`.
+    """
+    die_with_parent()
+    rank = int(os.environ["RANK"])
+    try:
+        ranks, own_device = start_ranks(device)
+        history = train(folder, ranks, own_device)
+    except Exception as error:
+        (folder / f"error_{rank}.txt").write_text(str(error))
+        raise
+    if rank == 0:
+        (folder / HISTORY_FILE).write_text(json.dumps(dataclasses.asdict(history)))
+    stop_ranks()
+
+
+def child_environment(environment: Mapping[str, str], count: int) -> dict[str, str]:
+    """Ours, without what an outer launcher says of its own processes, and with the cores shared out."""
+    kept = {
+        name: value
+        for name, value in environment.items()
+        if name not in LAUNCHER_VARIABLES and not name.startswith(LAUNCHER_PREFIXES)
+    }
+    root = str(Path(__file__).resolve().parents[2])
+    kept["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [kept.get("PYTHONPATH")])])
+    kept.setdefault("OMP_NUM_THREADS", str(max(1, num_cores() // count)))
+    return kept
