@@ -1,9 +1,9 @@
 """Text route: fine-tune the U-Net of a text-to-image diffusion model, then sample frames from prompts.
 
 Source: ControlEvents (Hu et al., WACV 2026), class-conditioned route: Stable Diffusion v1.4, U-Net trained,
-autoencoder and text encoder frozen, prompts "A photo of {class}". The bundled small prior stands in for Stable
-Diffusion unless a folder is given. Differences: averaged weights, which can be switched off; a 20-step solver instead
-of 1000 DDPM steps.
+autoencoder and text encoder frozen, prompts "A photo of {class}". The bundled small prior of objects stands in for
+Stable Diffusion unless a folder is given. Differences: averaged weights, which can be switched off; a 20-step solver
+instead of 1000 DDPM steps.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def prior_folders(options: Options) -> list[Path]:
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.prior_files import prior_places
+    from ctlev_core.diffusion.prior_files import BUNDLED_OBJECT_PRIOR, prior_places
 
-    return prior_places(options.prior)
+    return prior_places(options.prior or BUNDLED_OBJECT_PRIOR)
 
 
 def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
@@ -61,12 +61,13 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
             the conditions have images.
     """
     from ctlev_core.diffusion.checkpoint_training import train_checkpoint
+    from ctlev_core.diffusion.prior_files import BUNDLED_OBJECT_PRIOR
 
     _check_text_only(conditions)
     return train_checkpoint(
         frames,
         conditions,
-        options,
+        options.model_copy(update={"prior": options.prior or BUNDLED_OBJECT_PRIOR}),
         tune=options.tune,
         with_controlnet=False,
         class_names=conditions.class_names,
