@@ -9,9 +9,7 @@ Arrays and options reach them as files in the work folder, and results come back
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ from ctlev_core.diffusion.prior import choose_device, load_prior, save_prior
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.trainer import TrainingHistory
 from ctlev_core.diffusion.training_options import FineTuningOptions
-from ctlev_core.diffusion.training_processes import JOB_FILE, run_rank, train_in_processes
+from ctlev_core.diffusion.training_processes import run_rank, train_in_processes
 from data_contracts.config import ConditionChoice
 from data_contracts.labels import Conditions
 
@@ -118,13 +116,17 @@ def _train_in_processes(
     if conditions.images is not None:
         np.save(folder / "conditions.npy", conditions.images, allow_pickle=False)
     plain = options.model_dump(mode="json", include=set(FineTuningOptions.model_fields))
-    written = {**job, "options": plain, "prompts": conditions.prompts, "with_images": conditions.images is not None}
-    (folder / JOB_FILE).write_text(json.dumps(written))
-    return train_in_processes(count, __name__, folder)
+    written = {
+        **job,
+        "device": options.device,
+        "options": plain,
+        "prompts": conditions.prompts,
+        "with_images": conditions.images is not None,
+    }
+    return train_in_processes(count, __name__, folder, written)
 
 
-def _train_rank(folder: Path, ranks: Ranks, device: torch.device) -> TrainingHistory:
-    job = json.loads((folder / JOB_FILE).read_text())
+def _train_rank(job: dict[str, Any], folder: Path, ranks: Ranks, device: torch.device) -> TrainingHistory:
     images = np.load(folder / "conditions.npy", mmap_mode="r") if job["with_images"] else None
     frames = np.load(folder / "frames.npy", mmap_mode="r")
     made_by = None if job["made_by"] is None else ConditionChoice(**job["made_by"])
@@ -133,5 +135,4 @@ def _train_rank(folder: Path, ranks: Ranks, device: torch.device) -> TrainingHis
 
 
 if __name__ == "__main__":
-    job_folder = Path(sys.argv[1])
-    run_rank(job_folder, _train_rank, device=json.loads((job_folder / JOB_FILE).read_text())["options"]["device"])
+    run_rank(_train_rank)

@@ -7,14 +7,13 @@ import hashlib
 import json
 import logging
 import math
-import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -37,7 +36,7 @@ from ctlev_core.diffusion.small_prior import IMAGE_SIZE, WIDTHS, PredictionType,
 from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
 from ctlev_core.diffusion.training import run_training, sample_rows
 from ctlev_core.diffusion.training_options import TrainingOptions
-from ctlev_core.diffusion.training_processes import JOB_FILE, run_rank, train_in_processes
+from ctlev_core.diffusion.training_processes import run_rank, train_in_processes
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
 from data_contracts.labels import History
@@ -253,11 +252,8 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
     """
     if options.num_processes == 1:
         return _pretrain(options, out, work, ALONE)
-    folder = work / "job"
-    folder.mkdir(parents=True, exist_ok=True)
-    job = {"options": options.model_dump(mode="json"), "out": str(out), "work": str(work)}
-    (folder / JOB_FILE).write_text(json.dumps(job))
-    return train_in_processes(options.num_processes, __name__, folder)
+    job = {"device": "cpu", "options": options.model_dump(mode="json"), "out": str(out), "work": str(work)}
+    return train_in_processes(options.num_processes, __name__, work / "job", job)
 
 
 def _pretrain(options: PretrainingOptions, out: Path, work: Path, ranks: Ranks) -> TrainingHistory:
@@ -306,10 +302,9 @@ def _pretrain(options: PretrainingOptions, out: Path, work: Path, ranks: Ranks) 
     return history
 
 
-def _pretrain_rank(folder: Path, ranks: Ranks, device: torch.device) -> TrainingHistory:
-    job = json.loads((folder / JOB_FILE).read_text())
+def _pretrain_rank(job: dict[str, Any], folder: Path, ranks: Ranks, device: torch.device) -> TrainingHistory:
     return _pretrain(PretrainingOptions(**job["options"]), Path(job["out"]), Path(job["work"]), ranks)
 
 
 if __name__ == "__main__":
-    run_rank(Path(sys.argv[1]), _pretrain_rank, device="cpu")
+    run_rank(_pretrain_rank)

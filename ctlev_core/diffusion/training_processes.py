@@ -1,6 +1,6 @@
 """A training in several processes, started here by torchrun: each runs a module as its main program on one folder.
 
-Options and arrays reach them as files in that folder, which whoever starts them writes; the history comes back there.
+Options and arrays reach them as files in that folder, and the history comes back there.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -25,12 +26,19 @@ LAUNCHER_VARIABLES = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "M
 LAUNCHER_PREFIXES = ("TORCHELASTIC_", "GROUP_", "ROLE_")
 
 
-def train_in_processes(count: int, module: str, folder: Path) -> TrainingHistory:
+def train_in_processes(count: int, module: str, folder: Path, job: Mapping[str, Any]) -> TrainingHistory:
     """Run `python -m module folder` in `count` processes that know one another; the module calls `run_rank`.
 
+    Args:
+        count: of the processes.
+        module: name of the module.
+        folder: of the job, made where it is not there; arrays that the processes need are the caller's to write.
+        job: JSON values that `run_rank` hands on; `device` is as for `start_ranks`.
     Raises:
         TrainingError: a process failed; with what each of them said.
     """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / JOB_FILE).write_text(json.dumps(job))
     for left in (HISTORY_FILE, *(f"error_{rank}.txt" for rank in range(count))):
         (folder / left).unlink(missing_ok=True)
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
@@ -47,19 +55,19 @@ def train_in_processes(count: int, module: str, folder: Path) -> TrainingHistory
     return TrainingHistory(**json.loads((folder / HISTORY_FILE).read_text()))
 
 
-def run_rank(folder: Path, train: Callable[[Path, Ranks, torch.device], TrainingHistory], *, device: str) -> None:
-    """What each of the processes does: train, and leave the history, or why there is none, in `folder`.
+def run_rank(train: Callable[[dict[str, Any], Path, Ranks, torch.device], TrainingHistory]) -> None:
+    """The main program of each of the processes: train, and leave the history, or why there is none, in the folder.
 
     Args:
-        folder: where the job was written.
-        train: given the folder, which process this is, and its device.
-        device: as for `start_ranks`.
+        train: given the job, its folder, which process this is, and its device.
     """
     die_with_parent()
+    folder = Path(sys.argv[1])
     rank = int(os.environ["RANK"])
     try:
-        ranks, own_device = start_ranks(device)
-        history = train(folder, ranks, own_device)
+        job = json.loads((folder / JOB_FILE).read_text())
+        ranks, device = start_ranks(job["device"])
+        history = train(job, folder, ranks, device)
     except Exception as error:
         (folder / f"error_{rank}.txt").write_text(str(error))
         raise
