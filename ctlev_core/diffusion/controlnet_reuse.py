@@ -11,14 +11,18 @@ from torch import Tensor
 
 
 class _CachedEmbedding(torch.nn.Module):
-    """Stands in for a ControlNet's condition embedding, whose output does not depend on the time step."""
+    """Stands in for a ControlNet's condition embedding, whose output does not depend on the time step.
+
+    Conditions that come twice, as with classifier-free guidance, get its value twice.
+    """
 
     def __init__(self, value: Tensor) -> None:
         super().__init__()
         self.value = value
 
     def forward(self, conditioning: Tensor) -> Tensor:
-        return self.value
+        times = len(conditioning) // len(self.value)
+        return self.value if times == 1 else self.value.repeat(times, 1, 1, 1)
 
 
 @contextmanager
@@ -39,16 +43,19 @@ class EveryKthStep:
     """Stands in for a ControlNet, of whose calls it makes every k-th; between them the last residuals serve again.
 
     Source: Li et al., Faster Diffusion, 2023: features of the encoder, which a ControlNet copies, hardly change from
-    one step to the next. Approximate; with k = 1 exact.
+    one step to the next. Approximate; with k = 1 exact. Another number of rows, where guidance begins or ends, makes
+    a call that counts as the first.
     """
 
     def __init__(self, network: Any, k: int) -> None:
-        self._network, self._k, self._calls = network, k, 0
+        self._network, self._k, self._calls, self._num_rows = network, k, 0, 0
         self._residuals: Any = None
 
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
+    def __call__(self, noisy: Tensor, *arguments: Any, **named: Any) -> Any:
         """As the ControlNet's call: the residuals of the down blocks and of the middle one."""
+        if len(noisy) != self._num_rows:
+            self._calls, self._num_rows = 0, len(noisy)
         if self._calls % self._k == 0:
-            self._residuals = self._network(*arguments, **named)
+            self._residuals = self._network(noisy, *arguments, **named)
         self._calls += 1
         return self._residuals

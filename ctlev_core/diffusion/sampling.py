@@ -76,11 +76,8 @@ def sample_latents(
     shape = (prior.unet.config.in_channels, side, side)
     state = torch.stack([torch.randn(shape, generator=stream) for stream in streams]).to(device)
     state = state * scheduler.init_noise_sigma
-    guided = options.guidance_scale > 1
-    if guided:
-        embeddings = torch.cat([empty_embedding.expand_as(embeddings), embeddings])
-        conditions = None if conditions is None else torch.cat([conditions, conditions])
-    embeddings = embeddings.to(device, dtype)
+    embeddings, empty = embeddings.to(device, dtype), empty_embedding.to(device, dtype)
+    both = torch.cat([empty.expand_as(embeddings), embeddings])
     conditions = None if conditions is None else conditions.to(device, dtype)
     further = {"generator": streams} if options.scheduler in STOCHASTIC else {}
     controlnet = None if prior.controlnet is None else EveryKthStep(prior.controlnet, options.controlnet_every)
@@ -88,12 +85,15 @@ def sample_latents(
     with cached_condition_embedding(prior.controlnet, conditions):
         for timestep in scheduler.timesteps:
             noisy = scheduler.scale_model_input(state, timestep).to(dtype)
-            noisy = torch.cat([noisy, noisy]) if guided else noisy
-            timesteps = timestep.expand(len(noisy)).to(device)
-            predicted = denoiser.predict(noisy, timesteps, embeddings, conditions).float()
-            if guided:
+            if _is_guided(timestep, scheduler.config.num_train_timesteps, options):
+                timesteps = timestep.expand(2 * len(noisy)).to(device)
+                twice = None if conditions is None else torch.cat([conditions, conditions])
+                predicted = denoiser.predict(torch.cat([noisy, noisy]), timesteps, both, twice).float()
                 plain, prompted = predicted.chunk(2)
                 predicted = plain + options.guidance_scale * (prompted - plain)
+            else:
+                timesteps = timestep.expand(len(noisy)).to(device)
+                predicted = denoiser.predict(noisy, timesteps, embeddings, conditions).float()
             state = scheduler.step(predicted, timestep, state, **further).prev_sample
     if not bool(torch.isfinite(state).all()):
         raise FloatingPointError(
@@ -101,6 +101,11 @@ def sample_latents(
             "float16 overflows beyond 65504, bfloat16 and float32 do not"
         )
     return state
+
+
+def _is_guided(timestep: Tensor, num_timesteps: int, options: SamplingOptions) -> bool:
+    low, high = options.guidance_interval
+    return options.guidance_scale > 1 and low <= float(timestep) / (num_timesteps - 1) <= high
 
 
 @torch.no_grad()

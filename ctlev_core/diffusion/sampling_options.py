@@ -47,6 +47,11 @@ class SamplingOptions(Frozen):
         "even and trailing = even in time; ddpm has no karras and takes even where nothing is said",
     )
     guidance_scale: float = Field(default=1.0, ge=1, description="classifier-free guidance; 1 = none, twice as fast")
+    guidance_interval: tuple[float, float] = Field(
+        default=(0.0, 1.0),
+        description="time steps with guidance, as shares of the schedule, 0 = no noise; the others take half the work "
+        "(Kynkaanniemi et al., NeurIPS 2024)",
+    )
     controlnet_every: int = Field(
         default=1, gt=0, description="the ControlNet is evaluated at every k-th step, its residuals reused between"
     )
@@ -92,6 +97,13 @@ class SamplingOptions(Frozen):
     def _check_spacing(self) -> Self:
         check_spacing(self.scheduler, self.spacing)
         return self
+
+    @field_validator("guidance_interval")
+    @classmethod
+    def _check_interval(cls, interval: tuple[float, float]) -> tuple[float, float]:
+        if not 0 <= interval[0] <= interval[1] <= 1:
+            raise ValueError(f"guidance_interval must be (low, high) with 0 <= low <= high <= 1, got {interval}")
+        return interval
 
     @field_validator("device")
     @classmethod

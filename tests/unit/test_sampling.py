@@ -1,5 +1,7 @@
 """A frame depends on its own condition and seed, whatever else is sampled with it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -121,6 +123,56 @@ def test_guidance_of_one_is_no_guidance_and_more_changes_frames(tmp_path):
     )
     assert np.abs(plain.astype(int) - barely.astype(int)).max() <= 1
     assert not np.array_equal(plain, guided)
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_guidance_interval_guides_the_steps_within_it(tmp_path, images):
+    """Nowhere is without guidance, everywhere with it, and the noisier half is the loop written out."""
+    conditions = conditions_of(2) if images else Conditions(conditions_of(2).prompts, None)
+    prior = shared_prior() if images else dataclasses.replace(shared_prior(), controlnet=None)
+
+    def frames(name, **changed):
+        return sample_frames(prior, conditions, FAST.model_copy(update=changed), seeds=[0, 1], work=tmp_path / name)
+
+    guided = {"guidance_scale": 4.0, "num_inference_steps": 6, "spacing": "even"}
+    nowhere = frames("nowhere", **guided, guidance_interval=(0.99999, 0.99999))
+    assert np.array_equal(nowhere, frames("none", **guided | {"guidance_scale": 1.0}))
+    everywhere = frames("everywhere", **guided, guidance_interval=(0.0, 1.0))
+    assert np.array_equal(everywhere, frames("default", **guided))
+    half = FAST.model_copy(update=guided | {"guidance_interval": (0.5, 1.0)})
+    tensors = sampling.conditions_to_tensor(conditions.images) if images else None
+    table = sampling.encode_prompts(prior, [*conditions.prompts, ""])
+    latents = sampling.sample_latents(prior, table[:2], table[2:], tensors, [0, 1], half)
+    torch.testing.assert_close(latents, guided_by_hand(prior, table, tensors, half), atol=1e-4, rtol=1e-4)
+    assert not torch.allclose(latents, guided_by_hand(prior, table, tensors, FAST.model_copy(update=guided)), atol=1e-2)
+
+
+@torch.no_grad()
+def guided_by_hand(prior, table, images, options):
+    """Two images of seeds 0 and 1, one at a time, the prompt and the empty one in passes of their own."""
+    made = []
+    for seed in (0, 1):
+        scheduler = sampling.make_scheduler(
+            options.scheduler, prior.scheduler_config, options.num_inference_steps, options.spacing
+        )
+        state = torch.randn((1, 48, 4, 4), generator=torch.Generator().manual_seed(seed)) * scheduler.init_noise_sigma
+        condition = None if images is None else images[seed : seed + 1]
+        for timestep in scheduler.timesteps:
+            denoiser = sampling.Denoiser(prior.unet, prior.controlnet)
+            prompted, plain = (
+                denoiser.predict(state, timestep[None], table[row : row + 1], condition) for row in (seed, 2)
+            )
+            if timestep / 999 >= options.guidance_interval[0]:
+                prompted = plain + options.guidance_scale * (prompted - plain)
+            state = scheduler.step(prompted, timestep, state).prev_sample
+        made.append(state)
+    return torch.cat(made)
+
+
+@pytest.mark.parametrize("interval", [(0.6, 0.4), (-0.1, 1.0), (0.0, 1.1)])
+def test_a_guidance_interval_lies_within_the_schedule(interval):
+    with pytest.raises(ValueError, match="guidance_interval must be"):
+        SamplingOptions(guidance_interval=interval)
 
 
 def test_low_precision_keeps_the_state_in_float32(tmp_path):
