@@ -69,6 +69,7 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
     forward = _operations("unet", width, height) + controlled * _operations("controlnet", width, height)
     tuned = {"unet": "tune unet", "controlnet": "tune controlnet"}.get(options["tune"])
     backward = 3 * forward if tuned is None else _operations(tuned, width, height)
+    # As if guidance were at every step: where steps lie in its interval depends on the checkpoint's schedule.
     evaluations = sampled["num_inference_steps"] * (2 if sampled["guidance_scale"] > 1 else 1)
     samples = experiment.num_synthetic * experiment.num_generators
     return Costs(
