@@ -63,11 +63,13 @@ class Ranks:
 def _messages(gradients: Sequence[torch.Tensor]) -> Iterator[list[torch.Tensor]]:
     """Gradients to be sent together, in their order: few messages, none of which needs much memory."""
     together: list[torch.Tensor] = []
+    size = 0
     for gradient in gradients:
-        if together and sum(one.numel() for one in together) + gradient.numel() > MESSAGE_VALUES:
+        if together and size + gradient.numel() > MESSAGE_VALUES:
             yield together
-            together = []
+            together, size = [], 0
         together.append(gradient)
+        size += gradient.numel()
     if together:
         yield together
 

@@ -76,9 +76,13 @@ def sample_latents(
     shape = (prior.unet.config.in_channels, side, side)
     state = torch.stack([torch.randn(shape, generator=stream) for stream in streams]).to(device)
     state = state * scheduler.init_noise_sigma
-    embeddings, empty = embeddings.to(device, dtype), empty_embedding.to(device, dtype)
-    both = torch.cat([empty.expand_as(embeddings), embeddings])
+    embeddings = embeddings.to(device, dtype)
     conditions = None if conditions is None else conditions.to(device, dtype)
+    # What guided steps take: every row without its prompt, then with it.
+    both, twice = embeddings, conditions
+    if options.guidance_scale > 1:
+        both = torch.cat([empty_embedding.to(embeddings).expand_as(embeddings), embeddings])
+        twice = None if conditions is None else torch.cat([conditions, conditions])
     further = {"generator": streams} if options.scheduler in STOCHASTIC else {}
     controlnet = None if prior.controlnet is None else EveryKthStep(prior.controlnet, options.controlnet_every)
     denoiser = Denoiser(prior.unet, controlnet)
@@ -87,7 +91,6 @@ def sample_latents(
             noisy = scheduler.scale_model_input(state, timestep).to(dtype)
             if _is_guided(timestep, scheduler.config.num_train_timesteps, options):
                 timesteps = timestep.expand(2 * len(noisy)).to(device)
-                twice = None if conditions is None else torch.cat([conditions, conditions])
                 predicted = denoiser.predict(torch.cat([noisy, noisy]), timesteps, both, twice).float()
                 plain, prompted = predicted.chunk(2)
                 predicted = plain + options.guidance_scale * (prompted - plain)

@@ -149,19 +149,9 @@ def test_pretraining_resumes_and_writes_a_prior(tmp_path):
         pretrain(TINY.model_copy(update={"seed": 1}), tmp_path / "other", tmp_path / "work")
 
 
-@pytest.fixture
-def one_thread():
-    """As each of several processes has on two cores: sums over threads are rounded otherwise, and those matter here."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.mark.usefixtures("one_thread")
 def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monkeypatch):
     monkeypatch.undo()  # other processes know nothing of it
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     training = TINY.training.model_copy(update={"gradient_accumulation": 2})
     options = TINY.model_copy(update={"tune": "unet", "diet": Diet(people_share=0.0), "training": training})
     alone = pretrain(options, tmp_path / "alone", tmp_path / "work")

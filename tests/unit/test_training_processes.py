@@ -44,15 +44,6 @@ def prior_folder(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def one_thread():
-    """As each of several processes has on two cores: sums over threads are rounded otherwise, and those matter here."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_every_batch_of_a_step_is_one_processs(count, share):
     shares = [Ranks(rank, count).batches(count * share) for rank in range(count)]
@@ -61,8 +52,7 @@ def test_every_batch_of_a_step_is_one_processs(count, share):
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder):
     alone = trained(tmp_path / "alone", prior_folder, OPTIONS)
     together = trained(tmp_path / "together", prior_folder, OPTIONS.model_copy(update={"num_processes": 2}))
     one, two = (load_prior(tmp_path / name / "out") for name in ("alone", "together"))
