@@ -10,7 +10,7 @@ Nesterov momentum of 0.95. First and last layers are treated like all others her
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -31,22 +31,22 @@ def is_matrix(parameter: Tensor) -> bool:
     return parameter.ndim >= 2 and min(parameter.shape[0], parameter[0].numel()) >= MIN_SIDE
 
 
-def orthogonalised(matrix: Tensor) -> Tensor:
-    """Roughly U V^T of the singular value decomposition U S V^T: singular values between 0.7 and 1.2 instead of S.
+def orthogonalised(matrices: Tensor) -> Tensor:
+    """Roughly U V^T of the singular value decompositions U S V^T: singular values between 0.7 and 1.2 instead of S.
 
     Args:
-        matrix: [M, N]; its scale is of no account.
+        matrices: [B, M, N]; their scales are of no account.
     Returns:
-        [M, N]; Newton-Schulz iterations in bfloat16. Directions with less than a thousandth of the norm stay smaller.
+        [B, M, N]; by Newton-Schulz iterations in bfloat16. Directions below a thousandth of the norm stay smaller.
     """
     a, b, c = COEFFICIENTS
-    tall = matrix.shape[0] > matrix.shape[1]
-    x = (matrix.T if tall else matrix).bfloat16()
-    x = x / (x.norm() + 1e-7)
+    tall = matrices.shape[1] > matrices.shape[2]
+    x = (matrices.mT if tall else matrices).bfloat16()
+    x = x / (torch.stack([matrix.norm() for matrix in x])[:, None, None] + 1e-7)
     for _ in range(ITERATIONS):
-        gram = x @ x.T
-        x = a * x + (b * gram + c * gram @ gram) @ x
-    return (x.T if tall else x).to(matrix.dtype)
+        gram = x @ x.mT
+        x = (x * a).add_(((gram * c) @ gram).add_(gram * b) @ x)
+    return (x.mT if tall else x).to(matrices.dtype)
 
 
 class Muon(torch.optim.Optimizer):
@@ -64,24 +64,34 @@ class Muon(torch.optim.Optimizer):
         if closure is not None:
             raise ValueError("Muon takes no closure: compute the gradients before the step")
         for group in self.param_groups:
+            alike: dict[tuple[int, ...], list[tuple[Tensor, Tensor]]] = {}
             for parameter in group["params"]:
-                if parameter.grad is None:
+                gradient = parameter.grad
+                if gradient is None:
                     continue
-                step, rate = (self._matrix_step, MATRIX_RATE) if is_matrix(parameter) else (self._adam_step, 1.0)
-                rate *= group["lr"]
-                direction = step(parameter, parameter.grad, group["betas"])
-                parameter.mul_(1 - rate * group["weight_decay"]).add_(direction, alpha=-rate)
+                if is_matrix(parameter):
+                    alike.setdefault(tuple(gradient.flatten(1).shape), []).append((parameter, gradient))
+                else:
+                    _move(group, parameter, self._adam_direction(parameter, gradient, group["betas"]), 1.0)
+            for matrices in alike.values():
+                directions = self._matrix_directions(matrices)
+                for (parameter, _), direction in zip(matrices, directions, strict=True):
+                    _move(group, parameter, direction.view_as(parameter), MATRIX_RATE)
 
-    def _matrix_step(self, parameter: Tensor, gradient: Tensor, betas: tuple[float, float]) -> Tensor:
-        state = self.state[parameter]
-        if not state:
-            state["momentum"] = torch.zeros_like(parameter)
-        momentum = state["momentum"].lerp_(gradient, 1 - MOMENTUM)
-        nesterov = gradient.lerp(momentum, MOMENTUM).flatten(1)
-        rows, columns = nesterov.shape
-        return orthogonalised(nesterov).mul_(max(1.0, rows / columns) ** 0.5).view_as(parameter)
+    def _matrix_directions(self, matrices: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+        """[B, M, N] of B weights of one shape with their gradients; together, since many small products are slow."""
+        nesterov = []
+        for parameter, gradient in matrices:
+            state = self.state[parameter]
+            if not state:
+                state["momentum"] = torch.zeros_like(parameter)
+            momentum = state["momentum"].lerp_(gradient, 1 - MOMENTUM)
+            nesterov.append(gradient.lerp(momentum, MOMENTUM).flatten(1))
+        directions = orthogonalised(torch.stack(nesterov))
+        rows, columns = directions.shape[1:]
+        return directions.mul_(max(1.0, rows / columns) ** 0.5)
 
-    def _adam_step(self, parameter: Tensor, gradient: Tensor, betas: tuple[float, float]) -> Tensor:
+    def _adam_direction(self, parameter: Tensor, gradient: Tensor, betas: tuple[float, float]) -> Tensor:
         state = self.state[parameter]
         if not state:
             state.update(step=0, mean=torch.zeros_like(parameter), square=torch.zeros_like(parameter))
@@ -89,3 +99,9 @@ class Muon(torch.optim.Optimizer):
         mean = state["mean"].lerp_(gradient, 1 - betas[0]) / (1 - betas[0] ** state["step"])
         square = state["square"].lerp_(gradient.square(), 1 - betas[1]) / (1 - betas[1] ** state["step"])
         return mean / (square.sqrt() + EPSILON)
+
+
+def _move(group: dict[str, Any], parameter: Tensor, direction: Tensor, rate: float) -> None:
+    """Down the direction, and towards zero by the weight decay; `rate` is a multiple of the learning rate."""
+    rate *= group["lr"]
+    parameter.mul_(1 - rate * group["weight_decay"]).add_(direction, alpha=-rate)
