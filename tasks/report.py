@@ -20,7 +20,7 @@ from ctlev_core.report.contact_sheet import contact_sheet_sections
 from ctlev_core.report.copies import copy_sections
 from ctlev_core.report.costs import cost_table, options_table, versions_table
 from ctlev_core.report.distances import floor_tables
-from ctlev_core.report.html import Curves, Folded, Section, render_report
+from ctlev_core.report.html import Animation, Curves, Folded, Section, render_report
 from ctlev_core.report.nearest_classes import nearest_sections
 from ctlev_core.report.paper_numbers import paper_section
 from ctlev_core.report.realism import realism_sections
@@ -48,7 +48,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=12, schema=tables.REPORT)
+@stage(version=13, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -111,7 +111,8 @@ def report(
     words = _verdict(rows, settings, list(shown), paired)
     steps = pictures.steps(frames, frame_conditions, conditions, next(iter(shown.values())), _kind(frame_conditions))
     grid, *other_grids = pictures.sample_grids(conditions, shown, real)
-    write_summary(out.folder, Summary(words, steps, grid))
+    figures = _figures(rows, _learnt_with(records), conditions, next(iter(shown.values())))
+    write_summary(out.folder, Summary(words, steps, grid, figures))
     page = render_report(
         title=title,
         lead=notice,
@@ -124,8 +125,8 @@ def report(
             grid,
             *other_grids,
             *([] if nearest is None else nearest_sections(nearest)),
-            *prior_figures(rows, _learnt_with(records), _first_metric(rows)),
-            *_figures(rows, frames, conditions, shown, target),
+            *figures,
+            pictures.real_grid(frames, target),
             *looks[:1],
             *_training_of_generators(checkpoints, checkpoint_names),
             *_folded("Class by class", by_class),
@@ -163,14 +164,14 @@ def _results(rows: list[Row], settings: Sequence[str], names: list[str], paired:
 
 
 def _figures(
-    rows: list[Row], frames: Manifest, conditions: Manifest, shown: dict[str, Manifest], target: Manifest | None
-) -> list[Section]:
+    rows: list[Row], learnt_with: dict[str, dict[str, Any]], conditions: Manifest, synthetic: Manifest
+) -> list[Curves | Animation]:
     metric = _first_metric(rows)
     points = scaling_points(rows, metric)
     return [
-        *pictures.motion(conditions, next(iter(shown.values()))),
+        *prior_figures(rows, learnt_with, metric),
+        *pictures.motion(conditions, synthetic),
         *([scaling_figure(points, metric)] if len({point.ratio for point in points}) >= FEWEST_AMOUNTS else []),
-        pictures.real_grid(frames, target),
     ]
 
 

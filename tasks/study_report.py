@@ -29,7 +29,7 @@ from data_contracts.study import SPEED_VS_ERROR
 from tasks.stage import Output, stage
 
 
-@stage(version=1, schema=tables.REPORT)
+@stage(version=2, schema=tables.REPORT)
 def study_report(
     out: Output,
     reports: list[Manifest],
@@ -60,7 +60,7 @@ def study_report(
     measured = [read_speed_summary(report.ref.path) for report in reports[len(names) :]]
     folders = [*names, *(SPEED_VS_ERROR for _ in measured)]
     shown, words = study_tables(parts), study_verdict(parts)
-    links = [(f"{part.question} (`{part.name}`)", f"{title}/{part.name}/{PAGE}") for part in parts]
+    links = [(part.heading, f"{title}/{part.name}/{PAGE}") for part in parts]
     links += [(f"Speed against error (`{speed.experiment}`)", f"{title}/{SPEED_VS_ERROR}/{PAGE}") for speed in measured]
     page = render_report(
         title=title,

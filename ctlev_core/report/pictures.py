@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ctlev_core.report.html import Animation, ImageGrid, Section, Step
+from ctlev_core.report.html import Animation, ImageGrid, Step
 from ctlev_core.windows import spread
 from data_contracts.manifest import Manifest
 
@@ -205,7 +205,7 @@ def real_grid(frames: Manifest, target: Manifest | None = None) -> ImageGrid:
     return ImageGrid("Real frames", rows, caption="The data the generator was tuned on, and the data tested on.")
 
 
-def motion(conditions: Manifest, synthetic: Manifest) -> list[Section]:
+def motion(conditions: Manifest, synthetic: Manifest) -> list[Animation]:
     """Conditions beside the frames sampled for them, as they follow in time, where they do."""
     if "images.npy" not in conditions.files:
         return []

@@ -44,6 +44,16 @@ class Part:
     summary: Summary
 
     @property
+    def compares(self) -> bool:
+        """Was anything trained on synthetic frames? If not, it is here for its samples and figures."""
+        return any(setting != "real" for setting in self.settings)
+
+    @property
+    def heading(self) -> str:
+        """How the sections about it begin."""
+        return f"{self.question} (`{self.name}`)"
+
+    @property
     def question(self) -> str:
         """What it asks, in two words."""
         return self._asked[0]
@@ -63,16 +73,16 @@ class Part:
 
 
 def study_verdict(parts: Sequence[Part]) -> str:
-    """A paragraph an experiment."""
-    return "\n\n".join(f"{part.question} (`{part.name}`): {part.summary.verdict}" for part in parts)
+    """A paragraph for each experiment that trained on synthetic frames."""
+    return "\n\n".join(f"{part.heading}: {part.summary.verdict}" for part in parts if part.compares)
 
 
 def study_tables(parts: Sequence[Part]) -> list[list[Table]]:
     """The tables of scores of each experiment that the page shows; in the last list those of all together."""
     found = []
     for part in parts:
-        tables = [table for table in score_tables(part.rows, part.settings, part.paired) if _answers(table)]
-        found.append([replace(table, title=f"{part.question} (`{part.name}`): {table.title}") for table in tables])
+        tables = score_tables(part.rows, part.settings, part.paired) if part.compares else []
+        found.append([replace(table, title=f"{part.heading}: {table.title}") for table in tables if _answers(table)])
     return [*found, [distances_table(parts)]]
 
 
@@ -82,12 +92,15 @@ def _answers(table: Table) -> bool:
 
 
 def study_sections(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> list[Section | Folded]:
-    """Of each experiment its tables, its samples and the paper's numbers; then the distances of all."""
+    """Of each experiment its tables, its samples, its figures and the paper's numbers; then the distances of all."""
     sections: list[Section | Folded] = []
     for part, shown in zip(parts, tables, strict=False):
         sections += shown
-        sections.append(replace(part.summary.grid, title=f"{part.question} (`{part.name}`): asked for, and sampled"))
-        sections += _published(part.published)
+        sections.append(replace(part.summary.grid, title=f"{part.heading}: asked for, and sampled"))
+        sections += [
+            replace(f, title=f"{part.heading}: {f.title[0].lower()}{f.title[1:]}") for f in part.summary.figures
+        ]
+        sections += _published(part.published) if part.compares else []
     return [*sections, *tables[-1], *_published(paper_numbers.DISTANCES)]
 
 
@@ -109,7 +122,7 @@ def speed_table(parts: Sequence[Part], speed: SpeedSummary) -> Table:
 
 def _heading(parts: Sequence[Part], speed: SpeedSummary) -> str:
     (part,) = (part for part in parts if part.name == speed.experiment)
-    return f"{part.question} (`{part.name}`)"
+    return part.heading
 
 
 def _published(table: Table | None) -> list[Folded]:

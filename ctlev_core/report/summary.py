@@ -1,4 +1,4 @@
-"""What a page of several experiments shows of each: its verdict, what was done in pictures, and its grid of samples.
+"""What a page of several experiments shows of each: its verdict, what was done in pictures, samples and figures.
 
 A report keeps its summary as JSON beside its page, pictures as PNG, so that the page over several is made from their
 reports alone.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ctlev_core.report.html import ImageGrid, Step
+from ctlev_core.report.html import Animation, Curves, ImageGrid, Step
 from data_contracts.errors import DataError
 
 SUMMARY_FILE = "summary.json"
@@ -23,11 +24,19 @@ SUMMARY_FILE = "summary.json"
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """See the module's docstring."""
+    """See the module's docstring.
+
+    Attributes:
+        verdict: a paragraph.
+        steps: what was done.
+        grid: what was asked for, and sampled.
+        figures: how scores change with the amounts of data and training, and frames in motion.
+    """
 
     verdict: str
     steps: list[Step]
     grid: ImageGrid
+    figures: Sequence[Curves | Animation] = ()
 
 
 def write_summary(folder: Path, summary: Summary) -> None:
@@ -37,6 +46,7 @@ def write_summary(folder: Path, summary: Summary) -> None:
         "verdict": summary.verdict,
         "steps": [{**vars(step), "picture": _picture(step.picture)} for step in steps],
         "grid": {**vars(grid), "rows": [[label, [_picture(image) for image in images]] for label, images in grid.rows]},
+        "figures": [_stored(figure) for figure in summary.figures],
     }
     (folder / SUMMARY_FILE).write_text(json.dumps(content), encoding="utf-8")
 
@@ -52,9 +62,23 @@ def read_summary(folder: Path) -> Summary:
         content = json.loads(path.read_text(encoding="utf-8"))
         steps = [Step(**{**step, "picture": _opened(step["picture"])}) for step in content["steps"]]
         rows = [(label, [_image(image) for image in images]) for label, images in content["grid"]["rows"]]
-        return Summary(content["verdict"], steps, ImageGrid(**{**content["grid"], "rows": rows}))
+        grid = ImageGrid(**{**content["grid"], "rows": rows})
+        return Summary(content["verdict"], steps, grid, [_figure(stored) for stored in content["figures"]])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: is not the summary of a report: {error}") from error
+
+
+def _stored(figure: Curves | Animation) -> dict[str, Any]:
+    if isinstance(figure, Curves):
+        return vars(figure)
+    return {**vars(figure), "clips": [[label, [_picture(image) for image in clip]] for label, clip in figure.clips]}
+
+
+def _figure(stored: dict[str, Any]) -> Curves | Animation:
+    if "clips" not in stored:
+        return Curves(**stored)
+    clips = [(label, np.stack([_image(image) for image in images])) for label, images in stored["clips"]]
+    return Animation(**{**stored, "clips": clips})
 
 
 def _picture(picture: np.ndarray | str) -> Any:

@@ -11,10 +11,11 @@ import yaml
 from report_artefacts import SETTINGS, Experiment
 
 from ctlev_core.plugins import PluginError, load_options
-from ctlev_core.report.html import Curves, ImageGrid, Step
+from ctlev_core.report.html import Animation, Curves, ImageGrid, Step
 from ctlev_core.report.report_files import publish_report
+from ctlev_core.report.score_tables import PairedScores
 from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
-from ctlev_core.report.study import distances_table
+from ctlev_core.report.study import Part, distances_table, study_sections, study_tables, study_verdict
 from ctlev_core.report.summary import SUMMARY_FILE, Summary, read_summary, write_summary
 from ctlev_core.report.tables import Table
 from ctlev_core.run_comparison import read_run
@@ -122,6 +123,23 @@ def test_links_lead_to_the_experiments_own_reports(published, reports):
         assert read_run(part, published / "both" / part).scores  # `flows/compare.py` takes the folder
 
 
+def test_an_experiment_that_trains_on_nothing_synthetic_shows_samples_and_figures(reports):
+    def part(settings):
+        summary = Summary("the verdict", [], ImageGrid("g", []), [replace(CHART, title="By amount")])
+        rows = pq.read_table(reports[0] / "scores.parquet").to_pylist()
+        paired = PairedScores(pq.read_table(reports[0] / "samples.parquet"))
+        return Part("first", rows, settings, ["synthetic"], paired, summary)
+
+    for settings in (["real"], list(SETTINGS)):
+        parts = [part(settings)]
+        tables = study_tables(parts)
+        titles = [section.title for section in study_sections(parts, tables)]
+        assert {"2D pose (`first`): asked for, and sampled", "2D pose (`first`): by amount"} <= set(titles)
+        told = settings != ["real"]
+        assert bool(tables[0]) == told == any("Paper, Table 2" in title for title in titles)
+        assert ("the verdict" in study_verdict(parts)) == told
+
+
 def test_distances_stand_beside_each_other_by_experiment(reports):
     parts = []
     for name, folder, factor in zip(PARTS, reports, (1, 2), strict=True):
@@ -139,8 +157,17 @@ def test_summaries_come_back_as_they_were(tmp_path):
     colour, grey = rng.integers(0, 256, (5, 7, 3), np.uint8), rng.integers(0, 256, (4, 6), np.uint8)
     steps = [Step("1", colour, "see", follows=True), Step("2", "“a cat”", "read")]
     grid = ImageGrid("grid", [("a", [colour, colour]), ("b", [grey])], column_labels=["x", "y"], caption="c")
-    write_summary(tmp_path, Summary("so", steps, grid))
+    curves = Curves(
+        "c", {"a": ([0.0, 1.0], [2.0, 3.0])}, "x", "y", log_x=True, spans={"a": ([1.0, np.nan], [3.0, 4.0])}
+    )
+    animation = Animation("m", [("run", np.stack([colour] * 3))], 8.0, "moves")
+    write_summary(tmp_path, Summary("so", steps, grid, [curves, animation]))
     back = read_summary(tmp_path)
+    chart, moving = back.figures
+    assert (chart.series, chart.x_label, chart.log_x) == ({"a": [[0, 1], [2, 3]]}, "x", True)
+    np.testing.assert_array_equal(chart.spans["a"], curves.spans["a"])
+    assert (moving.title, moving.rate_hz, moving.caption, moving.clips[0][0]) == ("m", 8.0, "moves", "run")
+    np.testing.assert_array_equal(moving.clips[0][1], animation.clips[0][1])
     assert (back.verdict, back.steps[1], back.steps[0].follows) == ("so", steps[1], True)
     assert (back.grid.title, back.grid.caption, list(back.grid.column_labels)) == ("grid", "c", ["x", "y"])
     np.testing.assert_array_equal(back.steps[0].picture, colour)
@@ -172,8 +199,20 @@ def test_the_bundled_study_is_made_of_its_presets():
 def test_the_demo_trains_once_what_its_experiments_share():
     study = load_study("demo", [])
     assert isinstance(study, Study)
-    pose, cdehp, body, objects, zero_shot = study.experiments.values()
+    pose, cdehp, prior, body, motion, objects, zero_shot = study.experiments.values()
     assert pose.baselines.items() <= body.baselines.items() and pose.baselines == cdehp.baselines
+    for one, other in ((pose, prior), (body, motion)):
+        for name in ("dataset", "windows", "encoding", "condition", "generator", "downstream", "downstream_seeds",
+                     "feature_extractor", "seed"):  # fmt: skip
+            assert getattr(one, name) == getattr(other, name)
+        assert other.settings == ("real",)  # trained for `one`
+    assert body.baselines["foreign_poses"].generator == body.generator
+    alike = {"random_50": {"random_init": True, "num_steps": 50}, "random_150": {"random_init": True},
+             "prior_50": {"num_steps": 50}}  # fmt: skip
+    for name, changes in alike.items():
+        baseline = prior.baselines[name]
+        assert baseline.generator.options == prior.generator.options | changes
+        assert (baseline.condition, baseline.sampling) == (prior.condition, prior.sampling)
     assert load_options(pose.dataset) == load_options(body.dataset)  # one says what is the other's default
     for name in ("windows", "encoding", "num_synthetic", "feature_extractor", "seed", "max_tries"):
         assert getattr(pose, name) == getattr(body, name)
