@@ -20,7 +20,7 @@ from ctlev_core.report.contact_sheet import contact_sheet_sections
 from ctlev_core.report.copies import copy_sections
 from ctlev_core.report.costs import cost_table, options_table, versions_table
 from ctlev_core.report.distances import floor_tables
-from ctlev_core.report.html import Animation, Curves, Folded, Section, render_report
+from ctlev_core.report.html import Curves, Folded, Section, render_report
 from ctlev_core.report.nearest_classes import nearest_sections
 from ctlev_core.report.paper_numbers import paper_section
 from ctlev_core.report.realism import realism_sections
@@ -34,7 +34,7 @@ from ctlev_core.report.score_tables import (
     score_tables,
     trained_rows,
 )
-from ctlev_core.report.summary import Summary, write_summary
+from ctlev_core.report.summary import Figure, Summary, write_summary
 from ctlev_core.report.tables import Cell, Table, render_latex, render_markdown
 from ctlev_core.report.training_curves import prior_figures
 from ctlev_core.report.verdict import verdict
@@ -165,7 +165,7 @@ def _results(rows: list[Row], settings: Sequence[str], names: list[str], paired:
 
 def _figures(
     rows: list[Row], learnt_with: dict[str, dict[str, Any]], conditions: Manifest, synthetic: Manifest
-) -> list[Curves | Animation]:
+) -> list[Figure]:
     metric = _first_metric(rows)
     points = scaling_points(rows, metric)
     return [

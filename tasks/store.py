@@ -1,13 +1,14 @@
 """The content-addressed store: where artefacts live, how they appear all at once, and who may write.
 
-<home>/artefacts/<stage>/<key>/   finished artefacts: manifest.parquet, run.json, arrays, checkpoints
-<home>/work/<key>/                resumable state of a stage that is running or was interrupted
-<home>/tmp/<key>/                 an artefact being put together; renamed into place when complete
-<home>/locks/<key>                held (flock) while a process makes the artefact; freed by the kernel on death
-<home>/locks/store                shared by every process that uses the store, until it ends; exclusive while pruning
-<home>/damaged/<stage>/           artefacts that were set aside; nothing here deletes them
-<home>/pruned/                    on its way out
-<home>/published/<experiment>/    which artefacts are the versions of its synthetic data (data_contracts.published)
+Below the home folder:
+artefacts/<stage>/<key>/   finished artefacts: manifest.parquet, run.json, arrays, checkpoints
+work/<key>/                resumable state of a stage that is running or was interrupted
+tmp/<key>/                 an artefact being put together; renamed into place when complete
+locks/<key>                held (flock) while a process makes the artefact; freed by the kernel on death
+locks/store                shared by every process that uses the store, until it ends; exclusive while pruning
+damaged/<stage>/           artefacts that were set aside; nothing here deletes them
+pruned/                    on its way out
+published/<experiment>/    which artefacts are the versions of its synthetic data (data_contracts.published)
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from ctlev_core.report import paper_numbers
 from ctlev_core.report.html import Folded, Section, Text
 from ctlev_core.report.score_tables import PairedScores, cell_text, score_tables, trained_rows
 from ctlev_core.report.speed_summary import SpeedSummary
-from ctlev_core.report.summary import Summary
+from ctlev_core.report.summary import Figure, Summary
 from ctlev_core.report.tables import Cell, Table
 
 Row = dict[str, Any]
@@ -97,9 +97,7 @@ def study_sections(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> 
     for part, shown in zip(parts, tables, strict=False):
         sections += shown
         sections.append(replace(part.summary.grid, title=f"{part.heading}: asked for, and sampled"))
-        sections += [
-            replace(f, title=f"{part.heading}: {f.title[0].lower()}{f.title[1:]}") for f in part.summary.figures
-        ]
+        sections += [_titled(part.heading, figure) for figure in part.summary.figures]
         sections += _published(part.published) if part.compares else []
     return [*sections, *tables[-1], *_published(paper_numbers.DISTANCES)]
 
@@ -109,10 +107,14 @@ def speed_sections(parts: Sequence[Part], speed: SpeedSummary) -> list[Section |
     table = speed_table(parts, speed)
     sections: list[Section | Folded] = [Text(f"Speed against error: {_heading(parts, speed)}", speed.recommendation)]
     for chart in speed.charts[:1]:
-        sections.append(replace(chart, title=f"Speed against error: {chart.title[:1].lower()}{chart.title[1:]}"))
+        sections.append(_titled("Speed against error", chart))
     others = speed.charts[1:]
     shown = [*others, replace(table, title="Costs and errors")] if others else [table]
     return [*sections, Folded(table.title, shown)]
+
+
+def _titled(heading: str, figure: Figure) -> Figure:
+    return replace(figure, title=f"{heading}: {figure.title[:1].lower()}{figure.title[1:]}")
 
 
 def speed_table(parts: Sequence[Part], speed: SpeedSummary) -> Table:

@@ -20,6 +20,7 @@ from ctlev_core.report.html import Animation, Curves, ImageGrid, Step
 from data_contracts.errors import DataError
 
 SUMMARY_FILE = "summary.json"
+Figure = Curves | Animation
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,7 @@ class Summary:
     verdict: str
     steps: list[Step]
     grid: ImageGrid
-    figures: Sequence[Curves | Animation] = ()
+    figures: Sequence[Figure] = ()
 
 
 def write_summary(folder: Path, summary: Summary) -> None:
@@ -68,13 +69,13 @@ def read_summary(folder: Path) -> Summary:
         raise DataError(f"{path}: is not the summary of a report: {error}") from error
 
 
-def _stored(figure: Curves | Animation) -> dict[str, Any]:
+def _stored(figure: Figure) -> dict[str, Any]:
     if isinstance(figure, Curves):
         return vars(figure)
     return {**vars(figure), "clips": [[label, [_picture(image) for image in clip]] for label, clip in figure.clips]}
 
 
-def _figure(stored: dict[str, Any]) -> Curves | Animation:
+def _figure(stored: dict[str, Any]) -> Figure:
     if "clips" not in stored:
         return Curves(**stored)
     clips = [(label, np.stack([_image(image) for image in images])) for label, images in stored["clips"]]
