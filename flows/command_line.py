@@ -28,6 +28,20 @@ X = TypeVar("X", bound=Experiment)
 PRESETS = Path(__file__).resolve().parent / "presets"
 
 
+class _UniqueKeysLoader(yaml.SafeLoader):
+    """YAML's safe loader, which alone would keep the last of two equal keys and say nothing."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        # Here and not when values are made: by then merged mappings (`<<`) have put their keys among the others.
+        node = super().compose_mapping_node(anchor)
+        names = set[str]()
+        for key, _ in node.value:
+            if key.value in names:
+                raise yaml.MarkedYAMLError(problem=f"{key.value!r} is there twice", problem_mark=key.start_mark)
+            names.add(str(key.value))
+        return node
+
+
 def preset_names(folder: Path = PRESETS) -> list[str]:
     """Names of the bundled presets of a folder."""
     return sorted(path.stem for path in folder.glob("*.yaml"))
@@ -77,7 +91,10 @@ def read_preset(folder: Path, preset: str, heirs: tuple[str, ...] = ()) -> dict[
         known = ", ".join(preset_names(folder))
         of = f"{heirs[-1]} extends an " if heirs else ""
         raise PluginError(f"{of}unknown preset {preset!r}; known: {known}, or the path of a .yaml file")
-    values = yaml.safe_load(path.read_text())
+    try:
+        values = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeysLoader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise PluginError(f"{path}: not a preset in YAML: {error}") from None
     if not isinstance(values, dict):
         raise PluginError(f"{path}: a preset is a mapping of options, got {type(values).__name__}")
     extended = values.pop("extends", None)
