@@ -32,9 +32,9 @@ MIN_ALPHA_BAR = 2.0**-24
 THIRD_ORDER_FROM = 20
 """Steps from which UniPC is of order 3; with fewer its long steps overshoot.
 
-Root mean square distance, in grey levels, of the bundled prior's images from those of 60 steps, order 3 and 2: 48 and
-11 with 6 Karras steps, 21 and 2.9 with 8, 3.0 and 1.9 with 10, 1.2 and 0.8 with 15, 0.7 and 0.7 with 20. With a
-denoiser in closed form order 3 is the better one with 20 steps.
+Root mean square distance, in grey levels, of the images of an earlier bundled prior from those of 60 steps, order 3
+and 2: 48 and 11 with 6 Karras steps, 21 and 2.9 with 8, 3.0 and 1.9 with 10, 1.2 and 0.8 with 15, 0.7 and 0.7 with 20.
+With a denoiser in closed form order 3 is the better one with 20 steps.
 """
 
 _NOISE_SCHEDULE = (
