@@ -148,8 +148,10 @@ def read_preset(path: Path) -> SensorOptions:
     """
     import yaml
 
+    from data_contracts.yaml_text import load_yaml
+
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise DataError(f"{path}: not a sensor preset: {error}") from error
     if not isinstance(content, dict):

@@ -19,6 +19,7 @@ from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.experiment import Experiment
 from data_contracts.study import Study
+from data_contracts.yaml_text import load_yaml
 from flows import local_server, settings
 from flows.costs import HOW_ESTIMATED, estimate_costs
 from flows.inputs import InputsMissing, check_inputs
@@ -26,20 +27,6 @@ from tasks.stage import PlannedStage, in_one_run, planning
 
 X = TypeVar("X", bound=Experiment)
 PRESETS = Path(__file__).resolve().parent / "presets"
-
-
-class _UniqueKeysLoader(yaml.SafeLoader):
-    """YAML's safe loader, which alone would keep the last of two equal keys and say nothing."""
-
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        # Here and not when values are made: by then merged mappings (`<<`) have put their keys among the others.
-        node = super().compose_mapping_node(anchor)
-        names = set[str]()
-        for key, _ in node.value:
-            if key.value in names:
-                raise yaml.MarkedYAMLError(problem=f"{key.value!r} is there twice", problem_mark=key.start_mark)
-            names.add(str(key.value))
-        return node
 
 
 def preset_names(folder: Path = PRESETS) -> list[str]:
@@ -92,7 +79,7 @@ def read_preset(folder: Path, preset: str, heirs: tuple[str, ...] = ()) -> dict[
         of = f"{heirs[-1]} extends an " if heirs else ""
         raise PluginError(f"{of}unknown preset {preset!r}; known: {known}, or the path of a .yaml file")
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeysLoader)
+        values = load_yaml(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise PluginError(f"{path}: not a preset in YAML: {error}") from None
     if not isinstance(values, dict):
@@ -122,7 +109,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
         if not isinstance(target, dict):
             raise PluginError(f"--set {name}: {parent!r} is not a group of options")
     try:
-        target[last] = yaml.safe_load(text)
+        target[last] = load_yaml(text)
     except yaml.YAMLError as error:
         raise PluginError(f"--set {name}: {text!r} is not YAML: {error}") from None
 

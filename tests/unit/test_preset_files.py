@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 
 from ctlev_core.plugins import PluginError
-from flows.command_line import read_preset
+from ctlev_core.sensor_options import read_preset as read_sensor_preset
+from data_contracts.errors import DataError
+from flows.command_line import apply_override, read_preset
 
 
 @pytest.mark.parametrize(
@@ -24,6 +26,15 @@ def test_a_broken_preset_is_refused(tmp_path: Path, content: bytes, message: str
     with pytest.raises(PluginError, match=message) as error:
         read_preset(tmp_path, str(path))
     assert "mine.yaml" in str(error.value)
+
+
+def test_so_are_a_sensor_preset_and_an_override(tmp_path: Path) -> None:
+    path = tmp_path / "sensor.yaml"
+    path.write_text("leak_rate_hz: 1\nleak_rate_hz: 2\n")
+    with pytest.raises(DataError, match="'leak_rate_hz' is there twice"):
+        read_sensor_preset(path)
+    with pytest.raises(PluginError, match="'palette' is there twice"):
+        apply_override({}, "sampling={palette: grey, palette: rgb}")
 
 
 def test_a_merged_mapping_may_be_overridden(tmp_path: Path) -> None:
