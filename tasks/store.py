@@ -164,6 +164,7 @@ class Store:
         """
         record["digest"] = file_digest(temporary / "manifest.parquet")
         (temporary / RUN_FILE).write_text(json.dumps(record, indent=2, sort_keys=True, default=str) + "\n")
+        _share_as_the_record(temporary)
         folder = self.folder(stage, key)
         folder.parent.mkdir(parents=True, exist_ok=True)
         # The name of a new folder lies in the one around it.
@@ -302,6 +303,14 @@ def _touch(folder: Path) -> None:
     """
     with contextlib.suppress(OSError):  # not ours to write; reading goes on
         os.utime(folder / RUN_FILE)
+
+
+def _share_as_the_record(folder: Path) -> None:
+    """Who may read the provenance record may read every file beside it: safetensors makes its own private (0600)."""
+    mode = stat.S_IMODE((folder / RUN_FILE).stat().st_mode)
+    for path in folder.rglob("*"):
+        if path.is_file() and not path.is_symlink() and stat.S_IMODE(path.stat().st_mode) != mode:
+            path.chmod(mode)
 
 
 def _folders(folder: Path) -> list[Path]:

@@ -136,6 +136,25 @@ def test_an_artefact_gets_its_name_after_all_of_it_is_on_the_disk_and_the_name_f
     assert done == [folder.parent]
 
 
+def test_whoever_may_read_the_record_may_read_every_file_of_an_artefact(tmp_path, monkeypatch):
+    """A group shares a store; safetensors, for one, makes its files readable for their owner alone."""
+    publish = Store.publish
+
+    def publish_private(self, stage, key, temporary, record):
+        for path in temporary.rglob("*.*"):
+            path.chmod(0o600)
+        return publish(self, stage, key, temporary, record)
+
+    monkeypatch.setattr(Store, "publish", publish_private)
+    before = os.umask(0o027)
+    try:
+        folder = add(Store(tmp_path), 1)
+    finally:
+        os.umask(before)
+    modes = {path.name: path.stat().st_mode & 0o777 for path in folder.rglob("*") if path.is_file()}
+    assert len(modes) == 4 and set(modes.values()) == {0o640}, modes
+
+
 def test_what_cannot_be_synced_is_not_published(tmp_path, monkeypatch):
     def fail(descriptor):
         raise OSError("disk full")
