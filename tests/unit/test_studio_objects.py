@@ -14,7 +14,7 @@ from tokenizers import Tokenizer
 
 from ctlev_core.conditions import text
 from ctlev_core.datasets import studio_objects
-from ctlev_core.datasets.studio_objects import CLASSES, HELD_OUT, Options
+from ctlev_core.datasets.studio_objects import CLASSES, COMPOSITIONS, HELD_OUT, UNSEEN, Options
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
 from ctlev_core.render.compositions import NOUNS, Composition, all_compositions, parse_composition
 from ctlev_core.render.object_drawing import draw_composition, draw_object
@@ -43,7 +43,8 @@ def same_events(first: Events, second: Events) -> bool:
 
 
 def test_there_are_classes_enough_with_two_to_five_names_that_no_other_has():
-    assert len(CLASSES) >= 20 and len(HELD_OUT) == 10 and set(CLASSES) <= set(OBJECTS)
+    assert len(CLASSES) >= 20 and len(UNSEEN) == len(COMPOSITIONS) == 10
+    assert set(CLASSES + UNSEEN) <= set(OBJECTS) and not set(CLASSES) & set(UNSEEN)
     names = studio_objects.read_synonyms(SMALL)
     assert list(names) == list(CLASSES)
     assert all(2 <= len(names[name]) <= 5 and names[name][0] == name for name in CLASSES)
@@ -66,12 +67,12 @@ def test_the_prior_has_class_names_and_held_out_names_as_whole_words():
     assert longest <= 24
 
 
-def test_held_out_classes_are_compositions_that_the_grammar_has():
+def test_compositions_are_those_that_the_grammar_has():
     grammar = {composition.name: composition for composition in all_compositions()}
     assert len(grammar) == len(all_compositions()) == 2 * len(NOUNS) * (len(NOUNS) - 1)
-    assert set(HELD_OUT) <= set(grammar) and all(parse_composition(name) == grammar[name] for name in HELD_OUT)
+    assert all(parse_composition(name) == grammar[name] for name in COMPOSITIONS)
     # Two of them differ in nothing but the arrangement.
-    assert {"star on house", "house with star"} <= set(HELD_OUT)
+    assert {"star on house", "house with star"} <= set(COMPOSITIONS)
 
 
 @pytest.mark.parametrize(
@@ -131,16 +132,11 @@ def test_ordinary_classes_are_learnt_tested_and_sampled():
     assert recordings[0].recording_id == "train/airplane_00000" and recordings[0].sensor_size == (64, 64)
 
 
-def test_zero_shot_learns_no_composition_and_tests_and_samples_nothing_else():
-    options = SMALL.model_copy(update={"zero_shot": True})
-    assert {r.class_name for r in of_split("train", options)} == set(CLASSES)
-    for split in ("test", "condition"):
-        assert [r.class_name for r in of_split(split, options)] == list(HELD_OUT)
-    # The few-shot run of the same classes tests on the same recordings.
-    few_shot = SMALL.model_copy(update={"classes": HELD_OUT})
-    assert of_split("test", few_shot) == of_split("test", options)
-    recording = of_split("test", options)[2]
-    assert same_events(studio_objects.read_events(recording, options), studio_objects.read_events(recording, few_shot))
+def test_held_out_classes_are_there_only_when_asked_for():
+    assert not {r.class_name for r in studio_objects.list_recordings(SMALL)} & set(HELD_OUT)
+    options = SMALL.model_copy(update={"classes": HELD_OUT})
+    for split in ("train", "test", "condition"):
+        assert list(dict.fromkeys(r.class_name for r in of_split(split, options))) == list(HELD_OUT)
 
 
 def test_a_recording_depends_on_nothing_but_seed_split_class_and_index():
@@ -149,7 +145,7 @@ def test_a_recording_depends_on_nothing_but_seed_split_class_and_index():
     with ThreadPoolExecutor(3) as threads:
         together = list(threads.map(lambda recording: studio_objects.read_events(recording, SMALL), chosen[::-1]))
     assert all(same_events(a, b) for a, b in zip(alone, together[::-1], strict=True))
-    other = SMALL.model_copy(update={"classes": ("shoe", "cat"), "num_train_per_class": 9, "zero_shot": False})
+    other = SMALL.model_copy(update={"classes": ("shoe", "cat"), "num_train_per_class": 9})
     assert same_events(studio_objects.read_events(chosen[0], other), alone[0])
     reseeded = SMALL.model_copy(update={"seed": 1})
     assert not same_events(studio_objects.read_events(chosen[0], reseeded), alone[0])
@@ -159,7 +155,7 @@ def test_a_recording_depends_on_nothing_but_seed_split_class_and_index():
     )
 
 
-@pytest.mark.parametrize("class_name", ["airplane", "key", "umbrella", *HELD_OUT[:3]])
+@pytest.mark.parametrize("class_name", ["airplane", "key", "umbrella", *UNSEEN, *COMPOSITIONS[:3]])
 @pytest.mark.parametrize("motion", ["saccades", "square", "circle", "drift"])
 def test_events_and_labels_keep_their_contracts(class_name, motion):
     options = Options(classes=(class_name,), num_train_per_class=1, motion=motion)
@@ -266,7 +262,6 @@ def test_a_sensor_may_come_from_a_file(tmp_path):
         ({"sensor_preset": "loud"}, f"expected one of {', '.join(PRESETS)}, or a file"),
         ({"classes": ("cat", "unicorn")}, "no class 'unicorn'; there are: airplane"),
         ({"classes": ("cat", "cat")}, "a class is named twice"),
-        ({"zero_shot": True, "classes": ("cat",)}, "zero_shot needs classes to learn from and some of bird on car"),
         ({"object_size": (0.9, 0.5)}, "the lower first"),
         ({"motion": "jump"}, "saccades"),
         ({"sensor_size": (8, 64)}, "greater than or equal to 16"),
