@@ -101,8 +101,7 @@ class FineTuningOptions(TrainingOptions):
         default=100.0,
         gt=0,
         description="highest weight of the error of a network that predicts the latents, whose weight snr + 1 grows "
-        "without bound at little noise, where lone events are decided, and which cells of a moving edge sent some; what "
-        "is decided at much noise the prior knows",
+        "without bound at little noise: there lone events are decided; what is decided at much noise the prior knows",
     )
     prompt_dropout: float = Field(
         default=0.0, ge=0, le=1, description="share of empty prompts, needed only for guidance_scale > 1"

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from report_artefacts import SETTINGS, Experiment
 
+from ctlev_core.datasets import studio_objects
 from ctlev_core.plugins import PluginError, load_options
 from ctlev_core.report.html import Animation, Curves, ImageGrid, Step
 from ctlev_core.report.report_files import publish_report
@@ -219,7 +220,9 @@ def test_the_demo_trains_once_what_its_experiments_share():
     for name in ("dataset", "windows", "encoding", "condition", "generator", "feature_extractor", "seed"):
         assert getattr(objects, name) == getattr(zero_shot, name)
     assert objects.feature_extractor == objects.downstream
-    assert set(zero_shot.target.options["classes"]).isdisjoint(objects.dataset.options.get("classes", ()))
+    learnt = studio_objects.list_recordings(studio_objects.Options(**objects.dataset.options))
+    assert {recording.class_name for recording in learnt}.isdisjoint(zero_shot.target.options["classes"])
+    assert len(zero_shot.target.options["classes"]) == 10
 
 
 @pytest.mark.parametrize(
