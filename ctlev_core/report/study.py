@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,6 +13,7 @@ from ctlev_core.report.score_tables import PairedScores, cell_text, score_tables
 from ctlev_core.report.speed_summary import SpeedSummary
 from ctlev_core.report.summary import Figure, Summary
 from ctlev_core.report.tables import Cell, Table
+from ctlev_core.report.verdict import made_better
 
 Row = dict[str, Any]
 _QUESTIONS = (
@@ -73,8 +75,25 @@ class Part:
 
 
 def study_verdict(parts: Sequence[Part]) -> str:
-    """A paragraph for each experiment that trained on synthetic frames."""
-    return "\n\n".join(f"{part.heading}: {part.summary.verdict}" for part in parts if part.compares)
+    """In a sentence what adding synthetic frames did; then a paragraph for each experiment that trained on them."""
+    paragraphs = [f"{part.heading}: {part.summary.verdict}" for part in parts if part.compares]
+    return "\n\n".join([*_in_short(parts), *paragraphs])
+
+
+def _in_short(parts: Sequence[Part]) -> list[str]:
+    """One sentence, where two experiments or more can say by their intervals whether synthetic frames helped."""
+    found: dict[bool | None, list[str]] = {True: [], False: [], None: []}
+    for part in parts:
+        metric = next((row["metric"] for row in trained_rows(part.rows)), "")
+        difference = part.paired.difference("real", "real+synthetic", metric)
+        if difference is not None and not math.isnan(difference.low):
+            found[made_better(difference, metric)].append(part.heading)
+    total = sum(len(headings) for headings in found.values())
+    if total < 2:
+        return []
+    told = ((True, "helped"), (False, "did harm"), (None, "made no difference that can be told"))
+    clauses = [f"{what} in {len(found[key])} of {total}: {', '.join(found[key])}" for key, what in told if found[key]]
+    return [f"In short, by 95 % intervals, adding synthetic frames to real ones {'; it '.join(clauses)}."]
 
 
 def study_tables(parts: Sequence[Part]) -> list[list[Table]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctlev_core.paired_differences import Difference
 
-__all__ = ["Difference", "lower_is_better", "verdict"]
+__all__ = ["Difference", "lower_is_better", "made_better", "verdict"]
 from data_contracts.experiment import LABELS_OF, SHUFFLED
 
 _LOWER = ("mpjpe", "pve", "fd_", "fid", "kid", "error", "calibration_error")
@@ -19,6 +19,11 @@ _LOWER = ("mpjpe", "pve", "fd_", "fid", "kid", "error", "calibration_error")
 def lower_is_better(metric: str) -> bool:
     """Errors and distances want to be small; shares want to be large."""
     return metric.startswith(_LOWER)
+
+
+def made_better(difference: Difference, metric: str) -> bool | None:
+    """Whether a change of a score is one for the better; None where its interval does not say."""
+    return (difference.value < 0) == lower_is_better(metric) if difference.is_certain else None
 
 
 def verdict(
@@ -86,7 +91,7 @@ def _what_it_did(difference: Difference, metric: str, real: float, what: str = "
     text = f"paired difference {difference.text()}"
     if not difference.is_certain:
         return f"Whether {doing} helped is undecided: {text}."
-    better = (difference.value < 0) == lower_is_better(metric)
+    better = made_better(difference, metric)
     share = f", {abs(difference.value / real):.0%} of what real data alone gives" if real else ""
     return f"{what} made it {'better' if better else 'worse'}: {text}{share}."
 
@@ -105,7 +110,7 @@ def _beside(name: str, value: float, difference: Difference, metric: str) -> str
         return f"{sentence}."
     if not difference.is_certain:
         return f"{sentence}; which is better is undecided: {difference.text()}."
-    better = (difference.value < 0) == lower_is_better(metric)
+    better = made_better(difference, metric)
     return f"{sentence}; its own are {'better' if better else 'worse'}: {difference.text()}."
 
 

@@ -11,6 +11,7 @@ import yaml
 from report_artefacts import SETTINGS, Experiment
 
 from ctlev_core.datasets import studio_objects
+from ctlev_core.paired_differences import Difference
 from ctlev_core.plugins import PluginError, load_options
 from ctlev_core.report.html import Animation, Curves, ImageGrid, Step
 from ctlev_core.report.report_files import publish_report
@@ -139,6 +140,37 @@ def test_an_experiment_that_trains_on_nothing_synthetic_shows_samples_and_figure
         told = settings != ["real"]
         assert bool(tables[0]) == told == any("Paper, Table 2" in title for title in titles)
         assert ("the verdict" in study_verdict(parts)) == told
+
+
+def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
+    class Paired:
+        def __init__(self, *found):
+            self.found = found
+
+        def difference(self, before, after, metric):
+            assert (before, after) == ("real", "real+synthetic")
+            return Difference(*self.found) if self.found else None
+
+    def part(name, metric, *found):
+        rows = [{"metric": metric, "setting": "real", "task": "test", "group": "all"}]
+        return Part(name, rows, ["real", "real+synthetic"], [], Paired(*found), Summary("told.", [], None, []))
+
+    parts = [
+        part("a", "mpjpe2d_px", -0.3, -0.5, -0.1),  # an error that fell
+        part("b", "accuracy", 0.1, 0.05, 0.15),  # a share that rose
+        part("c", "accuracy", -0.1, -0.15, -0.05),
+        part("d", "mpjpe3d_mm", -3.0, -9.0, 3.0),
+        part("e", "mpjpe2d_px", -0.3, float("nan"), float("nan")),  # too few recordings for an interval
+        part("f", "accuracy"),
+    ]
+    first, *others = study_verdict(parts).split("\n\n")
+    assert first == (
+        "In short, by 95 % intervals, adding synthetic frames to real ones helped in 2 of 4: 2D pose (`a`), Object "
+        "recognition (`b`); it did harm in 1 of 4: Object recognition (`c`); it made no difference that can be told in "
+        "1 of 4: 3D body (`d`)."
+    )
+    assert len(others) == 6 and others[0] == "2D pose (`a`): told."
+    assert study_verdict(parts[3:]) == "\n\n".join(others[3:])  # one alone needs no summing up
 
 
 def test_distances_stand_beside_each_other_by_experiment(reports):
