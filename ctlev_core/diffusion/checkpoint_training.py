@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import torch
 from ctlev_core.diffusion.finetuning import Tune, fine_tune, forget_weights
 from ctlev_core.diffusion.prior import choose_device, load_prior, save_prior
 from ctlev_core.diffusion.ranks import ALONE, Ranks
+from ctlev_core.diffusion.sharding import check_sharding, gather_networks, shard_networks
 from ctlev_core.diffusion.trainer import TrainingHistory
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from ctlev_core.diffusion.training_processes import run_rank, train_in_processes
@@ -68,6 +70,10 @@ def train_checkpoint(
         "made_by": None if conditions.made_by is None else conditions.made_by.model_dump(),
     }
     count = options.num_processes or int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    launched_so = os.environ.get("ACCELERATE_USE_FSDP", "false").lower() == "true"
+    job["fsdp"] = count > 1 and (launched_so if options.fsdp is None else options.fsdp)
+    if job["fsdp"]:
+        check_sharding(options)
     if count == 1:
         return _train(frames, conditions, options, job, ALONE, choose_device(options.device))
     Ranks(0, count).batches(options.gradient_accumulation)  # raises before processes are started
@@ -91,6 +97,9 @@ def _train(
     prior = load_prior(options.prior, controlnet=controlnet, with_controlnet=job["with_controlnet"], device=device)
     if options.random_init:
         prior = forget_weights(prior, job["seed"])
+    if job["fsdp"]:
+        shard_networks(prior)
+        ranks = replace(ranks, sharded=True)
     history = fine_tune(
         prior,
         frames,
@@ -102,8 +111,9 @@ def _train(
         class_names=job["class_names"],
         ranks=ranks,
     )
-    if ranks.rank == 0:
-        save_prior(prior, Path(job["out"]))
+    written = gather_networks(prior, keep=ranks.rank == 0) if ranks.sharded else prior
+    if ranks.rank == 0 and written is not None:
+        save_prior(written, Path(job["out"]))
     return history
 
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 
+T = TypeVar("T")
 MESSAGE_VALUES = 8_000_000
 """Gradients sent at a time, at most: 32 MB. A message for each of hundreds of small weights cost a third of a step on
 two cores; a single one would copy all gradients of a network of Stable Diffusion's size."""
@@ -18,10 +20,17 @@ two cores; a single one would copy all gradients of a network of Stable Diffusio
 
 @dataclass(frozen=True)
 class Ranks:
-    """One of `count` processes that train together; number 0 alone writes files and shows progress."""
+    """One of `count` processes that train together; number 0 alone writes files and shows progress.
+
+    Attributes:
+        rank: number of the process.
+        count: of the processes.
+        sharded: each holds a part of the weights, see `sharding.py`; gradients are then summed on their way.
+    """
 
     rank: int = 0
     count: int = 1
+    sharded: bool = False
 
     def batches(self, gradient_accumulation: int) -> range:
         """The batches of a step that are this process's.
@@ -40,7 +49,7 @@ class Ranks:
         """Add up the gradients of all processes, in place, and the losses, which are returned."""
         if self.count == 1:
             return loss
-        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        gradients = [] if self.sharded else [each.grad for each in parameters if each.grad is not None]
         for together in _messages(gradients):
             message = torch.cat([gradient.flatten() for gradient in together])
             torch.distributed.all_reduce(message)
@@ -51,11 +60,11 @@ class Ranks:
         torch.distributed.all_reduce(summed)
         return summed.item()
 
-    def agreed(self, values: tuple[float, float]) -> tuple[float, float]:
-        """The values of process 0: whether to stop must not hang on rounding that differs between devices."""
+    def agreed(self, value: T) -> T:
+        """The value of process 0: whether to stop must not hang on clocks or on rounding that differs."""
         if self.count == 1:
-            return values
-        shared: list[tuple[float, float]] = [values]
+            return value
+        shared = [value]
         torch.distributed.broadcast_object_list(shared, src=0)
         return shared[0]
 

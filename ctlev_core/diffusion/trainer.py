@@ -11,8 +11,10 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.distributed.tensor import DTensor
 
 from ctlev_core.diffusion.muon import Muon
+from ctlev_core.diffusion.sharding import part_of, part_of_optimizer, whole
 from ctlev_core.diffusion.training_options import TrainingOptions
 from ctlev_core.training_state import read_training_state, write_training_state
 from data_contracts.errors import TrainingError
@@ -103,7 +105,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = options.learning_rate * warmup * decay
         self.scaler.unscale_(self.optimizer)
-        self.gradient_norm = torch.nn.utils.clip_grad_norm_(self.parameters, options.max_gradient_norm).item()
+        self.gradient_norm = whole(torch.nn.utils.clip_grad_norm_(self.parameters, options.max_gradient_norm)).item()
         finite = math.isfinite(self.gradient_norm)
         if finite:
             self.scaler.step(self.optimizer)
@@ -166,8 +168,11 @@ class Trainer:
         _copy_into(self.parameters, self.average if self.best is None else self.best)
         return self.history
 
-    def save(self, path: Path) -> None:
-        """Write everything needed to go on, atomically."""
+    def save(self, path: Path, *, write: bool = True) -> None:
+        """Write everything needed to go on, atomically; the same whether weights are shared out or not.
+
+        Where they are, all processes must call this, and one of them writes.
+        """
         state = {
             "identity": self.identity,
             "step": self.step,
@@ -182,7 +187,9 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "scaler": self.scaler.state_dict(),
         }
-        write_training_state(path, state)
+        state = whole(state, keep=write)
+        if write:
+            write_training_state(path, state)
 
     def restore(self, path: Path) -> None:
         """Go on from a saved state.
@@ -190,21 +197,25 @@ class Trainer:
         Raises:
             TrainingError: the state is of another run or cannot be read.
         """
-        state = read_training_state(path, self.parameters[0].device)
+        first = self.parameters[0]
+        state = read_training_state(path, "cpu" if isinstance(first, DTensor) else first.device)
         if state["identity"] != self.identity:
             raise TrainingError(
                 f"{path}: saved training state is of another run, delete it to start anew; "
                 f"expected {self.identity}, got {state['identity']}"
             )
-        _copy_into(self.parameters, state["parameters"])
-        self.average = list(state["average"])
-        self.best = state.get("best")
-        self.optimizer.load_state_dict(state["optimizer"])
+        _copy_into(self.parameters, self._parts_of(state["parameters"]))
+        self.average = self._parts_of(state["average"])
+        self.best = None if state.get("best") is None else self._parts_of(state["best"])
+        self.optimizer.load_state_dict(part_of_optimizer(state["optimizer"], self.parameters))
         self.scaler.load_state_dict(state.get("scaler", {}))
         self.history = TrainingHistory(**state["history"])
         self.step, self.seconds, self.skipped = state["step"], state["seconds"], state["skipped"]
         self.non_finite = state.get("non_finite", 0)
         self.losses = state["losses"]
+
+    def _parts_of(self, values: Sequence[Tensor]) -> list[Tensor]:
+        return [part_of(value, parameter) for value, parameter in zip(values, self.parameters, strict=True)]
 
 
 def _lowest(losses: Sequence[float]) -> int:

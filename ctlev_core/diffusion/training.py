@@ -107,13 +107,13 @@ def run_training(
             if validate and trainer.step % options.validation_every == 0 and trainer.step < options.num_steps:
                 _validate(trainer, validate, log, ranks)
             _draw(trainer, draw, log, ranks)
-            if ranks.rank == 0 and time.monotonic() - saved > options.checkpoint_every_s:
-                trainer.save(state)
+            due = time.monotonic() - saved > options.checkpoint_every_s
+            if ranks.agreed(due) if ranks.sharded else due:
+                _save(trainer, state, ranks)
                 saved = time.monotonic()
         if validate and trainer.history.validation_step[-1:] != [trainer.step]:
             _validate(trainer, validate, log, ranks)
-    if ranks.rank == 0:
-        trainer.save(state)
+    _save(trainer, state, ranks)
     return trainer.finish()
 
 
@@ -175,9 +175,15 @@ def _validate(trainer: Trainer, validate: Callable[[], tuple[float, float]], log
     log.scalars(trainer.step, **{f"loss/{name}": value for name, value in curves.items()})
 
 
+def _save(trainer: Trainer, path: Path, ranks: Ranks) -> None:
+    """Process 0 writes; where weights are shared out, the others hand over their parts."""
+    if ranks.rank == 0 or ranks.sharded:
+        trainer.save(path, write=ranks.rank == 0)
+
+
 def _draw(trainer: Trainer, draw: Callable[[], np.ndarray] | None, log: TrainingLog, ranks: Ranks) -> None:
     every = trainer.options.sample_every
-    if draw is not None and every and trainer.step % every == 0 and ranks.rank == 0:
+    if draw is not None and every and trainer.step % every == 0 and (ranks.rank == 0 or ranks.sharded):
         # Sampling swaps a part of the ControlNet and has other shapes: to compile that anew would take minutes.
         with trainer.using_average(), torch.compiler.set_stance("force_eager"):
             log.picture(trainer.step, draw())

@@ -144,3 +144,9 @@ class FineTuningOptions(TrainingOptions):
         description="processes, each with a GPU of its own where there are any, that share the `gradient_accumulation` "
         "batches of a step evenly; null = as many as `accelerate launch` or `torchrun` started, else 1",
     )
+    fsdp: bool | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="share out weights, gradients and moments over `num_processes` (fully sharded data parallelism): "
+        "less memory of each GPU for more traffic between them; null = as `accelerate launch` was told",
+    )

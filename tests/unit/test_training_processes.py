@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_prior import make_data, make_prior
 
+from ctlev_core.diffusion import training
 from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 from ctlev_core.diffusion.prior import load_prior, save_prior
 from ctlev_core.diffusion.ranks import Ranks
@@ -51,26 +52,70 @@ def test_every_batch_of_a_step_is_one_processs(count, share):
     assert {len(each) for each in shares} == {share}
 
 
-@pytest.mark.usefixtures("one_thread")
-def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder):
-    alone = trained(tmp_path / "alone", prior_folder, OPTIONS)
-    together = trained(tmp_path / "together", prior_folder, OPTIONS.model_copy(update={"num_processes": 2}))
-    one, two = (load_prior(tmp_path / name / "out") for name in ("alone", "together"))
-    start = load_prior(prior_folder)
+def assert_alike(one, two):
+    """Sums in another order: rounding, 1e-7 of weights of about 1.
+
+    Adam divides by the gradient's size, so that where it is nothing but rounding a single weight goes elsewhere, by
+    less than a step.
+    """
+    difference = (one - two).abs()
+    assert difference.mean() < 1e-6 and difference.max() < OPTIONS.learning_rate / 10
+
+
+def assert_same_run(one, two, start):
+    """The checkpoints in two folders are those of one training that began in a third."""
+    priors = [load_prior(folder) for folder in (one, two, start)]
     for name in ("unet", "controlnet"):
-        states = [getattr(prior, name).state_dict() for prior in (one, two, start)]
+        states = [getattr(prior, name).state_dict() for prior in priors]
         for key, value in states[0].items():
-            # Sums in another order: rounding, 1e-7 of weights of about 1. Adam divides by the gradient's size, so that
-            # where it is nothing but rounding a single weight goes elsewhere, by less than a step.
-            difference = (value - states[1][key]).abs()
-            assert difference.mean() < 1e-6 and difference.max() < OPTIONS.learning_rate / 10, key
+            assert_alike(value, states[1][key])
         assert max((states[0][key] - states[2][key]).abs().max().item() for key in states[0]) > 1e-3
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize(
+    "shared", [{}, {"fsdp": True, "sample_every": 2}, {"fsdp": True, "gradient_checkpointing": True}]
+)
+def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder, shared):
+    alone = trained(tmp_path / "alone", prior_folder, OPTIONS)
+    together = trained(tmp_path / "together", prior_folder, OPTIONS.model_copy(update={"num_processes": 2, **shared}))
+    assert_same_run(tmp_path / "alone" / "out", tmp_path / "together" / "out", prior_folder)
     assert together.step == alone.step and together.kept_step == alone.kept_step
     for name in ("loss", "validation_loss", "shuffled_loss"):
         np.testing.assert_allclose(getattr(together, name), getattr(alone, name), rtol=1e-4)
+    assert len(list((tmp_path / "together" / "work" / "samples").glob("*.png"))) == (
+        2 if "sample_every" in shared else 0
+    )
     # The state is that of the run, not of its processes: one alone takes it up, and finds it finished.
+    states = [torch.load(tmp_path / name / "work" / "state.pt", weights_only=True) for name in ("alone", "together")]
+    for name in ("parameters", "average", "best"):
+        for one, two in zip(states[0][name], states[1][name], strict=True):
+            assert_alike(one, two)
+    for index, moments in states[0]["optimizer"]["state"].items():
+        for name, value in moments.items():
+            assert_alike(value, states[1]["optimizer"]["state"][index][name])
     again = trained(tmp_path / "together", prior_folder, OPTIONS)
     assert vars(again) == vars(together)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_parts_of_weights_go_on_from_whole_ones(tmp_path, prior_folder, monkeypatch):
+    """One process is killed in its third step; two that share out the weights end where it would have."""
+    trained(tmp_path / "alone", prior_folder, OPTIONS)
+    loss = training.denoising_loss
+    calls = iter(range(2 * OPTIONS.gradient_accumulation))
+
+    def killed(*arguments):
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return loss(*arguments)
+
+    monkeypatch.setattr(training, "denoising_loss", killed)
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "resumed", prior_folder, OPTIONS.model_copy(update={"checkpoint_every_s": 1e-9}))
+    assert torch.load(tmp_path / "resumed" / "work" / "state.pt", weights_only=True)["step"] == 2
+    trained(tmp_path / "resumed", prior_folder, OPTIONS.model_copy(update={"num_processes": 2, "fsdp": True}))
+    assert_same_run(tmp_path / "alone" / "out", tmp_path / "resumed" / "out", prior_folder)
 
 
 @pytest.mark.slow
@@ -89,6 +134,9 @@ def test_failure_of_a_process_is_reported(tmp_path):
     [
         ({"num_processes": 3}, "gradient_accumulation must be a multiple of the 3 processes.*got 4; halve batch_size"),
         ({"num_processes": 2, "device": "cuda:1"}, "device must be auto, cuda or cpu with 2 processes.*got 'cuda:1'"),
+        ({"num_processes": 2, "fsdp": True, "optimizer": "muon"}, "fsdp needs optimizer=adamw, got muon"),
+        ({"num_processes": 2, "fsdp": True, "compile_networks": True}, "fsdp needs compile_networks=False, got True"),
+        ({"num_processes": 2, "fsdp": True, "precision": "float16"}, "fsdp needs precision float32 or bfloat16"),
     ],
 )
 def test_what_processes_cannot_share_is_refused_before_they_start(tmp_path, prior_folder, changed, message):
@@ -102,6 +150,16 @@ def test_an_outer_launcher_says_how_many(tmp_path, prior_folder, monkeypatch):
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
     with pytest.raises(ValueError, match="a multiple of the 3 processes"):
         trained(tmp_path, prior_folder, OPTIONS)
+
+
+def test_an_outer_launcher_says_whether_weights_are_shared_out(tmp_path, prior_folder, monkeypatch):
+    """`accelerate launch --use_fsdp`, or an `accelerate config` that chose it, leaves that in the environment."""
+    monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
+    options = OPTIONS.model_copy(update={"num_processes": 2, "optimizer": "muon"})
+    with pytest.raises(ValueError, match="fsdp needs optimizer=adamw"):
+        trained(tmp_path, prior_folder, options)
+    with pytest.raises(ValueError, match="a multiple of the 3 processes"):  # a preset that says no is heeded
+        trained(tmp_path, prior_folder, options.model_copy(update={"fsdp": False, "num_processes": 3}))
 
 
 def test_children_hear_nothing_of_an_outer_launcher():
