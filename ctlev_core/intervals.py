@@ -7,6 +7,7 @@ Source: Davison & Hinkley, Bootstrap Methods and their Application, 1997, sectio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +18,25 @@ MIN_RECORDINGS = 5
 """With fewer test recordings a bootstrap over them says too little: the tables then give no interval."""
 
 _CHUNK_NUMBERS = 4_000_000
+
+
+def score_text(value: float, low: float | None = None, high: float | None = None, *, signed: bool = False) -> str:
+    """For a sentence or a cell: `6.541 [5.932, 7.217]`, `-25.3 [-38.1, -13.2]`, or the value alone.
+
+    Args:
+        value: a score or a difference of scores.
+        low: lower end of its interval; None or NaN = unknown.
+        high: its upper end.
+        signed: with a sign above zero, too.
+    Returns:
+        Four significant digits of the largest of them, at most three decimals: more is not known of any score.
+    """
+    known = low is not None and high is not None and not math.isnan(low)
+    numbers = (value, low, high) if known else (value,)
+    largest = max(abs(number) for number in numbers if number is not None)
+    decimals = 3 if not math.isfinite(largest) else min(3, max(0, 4 - len(f"{largest:.0f}")))
+    shown = [f"{number:{'+' if signed else ''}.{decimals}f}" for number in numbers]
+    return f"{shown[0]} [{shown[1]}, {shown[2]}]" if known else shown[0]
 
 
 def bootstrap_interval(

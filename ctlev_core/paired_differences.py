@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.intervals import MIN_RECORDINGS
+from ctlev_core.intervals import MIN_RECORDINGS, score_text
 
 NUM_RESAMPLES = 4000
 _CHUNK_NUMBERS = 4_000_000
@@ -36,10 +36,9 @@ class Difference:
         """Does the interval exclude zero?"""
         return self.low > 0 or self.high < 0
 
-    def text(self, digits: int = 3) -> str:
+    def text(self) -> str:
         """For a table cell: `-0.412 [-0.533, -0.291]`, or the value alone."""
-        shown = f"{self.value:+.{digits}f}"
-        return shown if math.isnan(self.low) else f"{shown} [{self.low:+.{digits}f}, {self.high:+.{digits}f}]"
+        return score_text(self.value, self.low, self.high, signed=True)
 
 
 @dataclass(frozen=True, eq=False)

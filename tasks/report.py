@@ -48,7 +48,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=13, schema=tables.REPORT)
+@stage(version=14, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,

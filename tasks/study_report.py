@@ -29,7 +29,7 @@ from data_contracts.study import SPEED_VS_ERROR
 from tasks.stage import Output, stage
 
 
-@stage(version=3, schema=tables.REPORT)
+@stage(version=4, schema=tables.REPORT)
 def study_report(
     out: Output,
     reports: list[Manifest],

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ctlev_core.copy_check import CLOSEST_PAIRS
+from ctlev_core.intervals import score_text
 from ctlev_core.report.html import ImageGrid, Section, Table
 from data_contracts.manifest import Manifest
 
@@ -57,4 +58,4 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
 def _text(row: dict[str, Any]) -> str:
     if row["metric"] == "duplicates":
         return f"{row['value']:.0f}"
-    return f"{row['value']:.3f}" + ("" if row["low"] is None else f" [{row['low']:.3f}, {row['high']:.3f}]")
+    return score_text(row["value"], row["low"], row["high"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ctlev_core.feature_distances import DISTANCE_ESTIMATES
+from ctlev_core.intervals import score_text
 from ctlev_core.report.tables import Cell, Table
 from data_contracts.manifest import Manifest
 
@@ -25,9 +26,9 @@ def floor_tables(scores: Sequence[Manifest]) -> list[Table]:
         for row in manifest.attached(DISTANCE_ESTIMATES).to_pylist():
             floor = None
             if row["floor"] is not None:
-                floor = f"{row['floor']:.3f} [{row['floor_low']:.3f}, {row['floor_high']:.3f}]"
-            halved = None if row["halved"] is None else f"{row['halved']:.3f}"
+                floor = score_text(row["floor"], row["floor_low"], row["floor_high"])
+            halved = None if row["halved"] is None else score_text(row["halved"])
             counts = [row[name] for name in ("num_predicted", "num_target", "num_features")]
-            body.append([row["setting"], row["metric"], f"{row['value']:.3f}", halved, floor, *counts])
+            body.append([row["setting"], row["metric"], score_text(row["value"]), halved, floor, *counts])
     columns = ["frames", "score", "all", "halves", "halves of real frames", "number", "real frames", "features"]
     return [Table("How to read the distances", columns, body, caption=_CAPTION)] if body else []

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from ctlev_core.intervals import score_text
 from ctlev_core.paired_differences import Difference, Trainings, paired_difference, read_trainings
 from ctlev_core.report.tables import Cell, Table
-from ctlev_core.report.verdict import lower_is_better
+from ctlev_core.report.verdict import in_words, lower_is_better
 from data_contracts.experiment import LABELS_OF, SHUFFLED
 
 Row = dict[str, Any]
@@ -23,16 +24,6 @@ ORIGINS = "classes with"
 """Groups that begin so are classes by where they were to be learnt from."""
 SUBJECTS = ("subject ", "subjects ")
 """Groups that begin so are one subject, or subjects by whether they were learnt from."""
-_METRICS = {
-    "mpjpe2d": "mean distance between predicted and true joints in the image, in pixels",
-    "mpjpe3d": "mean distance between predicted and true joints in space, in millimetres",
-    "pve": "mean distance between predicted and true points of the body's surface, in millimetres",
-    "pck": "share of joints predicted within the limit it names",
-    "auc": "share of joints within a limit, averaged over limits",
-    "oks_ap": "share of poses whose similarity to the truth reaches the limit it names",
-    "accuracy": "share of frames whose class is told right",
-    "binary_accuracy": "share told right where a class is told from the others, half of the frames its own",
-}
 _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
 _ENOUGH = 5
 """Trainings of a setting from which their spread is known well enough to say no more about it."""
@@ -190,11 +181,13 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
         "interval of the difference says that compares sample by sample."
     )
     notes = [f"`{name}`: {text}" for name, text in _SETTINGS.items() if any(name in s.split("+") for s in settings)]
-    explained = {text: name for name in metrics for start, text in _METRICS.items() if name.startswith(start)}
+    explained = {in_words(name): name for name in metrics if in_words(name)}
     notes += [f"`{name}`: {text}" for text, name in explained.items()]
     if any("@" in setting for setting in settings):
         notes.append("`synthetic@SHARE`: the first part of the synthetic frames")
-    notes += [f"`{name}`: {value:.3f}" for name, value in {row["metric"]: row["value"] for row in chance}.items()]
+    notes += [
+        f"`{name}`: {score_text(value)}" for name, value in {row["metric"]: row["value"] for row in chance}.items()
+    ]
     if min(len({_training(row) for row in rows if row["setting"] == setting}) for setting in settings) < _ENOUGH:
         notes.append(
             "Intervals cannot cover the spread between trainings where there is one, and cover it poorly where there "
@@ -258,7 +251,7 @@ def cell_text(rows: Sequence[Row]) -> str:
     if not rows:
         return ""
     value, low, high = interval_over_trainings(rows)
-    return f"{value:.3f}" if math.isnan(low) else f"{value:.3f} [{low:.3f}, {high:.3f}]"
+    return score_text(value, low, high)
 
 
 def interval_over_trainings(rows: Sequence[Row]) -> tuple[float, float, float]:

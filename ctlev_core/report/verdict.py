@@ -8,17 +8,33 @@ from typing import Any
 
 import numpy as np
 
+from ctlev_core.intervals import score_text
 from ctlev_core.paired_differences import Difference
 
 __all__ = ["Difference", "lower_is_better", "made_better", "verdict"]
 from data_contracts.experiment import LABELS_OF, SHUFFLED
 
 _LOWER = ("mpjpe", "pve", "fd_", "fid", "kid", "error", "calibration_error")
+_WORDS = {
+    "mpjpe2d": "mean distance between predicted and true joints in the image, in pixels",
+    "mpjpe3d": "mean distance between predicted and true joints in space, in millimetres",
+    "pve": "mean distance between predicted and true points of the body's surface, in millimetres",
+    "pck": "share of joints predicted within the limit it names",
+    "auc": "share of joints within a limit, averaged over limits",
+    "oks_ap": "share of poses whose similarity to the truth reaches the limit it names",
+    "accuracy": "share of frames whose class is told right",
+    "binary_accuracy": "share told right where a class is told from the others, half of the frames its own",
+}
 
 
 def lower_is_better(metric: str) -> bool:
     """Errors and distances want to be small; shares want to be large."""
     return metric.startswith(_LOWER)
+
+
+def in_words(metric: str) -> str:
+    """What a score of a downstream model is the mean of; empty where its name says it or it is seldom looked at."""
+    return next((text for start, text in _WORDS.items() if metric.startswith(start)), "")
 
 
 def made_better(difference: Difference, metric: str) -> bool | None:
@@ -56,8 +72,9 @@ def verdict(
     own = {name: values[name] for name in ("real", "synthetic", "real+synthetic") if name in values}
     if not own:
         own = {name: values[name] for name in settings if name in values}
-    summary = f"{metric} on held-out real data ({'lower' if lower_is_better(metric) else 'higher'} is better): "
-    summary += ", ".join(f"{setting} {value:.3f}" for setting, value in own.items()) + "."
+    sense = f"{'lower' if lower_is_better(metric) else 'higher'} is better"
+    summary = f"{metric} ({'; '.join(filter(None, (in_words(metric), sense)))}) on held-out real data: "
+    summary += ", ".join(f"{setting} {score_text(value)}" for setting, value in own.items()) + "."
     if "real+synthetic" not in values and instead is not None and {"real", "synthetic"} <= values.keys():
         told = _what_it_did(instead, metric, values["real"], "Training on synthetic data instead of real data")
         return f"{summary} {told} {_labels(values)}".rstrip()
@@ -105,7 +122,7 @@ def _ceiling(gain: Difference, share: Difference | None) -> str:
 
 
 def _beside(name: str, value: float, difference: Difference, metric: str) -> str:
-    sentence = f"With frames of {name} in the place of its own, real+{name} is {value:.3f}"
+    sentence = f"With frames of {name} in the place of its own, real+{name} is {score_text(value)}"
     if math.isnan(difference.low):
         return f"{sentence}."
     if not difference.is_certain:
@@ -119,5 +136,7 @@ def _labels(values: Mapping[str, float]) -> str:
     own, shuffled = (values.get(f"{begin} synthetic") for begin in (LABELS_OF, SHUFFLED))
     if own is None:
         return ""
-    control = "" if shuffled is None else f", and {shuffled:.3f} on them with shuffled labels"
-    return f"The model trained on real frames scores {own:.3f} on synthetic frames against their labels{control}."
+    control = "" if shuffled is None else f", and {score_text(shuffled)} on them with shuffled labels"
+    return (
+        f"The model trained on real frames scores {score_text(own)} on synthetic frames against their labels{control}."
+    )

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, precision_score, recall_score
 
-from ctlev_core.intervals import bootstrap_interval, cluster_bootstrap, compute_spread, ratio_bootstrap
+from ctlev_core.intervals import bootstrap_interval, cluster_bootstrap, compute_spread, ratio_bootstrap, score_text
 from ctlev_core.metrics import classification, frechet, mpjpe2d, oks, pck2d
 from data_contracts.labels import Labels
 
@@ -232,3 +232,22 @@ def test_intervals_of_quotients_are_those_of_resampled_rows():
     assert ratio_bootstrap(sums, np.full(60, "one")) == ({}, {}) == ratio_bootstrap({}, groups)
     nothing = {"never": (np.zeros(60), np.zeros(60))}
     assert ratio_bootstrap(nothing, groups) == ({}, {})
+
+
+@pytest.mark.parametrize(
+    ("numbers", "signed", "text"),
+    [
+        ((6.5412, 5.9318, 7.2171), False, "6.541 [5.932, 7.217]"),
+        ((279.572, 254.748, 306.019), False, "279.6 [254.7, 306.0]"),
+        ((-25.336, -38.124, -13.222), True, "-25.34 [-38.12, -13.22]"),
+        ((0.0312, 0.0061, 0.0562), True, "+0.031 [+0.006, +0.056]"),
+        ((9.99961, 9.0, 9.99961), False, "10.00 [9.00, 10.00]"),
+        ((9.5, 8.0, 10.0), False, "9.50 [8.00, 10.00]"),
+        ((123456.7, None, None), False, "123457"),
+        ((0.0, float("nan"), float("nan")), False, "0.000"),
+        ((float("nan"),), False, "nan"),
+        ((float("inf"), 1.0, float("inf")), False, "inf [1.000, inf]"),
+    ],
+)
+def test_scores_are_told_with_four_digits(numbers, signed, text):
+    assert score_text(*numbers, signed=signed) == text

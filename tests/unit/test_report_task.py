@@ -40,7 +40,7 @@ def test_the_page_says_first_what_data_it_is_then_the_verdict_then_what_was_done
     folded = ("Where the time went", "The paper&#x27;s own numbers, on other data")
     places += [page.index(f"{text}</h2></summary>") for text in folded]
     assert places == sorted(places)
-    for expected in ("real+more_real", "synthetic ones give 50% [", "15.000 on them with shuffled labels"):
+    for expected in ("real+more_real", "synthetic ones give 50% [", "15.00 on them with shuffled labels"):
         assert expected in page
     assert "http://" not in page and "https://" not in page
 

@@ -75,7 +75,7 @@ def test_labels_shuffled_labels_and_distances_have_tables_of_their_own():
     assert [cells[0] for cells in headline.rows] == ["real"]
     names = ["held-out real (floor)", "labels of synthetic", "shuffled labels of synthetic"]
     assert [cells[0] for cells in labels.rows] == names
-    assert distances.rows[1][:2] == ["synthetic", "9.000 [8.000, 10.000]"]
+    assert distances.rows[1][:2] == ["synthetic", "9.00 [8.00, 10.00]"]
 
 
 def test_two_tasks_are_two_tables_and_classes_against_the_rest_a_third():
@@ -172,6 +172,6 @@ def test_the_verdict_says_how_much_of_the_ceiling_was_reached_and_whether_labels
     text = verdict(rows, settings, difference, ceiling=(gain, Difference(0.6, 0.45, 0.75)))
     assert "Adding synthetic data made it better" in text and "9% of what real data alone gives" in text
     assert "synthetic ones give 60% [45%, 75%] of that." in text
-    assert "scores 5.500 on synthetic frames against their labels, and 15.000 on them with shuffled labels." in text
+    assert "scores 5.500 on synthetic frames against their labels, and 15.00 on them with shuffled labels." in text
     unsure = verdict(rows, settings, difference, ceiling=(Difference(-0.1, -0.3, 0.1), None))
     assert "change it by -0.100 [-0.300, +0.100]." in unsure and "of that" not in unsure
