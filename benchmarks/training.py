@@ -19,7 +19,7 @@ import contextlib
 import math
 import statistics
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -32,6 +32,7 @@ from interleaved import Comparison, describe_machine, matmul_flops, measure, now
 from torch.utils.flop_counter import FlopCounterMode
 
 from ctlev_core.diffusion import finetuning, training
+from ctlev_core.diffusion.acceleration import accelerated, autocast
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.prior import Prior, load_prior
 from ctlev_core.diffusion.training_options import FineTuningOptions
@@ -232,6 +233,7 @@ class Networks:
         self._batch: Batch = loop.fetch(0)
         self.device = self._batch.latents.device
         self.dtype = getattr(torch, options.precision)
+        self._options = options.model_copy(update={"compile_networks": False})
 
     def batch(self, count: int) -> Batch:
         """Its first rows."""
@@ -244,7 +246,7 @@ class Networks:
         for network in (self._denoiser.unet, self._denoiser.controlnet):
             if network is not None:
                 network.zero_grad(set_to_none=True)
-        with self._autocast():
+        with accelerated(self._denoiser, self._options, self.device), autocast(self._options, self.device):
             loss = denoising_loss(self._denoiser, self._schedule, batch, generator_for(0, 1))
         loss.backward()
 
@@ -253,11 +255,6 @@ class Networks:
         with FlopCounterMode(display=False) as counter:
             self.run(batch)
         return counter.get_total_flops()
-
-    @contextlib.contextmanager
-    def _autocast(self) -> Iterator[None]:
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype == torch.bfloat16):
-            yield
 
 
 if __name__ == "__main__":

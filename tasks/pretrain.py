@@ -18,7 +18,7 @@ def _start_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     return [] if start is None else files_of([start])
 
 
-@stage(version=2, schema=tables.TRAINING, raw_files=_start_files)
+@stage(version=3, schema=tables.TRAINING, raw_files=_start_files)
 def pretrain_prior(out: Output, *, options: PretrainingOptions) -> pa.Table:
     """Train the small prior on procedural images; the artefact's `prior/` is an ordinary diffusers folder."""
     return history_table(pretrain(options, out.folder / "prior", out.work))

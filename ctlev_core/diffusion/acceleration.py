@@ -30,11 +30,19 @@ def autocast(options: TrainingOptions, device: torch.device) -> AbstractContextM
 def accelerated(denoiser: Denoiser, options: TrainingOptions, device: torch.device) -> Iterator[None]:
     """Within the context the networks keep fewer activations or run compiled, as the options ask.
 
+    On a CPU attention stays in float32.
+
     Frozen networks too: on the way to a ControlNet the gradients pass through the frozen U-Net. Weights keep their
     names, so that saved states and checkpoints are those of plain networks.
     """
     networks = [network for network in (denoiser.unet, denoiser.controlnet) if network is not None]
     compiled = options.compile_networks and compiler_works(device)
+    attention = [network.attn_processors for network in networks]
+    if options.precision == "bfloat16" and device.type == "cpu":
+        from ctlev_core.diffusion.float32_attention import use_float32_attention
+
+        for network in networks:
+            use_float32_attention(network)
     for network in networks:
         if options.gradient_checkpointing:
             network.enable_gradient_checkpointing()
@@ -43,7 +51,8 @@ def accelerated(denoiser: Denoiser, options: TrainingOptions, device: torch.devi
     try:
         yield
     finally:
-        for network in networks:
+        for network, before in zip(networks, attention, strict=True):
+            network.set_attn_processor(before)
             if options.gradient_checkpointing:
                 network.disable_gradient_checkpointing()
             network._compiled_call_impl = None

@@ -21,7 +21,7 @@ from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History
 
-VERSION = 1
+VERSION = 2
 
 
 class Options(FineTuningOptions):

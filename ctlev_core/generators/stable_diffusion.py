@@ -19,7 +19,7 @@ from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.labels import Conditions, History
 
-VERSION = 2
+VERSION = 3
 
 
 class Options(FineTuningOptions):

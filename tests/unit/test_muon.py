@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.diffusion.muon import MATRIX_RATE, Muon, is_matrix, orthogonalised
+from ctlev_core.diffusion.muon import COEFFICIENTS, ITERATIONS, MATRIX_RATE, Muon, is_matrix, orthogonalised
 from ctlev_core.diffusion.training import Trainer
 from ctlev_core.diffusion.training_options import TrainingOptions
 
@@ -27,6 +27,18 @@ def test_orthogonalised_keeps_singular_vectors_and_levels_singular_values(shape,
     # The published range is 0.7 .. 1.2; bfloat16 adds some hundredths, on and off the diagonal.
     assert (np.diag(rotated)[heard] > 0.6).all() and (np.diag(rotated) < 1.3).all()
     assert np.abs(rotated - np.diag(np.diag(rotated))).max() < 0.15
+
+
+@pytest.mark.parametrize("shape", [(64, 576), (96, 96), (768, 96)])
+def test_bfloat16_is_near_to_the_same_iterations_in_float64(shape):
+    """Matrices with singular values over four orders of magnitude; the error is a share of the largest value."""
+    matrix = random_tensor(*shape) * torch.logspace(0, -4, shape[1])
+    x = matrix.double() / matrix.double().norm()
+    a, b, c = COEFFICIENTS
+    for _ in range(ITERATIONS):
+        gram = x @ x.T
+        x = a * x + (b * gram + c * gram @ gram) @ x
+    assert (orthogonalised(matrix[None])[0] - x).abs().max() < 0.04 * x.abs().max()
 
 
 def test_matrices_made_orthogonal_together_are_what_they_are_alone():

@@ -1,5 +1,6 @@
 """Each option of training does what it says, and a killed run ends as an unkilled one whichever are set."""
 
+import copy
 import dataclasses
 import logging
 import math
@@ -14,6 +15,7 @@ from tiny_prior import make_data, make_prior, shared_prior
 from ctlev_core.diffusion import acceleration, finetuning, trainer, training
 from ctlev_core.diffusion.denoising import generator_for
 from ctlev_core.diffusion.finetuning import draw_turns, fine_tune, split_rows
+from ctlev_core.diffusion.float32_attention import use_float32_attention
 from ctlev_core.diffusion.latent_cache import LatentCache, cache_latents, turn_conditions
 from ctlev_core.diffusion.muon import MATRIX_RATE, is_matrix
 from ctlev_core.diffusion.training_options import FineTuningOptions
@@ -296,6 +298,28 @@ def test_gradient_checkpointing_saves_memory_and_changes_nothing(tmp_path):
     assert not any(getattr(module, "gradient_checkpointing", False) for module in checked[3].unet.modules())
     # Within a block nothing is kept, and in these networks blocks are most of it.
     assert checked[0] < 0.6 * plain[0]
+
+
+def test_attention_is_in_float32_on_a_cpu_and_afterwards_as_it_was(tmp_path, monkeypatch):
+    attend, seen = torch.nn.functional.scaled_dot_product_attention, set()
+
+    def record(query, *arguments, **settings):
+        seen.add(query.dtype)
+        return attend(query, *arguments, **settings)
+
+    monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", record)
+    prior, _ = tuned(tmp_path, OPTIONS.model_copy(update={"precision": "bfloat16", "num_steps": 1}), tune="both")
+    assert seen == {torch.float32}
+    for network in (prior.unet, prior.controlnet):
+        assert {type(each).__name__ for each in network.attn_processors.values()} == {"AttnProcessor2_0"}
+    usual, in_float32 = prior.unet, copy.deepcopy(prior.unet)
+    use_float32_attention(in_float32)
+    noisy, prompts = (2, usual.config.in_channels, 8, 8), (2, 7, usual.config.cross_attention_dim)
+    inputs = (torch.randn(noisy), torch.tensor([10, 900]), torch.randn(prompts))
+    with torch.no_grad():
+        assert torch.equal(usual(*inputs).sample, in_float32(*inputs).sample)
+        with torch.autocast("cpu", torch.bfloat16):
+            torch.testing.assert_close(usual(*inputs).sample, in_float32(*inputs).sample, rtol=0, atol=0.05)
 
 
 def test_training_goes_on_without_a_compiler(tmp_path, monkeypatch, caplog):
