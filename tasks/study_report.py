@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.report.html import Links, render_report
+from ctlev_core.report.html import Folded, Links, Text, render_report
 from ctlev_core.report.report_files import LATEX, MARKDOWN, PAGE, published_files
 from ctlev_core.report.score_tables import PairedScores
 from ctlev_core.report.speed_summary import read_speed_summary
@@ -17,9 +17,11 @@ from ctlev_core.report.study import (
     Part,
     speed_sections,
     speed_table,
+    study_overview,
     study_sections,
     study_tables,
     study_verdict,
+    study_words,
 )
 from ctlev_core.report.summary import read_summary
 from ctlev_core.report.tables import render_latex, render_markdown
@@ -29,7 +31,7 @@ from data_contracts.study import SPEED_VS_ERROR
 from tasks.stage import Output, stage
 
 
-@stage(version=4, schema=tables.REPORT)
+@stage(version=5, schema=tables.REPORT)
 def study_report(
     out: Output,
     reports: list[Manifest],
@@ -59,24 +61,32 @@ def study_report(
     ]
     measured = [read_speed_summary(report.ref.path) for report in reports[len(names) :]]
     folders = [*names, *(SPEED_VS_ERROR for _ in measured)]
-    shown, words = study_tables(parts), study_verdict(parts)
+    shown, overview = study_tables(parts), study_overview(parts)
+    verdict, words = study_verdict(parts), study_words(parts)
     links = [(part.heading, f"{title}/{part.name}/{PAGE}") for part in parts]
     links += [(f"Speed against error (`{speed.experiment}`)", f"{title}/{SPEED_VS_ERROR}/{PAGE}") for speed in measured]
     page = render_report(
         title=title,
         lead=notice,
-        verdict=words,
+        verdict=verdict or words,
+        overview=overview,
         steps=parts[0].summary.steps,
         sections=[
             *study_sections(parts, shown),
             *(section for speed in measured for section in speed_sections(parts, speed)),
+            *([Folded("The same in words", [Text("", words)])] if verdict else []),
             Links("Everything else, experiment by experiment", links),
         ],
     )
     (out.folder / PAGE).write_text(page, encoding="utf-8")
-    kept = [table for of_part in shown for table in of_part] + [speed_table(parts, speed) for speed in measured]
+    kept = (
+        [overview]
+        + [table for of_part in shown for table in of_part]
+        + [speed_table(parts, speed) for speed in measured]
+    )
     (out.folder / LATEX).write_text(render_latex(kept, title=title, lead=notice), encoding="utf-8")
-    (out.folder / MARKDOWN).write_text(render_markdown(kept, title=title, lead=notice, verdict=words), encoding="utf-8")
+    told = "\n\n".join(filter(None, (verdict, words)))
+    (out.folder / MARKDOWN).write_text(render_markdown(kept, title=title, lead=notice, verdict=told), encoding="utf-8")
     files = []
     for name, report in zip(folders, reports, strict=True):
         (out.folder / name).mkdir()

@@ -135,6 +135,7 @@ def render_report(
     lead: str,
     verdict: str,
     sections: Sequence[Section | Folded],
+    overview: Table | None = None,
     footer: str = "",
     steps: Sequence[Step] = (),
 ) -> str:
@@ -145,6 +146,7 @@ def render_report(
         lead: first line: what data this is about, and what it must not be compared with.
         verdict: the answer, in a sentence or two.
         sections: in reading order; empty tables, grids and charts say so.
+        overview: the numbers behind the verdict, right below it.
         footer: where the numbers come from.
         steps: what was done, in pictures; below the verdict.
     Returns:
@@ -158,6 +160,7 @@ def render_report(
     )
     contents = f'<nav aria-label="Contents"><ol>{entries}</ol></nav>' if len(sections) > 2 else ""
     body = "\n".join(_numbered(section, number) for number, section in enumerate(sections, 1))
+    numbers = "" if overview is None else f"{_table(overview)}\n"
     foot = f"<footer>{_paragraphs(footer)}</footer>" if footer else ""
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -176,7 +179,7 @@ def render_report(
 <h1>{_inline(title)}</h1>
 <div class="lead">{_paragraphs(lead)}</div>
 <div class="verdict">{_paragraphs(verdict)}</div>
-{_strip(steps)}{contents}
+{numbers}{_strip(steps)}{contents}
 </header>
 {body}
 {foot}

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
+from ctlev_core.paired_differences import Difference
 from ctlev_core.report import paper_numbers
 from ctlev_core.report.html import Folded, Section, Text
 from ctlev_core.report.score_tables import PairedScores, cell_text, score_tables, trained_rows
 from ctlev_core.report.speed_summary import SpeedSummary
 from ctlev_core.report.summary import Figure, Summary
 from ctlev_core.report.tables import Cell, Table
-from ctlev_core.report.verdict import made_better
+from ctlev_core.report.verdict import in_words, lower_is_better, made_better
 
 Row = dict[str, Any]
 _QUESTIONS = (
@@ -23,6 +25,7 @@ _QUESTIONS = (
     ("mpjpe3d", "3D body", paper_numbers.BODY_3D),
 )
 """What an experiment asks, by a score that begins so; the first that any of its scores begins with."""
+_COMPARED = ("real", "synthetic", "real+synthetic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +68,16 @@ class Part:
         """The paper's answer, on other data."""
         return self._asked[1]
 
+    @cached_property
+    def metric(self) -> str:
+        """The score that its verdict is about; empty where nothing was trained."""
+        return next((row["metric"] for row in trained_rows(self.rows)), "")
+
+    @cached_property
+    def difference(self) -> Difference | None:
+        """Trained on real and synthetic frames minus on real ones alone, in that score."""
+        return self.paired.difference("real", "real+synthetic", self.metric)
+
     @property
     def _asked(self) -> tuple[str, Table | None]:
         metrics = [row["metric"] for row in trained_rows(self.rows)]
@@ -74,26 +87,53 @@ class Part:
         return self.name, None
 
 
+def study_words(parts: Sequence[Part]) -> str:
+    """A paragraph for each experiment that trained on synthetic frames."""
+    return "\n\n".join(f"{part.heading}: {part.summary.verdict}" for part in parts if part.compares)
+
+
+def study_overview(parts: Sequence[Part]) -> Table:
+    """A row for each experiment that trained on synthetic frames: its first score without them, of them, and with."""
+    body: list[list[Cell]] = []
+    bold: set[tuple[int, int]] = set()
+    explained: dict[str, str] = {}
+    for part in parts:
+        if not part.compares:
+            continue
+        rows = [row for row in trained_rows(part.rows) if row["group"] == "all" and row["metric"] == part.metric]
+        by_setting = {name: [row for row in rows if row["setting"] == name] for name in _COMPARED}
+        difference = part.difference
+        if difference is not None and difference.is_certain:
+            bold.add((len(body), 5))
+            if made_better(difference, part.metric):
+                bold.add((len(body), 4))
+        told = "" if difference is None else difference.text()
+        direction = "↓" if lower_is_better(part.metric) else "↑"
+        body.append([part.heading, f"{part.metric} {direction}", *map(cell_text, by_setting.values()), told])
+        if in_words(part.metric):
+            explained[part.metric] = in_words(part.metric)
+    caption = (
+        "Models trained on labelled real frames, on synthetic ones and on both, all tested on real frames that nothing "
+        "was trained on; ↓ less is better, ↑ more is. In brackets 95 % intervals. Bold: differences, frame by frame, "
+        "whose interval excludes 0, and scores that are better for it."
+    )
+    columns = ["experiment", "score", "real", "synthetic", "both", "both minus real"]
+    notes = [f"`{metric}`: {words}" for metric, words in explained.items()]
+    return Table("Do synthetic frames help?", columns, body, caption=caption, bold=bold, footnotes=notes)
+
+
 def study_verdict(parts: Sequence[Part]) -> str:
-    """In a sentence what adding synthetic frames did; then a paragraph for each experiment that trained on them."""
-    paragraphs = [f"{part.heading}: {part.summary.verdict}" for part in parts if part.compares]
-    return "\n\n".join([*_in_short(parts), *paragraphs])
-
-
-def _in_short(parts: Sequence[Part]) -> list[str]:
     """One sentence, where two experiments or more can say by their intervals whether synthetic frames helped."""
     found: dict[bool | None, list[str]] = {True: [], False: [], None: []}
     for part in parts:
-        metric = next((row["metric"] for row in trained_rows(part.rows)), "")
-        difference = part.paired.difference("real", "real+synthetic", metric)
-        if difference is not None and not math.isnan(difference.low):
-            found[made_better(difference, metric)].append(part.heading)
+        if part.difference is not None and not math.isnan(part.difference.low):
+            found[made_better(part.difference, part.metric)].append(part.heading)
     total = sum(len(headings) for headings in found.values())
     if total < 2:
-        return []
+        return ""
     told = ((True, "helped"), (False, "did harm"), (None, "made no difference that can be told"))
     clauses = [f"{what} in {len(found[key])} of {total}: {', '.join(found[key])}" for key, what in told if found[key]]
-    return [f"In short, by 95 % intervals, adding synthetic frames to real ones {'; it '.join(clauses)}."]
+    return f"By 95 % intervals, adding synthetic frames to real ones {'; it '.join(clauses)}."
 
 
 def study_tables(parts: Sequence[Part]) -> list[list[Table]]:

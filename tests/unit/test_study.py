@@ -17,7 +17,15 @@ from ctlev_core.report.html import Animation, Curves, ImageGrid, Step
 from ctlev_core.report.report_files import publish_report
 from ctlev_core.report.score_tables import PairedScores
 from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
-from ctlev_core.report.study import Part, distances_table, study_sections, study_tables, study_verdict
+from ctlev_core.report.study import (
+    Part,
+    distances_table,
+    study_overview,
+    study_sections,
+    study_tables,
+    study_verdict,
+    study_words,
+)
 from ctlev_core.report.summary import SUMMARY_FILE, Summary, read_summary, write_summary
 from ctlev_core.report.tables import Table
 from ctlev_core.run_comparison import read_run
@@ -103,13 +111,18 @@ def test_speed_against_error_is_a_section_with_a_link_to_its_page(reports, tmp_p
 
 def test_the_page_has_every_experiment_its_samples_the_papers_numbers_and_all_distances(published):
     page = (published / "both.html").read_text()
-    texts = ["Data: <code>x</code>", "2D pose (<code>first</code>): mpjpe2d", "2D pose (<code>second</code>): mpjpe2d"]
-    texts += ["1. A label"]
+    texts = [
+        "Data: <code>x</code>",
+        "adding synthetic frames to real ones helped in 2 of 2: 2D pose",
+        "both minus real",
+    ]
+    texts += ["2D pose (<code>first</code>)</td>", "2D pose (<code>second</code>)</td>", "1. A label"]
     for part in PARTS:
         heading = f"2D pose (<code>{part}</code>): "
         texts += [f"{heading}Does synthetic data help?</h2>", f"{heading}asked for, and sampled</h2>"]
         texts += ["Paper, Table 2: 2D pose on DHP19 and CDEHP</h2>"]
-    texts += ["Quality of the frames</h2>", "Paper, Table 4"]
+    texts += ["Quality of the frames</h2>", "Paper, Table 4", "The same in words</h2>"]
+    texts += [f"2D pose (<code>{part}</code>): mpjpe2d_px (mean distance" for part in PARTS]
     texts += [f'href="both/{part}/report.html"' for part in PARTS]
     place = 0
     for text in texts:
@@ -139,7 +152,7 @@ def test_an_experiment_that_trains_on_nothing_synthetic_shows_samples_and_figure
         assert {"2D pose (`first`): asked for, and sampled", "2D pose (`first`): by amount"} <= set(titles)
         told = settings != ["real"]
         assert bool(tables[0]) == told == any("Paper, Table 2" in title for title in titles)
-        assert ("the verdict" in study_verdict(parts)) == told
+        assert ("the verdict" in study_words(parts)) == told
 
 
 def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
@@ -152,7 +165,17 @@ def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
             return Difference(*self.found) if self.found else None
 
     def part(name, metric, *found):
-        rows = [{"metric": metric, "setting": "real", "task": "test", "group": "all"}]
+        rows = [
+            {
+                "metric": metric,
+                "setting": "real",
+                "task": "test",
+                "group": "all",
+                "value": 6.0,
+                "low": None,
+                "high": None,
+            }
+        ]
         return Part(name, rows, ["real", "real+synthetic"], [], Paired(*found), Summary("told.", [], None, []))
 
     parts = [
@@ -163,14 +186,26 @@ def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
         part("e", "mpjpe2d_px", -0.3, float("nan"), float("nan")),  # too few recordings for an interval
         part("f", "accuracy"),
     ]
-    first, *others = study_verdict(parts).split("\n\n")
-    assert first == (
-        "In short, by 95 % intervals, adding synthetic frames to real ones helped in 2 of 4: 2D pose (`a`), Object "
+    others = study_words(parts).split("\n\n")
+    assert study_verdict(parts) == (
+        "By 95 % intervals, adding synthetic frames to real ones helped in 2 of 4: 2D pose (`a`), Object "
         "recognition (`b`); it did harm in 1 of 4: Object recognition (`c`); it made no difference that can be told in "
         "1 of 4: 3D body (`d`)."
     )
     assert len(others) == 6 and others[0] == "2D pose (`a`): told."
-    assert study_verdict(parts[3:]) == "\n\n".join(others[3:])  # one alone needs no summing up
+    assert study_verdict(parts[3:]) == ""  # one alone needs no summing up
+    table = study_overview([*parts, replace(parts[0], settings=["real"])])
+    assert [row[:2] for row in table.rows[:2]] == [
+        ["2D pose (`a`)", "mpjpe2d_px ↓"],
+        ["Object recognition (`b`)", "accuracy ↑"],
+    ]
+    assert [row[2:] for row in table.rows[:2]] == [
+        ["6.000", "", "", "-0.300 [-0.500, -0.100]"],
+        ["6.000", "", "", "+0.100 [+0.050, +0.150]"],
+    ]
+    assert table.rows[5][5] == "" and len(table.rows) == len(parts)
+    # Both numbers of what helped, the difference alone of what did harm, neither where it cannot be told.
+    assert table.bold == {(0, 4), (0, 5), (1, 4), (1, 5), (2, 5)}
 
 
 def test_distances_stand_beside_each_other_by_experiment(reports):
