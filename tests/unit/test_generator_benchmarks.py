@@ -154,10 +154,9 @@ def test_errors_grow_as_digits_are_lost(benchmarks, prior_folder, scheduler):
 
 
 def test_training_benchmark(benchmarks, prior_folder, capsys):
-    benchmarks.training.main(
-        ["--prior", str(prior_folder), "--batch-size", "2", "--rounds", "2", "--steps", "1", "--precisions", "float32"]
-    )
+    benchmarks.training.main(["--prior", str(prior_folder), "--batch-size", "2", "--rounds", "2", "--steps", "1"])
     printed = capsys.readouterr().out
+    assert re.findall(r"^(\w+), bfloat16 beside float32 ", printed, re.M) == ["controlnet", "text"]
     for route in ("controlnet, float32", "text, float32"):
         assert re.search(rf"^{route} .* \d+\.\d\d +\d+\.\d\d \.\. \d+\.\d\d +1\.5: (met|missed)$", printed, re.M), (
             printed
