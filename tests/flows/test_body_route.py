@@ -1,6 +1,7 @@
 """The 3D route from end to end, at its smallest: bodies, normal maps, samples, a body regressor and its errors."""
 
 import pyarrow.parquet as pq
+import pytest
 from flow_scripts import artefacts, run_script
 
 SMALL = (
@@ -33,6 +34,7 @@ def test_sentences_become_event_frames_in_motion_and_bodies_are_scored(tmp_path)
         assert 0 < errors[setting, "mpjpe3d_pa_mm"] <= errors[setting, "mpjpe3d_pelvis_mm"] < 2000
 
 
+@pytest.mark.slow
 def test_one_generator_is_asked_for_poses_of_two_origins(tmp_path):
     foreign = "{poses: {name: text_motion, options: {camera: centred, sentences: [a person jumps]}}}"
     page, rows = run("body", tmp_path, 2, f"baselines={{foreign_poses: {foreign}}}", "num_synthetic=4")

@@ -59,8 +59,8 @@ def smpl(path):
     ("preset", "write", "condition"),
     [
         ("amass", amass, "skeleton"),
-        ("amass", amass, "normals"),
-        ("aist", aist, "skeleton"),
+        pytest.param("amass", amass, "normals", marks=pytest.mark.slow),
+        pytest.param("aist", aist, "skeleton", marks=pytest.mark.slow),
         ("aist", aist, "normals of an SMPL file"),
     ],
 )

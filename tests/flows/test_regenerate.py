@@ -170,6 +170,7 @@ def test_pruning_keeps_what_the_versions_that_are_kept_refer_to(home, make_versi
     assert len(read_versions(folder_of(copy))) == 3, "records stay: they are what is known of a version that is gone"
 
 
+@pytest.mark.slow
 def test_a_script_killed_before_it_publishes_goes_on_with_its_version(home):
     arguments = ["--preset", "smoke", *(part for option in OPTIONS for part in ("--set", option))]
     process = script("regenerate", *arguments, home=home)

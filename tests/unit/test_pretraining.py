@@ -149,6 +149,7 @@ def test_pretraining_resumes_and_writes_a_prior(tmp_path):
         pretrain(TINY.model_copy(update={"seed": 1}), tmp_path / "other", tmp_path / "work")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monkeypatch):
     monkeypatch.undo()  # other processes know nothing of it

@@ -74,7 +74,12 @@ def assert_same_run(one, two, start):
 
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
-    "shared", [{}, {"fsdp": True, "sample_every": 2}, {"fsdp": True, "gradient_checkpointing": True}]
+    "shared",
+    [
+        {},
+        {"fsdp": True, "sample_every": 2},
+        pytest.param({"fsdp": True, "gradient_checkpointing": True}, marks=pytest.mark.slow),
+    ],
 )
 def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder, shared):
     alone = trained(tmp_path / "alone", prior_folder, OPTIONS)
@@ -98,6 +103,7 @@ def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder, shared)
     assert vars(again) == vars(together)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_parts_of_weights_go_on_from_whole_ones(tmp_path, prior_folder, monkeypatch):
     """One process is killed in its third step; two that share out the weights end where it would have."""
