@@ -58,6 +58,7 @@ def service(tmp_path_factory):
         yield made
 
 
+@pytest.mark.slow
 def test_deployments_say_what_they_take_and_regenerate_never_overlaps(service):
     found = {name: service.api(f"deployments/name/{name}/default") for name in SCRIPTS}
     for name, deployment in found.items():
@@ -76,6 +77,7 @@ def test_deployments_say_what_they_take_and_regenerate_never_overlaps(service):
     assert scheduled["concurrency_options"]["collision_strategy"] == "CANCEL_NEW"
 
 
+@pytest.mark.slow
 def test_a_deployed_run_makes_what_the_script_makes_and_shows_its_plan(service, tmp_path):
     run = service.start_run("prepare-dataset", tmp_path / "deployed", "num_synthetic=3")
     options = ["--preset", "smoke", "--set", "num_synthetic=3", "--home", str(tmp_path / "script")]
@@ -98,6 +100,7 @@ def test_a_deployed_run_makes_what_the_script_makes_and_shows_its_plan(service, 
     assert {row["plan"] for row in json.loads(plan["data"])} == {"to run"}
 
 
+@pytest.mark.slow
 def test_wrong_types_are_refused_before_anything_runs(service):
     finished = service.prefect("deployment", "run", "prepare-dataset/default", "-p", "overrides=5")
     assert finished.returncode != 0
