@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -109,7 +110,10 @@ def check_name(path: Path) -> str:
 
 
 def recording_ids(paths: Iterable[Path], root: Path) -> list[str]:
-    """Recording ids of files with free names: the paths within the root without suffix, other characters as `_`.
+    """Recording ids of files with free names: the paths within the root without suffix.
+
+    Letters of other alphabets become their code points (`ue4` for an a with two dots), so that names in them stay
+    apart; blanks and signs become `_`.
 
     Raises:
         DataError: two files get the same id.
@@ -117,11 +121,15 @@ def recording_ids(paths: Iterable[Path], root: Path) -> list[str]:
     owners: dict[str, Path] = {}
     for path in paths:
         parts = path.relative_to(root).with_suffix("").parts
-        name = "/".join(_NOT_IN_IDS.sub("_", part) for part in parts)
+        name = "/".join(_NOT_IN_IDS.sub(_in_ascii, unicodedata.normalize("NFC", part)) for part in parts)
         if name in owners:
             raise DataError(f"{path}: would get the recording id {name!r} of {owners[name]}; rename one of them")
         owners[name] = path
     return list(owners)
+
+
+def _in_ascii(found: re.Match[str]) -> str:
+    return re.sub("_+", "_", "".join(f"u{ord(letter):x}" if letter.isalnum() else "_" for letter in found.group()))
 
 
 def shuffled(names: Iterable[str], seed: int, *salt: str) -> list[str]:

@@ -13,7 +13,7 @@ and so are files beside the class folders that are no recordings (a README).
 
 from __future__ import annotations
 
-import re
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -22,6 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core import event_files
+from ctlev_core.dataset_files.trees import recording_ids
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events
@@ -55,13 +56,15 @@ class Options(Frozen):
 def list_recordings(options: Options) -> list[Recording]:
     """Every recording, sorted by class and name; its id and subject are `<class>/<file name without suffix>`.
 
+    Names are free; in ids, blanks and letters of other alphabets are written as `recording_ids` does.
+
     Raises:
         DataError: the tree is not as expected; the message says where and shows it.
     """
     root = options.root
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; {EXPECTED_TREE}")
-    recordings: list[Recording] = []
+    found: list[tuple[str, Path, tuple[Part, ...]]] = []
     for class_folder in _class_folders(root):
         files = _recording_files(root, class_folder)
         if options.split == "time":
@@ -69,10 +72,15 @@ def list_recordings(options: Options) -> list[Recording]:
             parts = [(Part("train", 0.0, boundary), Part("test", boundary, 1.0))] * len(files)
         else:
             parts = _split_by_recording(files, options.test_fraction)
+        # What looks the same is the same class, however a file system composes its accents.
+        class_name = unicodedata.normalize("NFC", class_folder.name)
         for file, parts_of_file in zip(files, parts, strict=True):
-            name = f"{class_folder.name}/{file.stem}"
-            recordings.append(Recording(name, name, parts_of_file, class_folder.name, files=(file,)))
-    return recordings
+            found.append((class_name, file, parts_of_file))
+    names = recording_ids([file for _, file, _ in found], root)
+    return [
+        Recording(name, name, parts, class_name, files=(file,))
+        for name, (class_name, file, parts) in zip(names, found, strict=True)
+    ]
 
 
 def read_events(recording: Recording, options: Options) -> Events:
@@ -139,9 +147,8 @@ def _visible_entries(root: Path, folder: Path) -> Iterator[Path]:
             raise DataError(f"{entry}: a link to nothing")
         if not entry.resolve().is_relative_to(root.resolve()):
             raise DataError(f"{entry}: links to {entry.resolve()}, outside the dataset folder {root}")
-        # Files beside the class folders never become a name.
-        if (folder != root or entry.is_dir()) and not re.fullmatch(r"[A-Za-z0-9._-]+", entry.name):
-            raise DataError(f"{entry}: expected a name of letters, digits, '.', '_' and '-', got {entry.name!r}")
+        if not entry.name.isprintable():
+            raise DataError(f"{str(entry)!r}: expected a name of printable characters")
         yield entry
 
 

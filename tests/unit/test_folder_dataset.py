@@ -145,10 +145,26 @@ def test_two_recordings_of_one_name(root):
     assert_refused(root, r"a\.raw: has the name of a\.parquet", shows_tree=False)
 
 
-@pytest.mark.parametrize("name", ["two words/a.parquet", "car/a (1).parquet", "car/käfer.parquet"])
-def test_names_that_cannot_be_recording_ids(name, root):
-    write_recording(root / name)
-    assert_refused(root, "expected a name of letters, digits", shows_tree=False)
+def test_names_are_free(root):
+    names = {
+        "two words/a (1).parquet": ("two words", "two_words/a_1_"),
+        "ka\u0308fer/a.parquet": ("k\u00e4fer", "kue4fer/a"),  # composed of two characters, as macOS writes it
+        "\u732b/1.parquet": ("\u732b", "u732b/1"),
+        "\u72d7/1.parquet": ("\u72d7", "u72d7/1"),
+        "a&b, <c>/d'.parquet": ("a&b, <c>", "a_b_c_/d_"),
+    }
+    for name in names:
+        write_recording(root / name)
+    made = {recording.class_name: recording.recording_id for recording in listed(root)}
+    for class_name, recording_id in names.values():
+        assert made[class_name] == recording_id
+    write_recording(root / "two_words" / "a_1_.parquet")
+    assert_refused(root, "would get the recording id 'two_words/a_1_' of .*two words", shows_tree=False)
+
+
+def test_names_of_control_characters_are_refused(root):
+    write_recording(root / "car" / "a\nb.parquet")
+    assert_refused(root, "expected a name of printable characters", shows_tree=False)
 
 
 def test_links_out_of_the_root_are_refused(root, tmp_path):
