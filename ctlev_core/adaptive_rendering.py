@@ -156,7 +156,8 @@ def _by_speed(
                 break
             # A shorter interval may have a lower bound, so it is not shortened at once as far as this one asks.
             allowed_us = math.floor(1e6 * options.max_displacement_px / speed_px_s)
-            interval_us = max(allowed_us, interval_us // 2, options.min_interval_us)
+            # And always by something: the product above may round to more where the quotient here rounds to the same.
+            interval_us = max(min(allowed_us, interval_us - 1), interval_us // 2, options.min_interval_us)
         time_us = min(time_us + interval_us, stop_us)
         yield time_us, canvas(time_us)
 

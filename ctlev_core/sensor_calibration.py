@@ -96,7 +96,7 @@ def calibrate(events: Events, base: SensorOptions = PRESETS["noisy"]) -> Calibra
     _measure_noise(events, is_hot, found, measured, assumed)
     leak_events = found.get("leak_rate_hz", base.leak_rate_hz) * 1e-6 * events.duration_us
     _measure_thresholds(counts[:, ~is_hot], leak_events, base, found, measured, assumed)
-    _measure_refractory(events, found, measured, assumed)
+    _measure_refractory(events, base, found, measured, assumed)
     return Calibration(SensorOptions(**base.model_dump() | found), measured, assumed)
 
 
@@ -225,7 +225,7 @@ def _intercept(squares: np.ndarray, ends: np.ndarray) -> float:
     return max(float(variance.mean() - slope * end.mean()), 0.0)
 
 
-def _measure_refractory(events: Events, found: dict, measured: dict, assumed: dict) -> None:
+def _measure_refractory(events: Events, base: SensorOptions, found: dict, measured: dict, assumed: dict) -> None:
     pixel = events.y.astype(np.int64) * events.sensor_size[0] + events.x
     order = np.argsort(pixel, kind="stable")
     intervals_us = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
@@ -243,6 +243,7 @@ def _measure_refractory(events: Events, found: dict, measured: dict, assumed: di
     if pile >= MIN_PILE:
         found["refractory_us"] = shortest_us
     else:
+        found["refractory_us"] = min(base.refractory_us, shortest_us)
         assumed["refractory_us"] = (
             f"at most {shortest_us} us, the shortest interval, but {pile} are about as short; {MIN_PILE} are wanted"
         )
@@ -274,6 +275,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="the preset, YAML")
     parser.add_argument("--base", default="noisy", help="for what cannot be measured: a preset's name, or a YAML file")
     chosen = parser.parse_args(arguments)
+    if not chosen.out.parent.is_dir():
+        raise DataError(f"--out {chosen.out}: no folder {chosen.out.parent} to write into")
     base = PRESETS.get(chosen.base) or read_preset(Path(chosen.base))
     calibration = calibrate(read_events_file(chosen.recording), base)
     write_preset(chosen.out, calibration, chosen.recording.name)

@@ -50,6 +50,15 @@ class SensorOptions(Frozen):
             raise ValueError(f"hot_rate_hz must be two rates, the lower first, got {self.hot_rate_hz}")
         return self
 
+    @model_validator(mode="after")
+    def _thresholds_are_not_below_the_least(self) -> SensorOptions:
+        for name, mean in (("threshold", self.threshold), ("threshold_off", self.threshold_off)):
+            if mean is not None and mean < self.threshold_minimum:
+                raise ValueError(
+                    f"{name} must be at least threshold_minimum, {self.threshold_minimum:g}, got {mean:g}: lower that too"
+                )
+        return self
+
 
 PRESETS = {
     # What ESIM assumes: nothing but thresholds, and the first frame as the reference.

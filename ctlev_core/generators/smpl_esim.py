@@ -128,7 +128,9 @@ def _film(
             scene,
             0,
             stop_us - start_us,
-            PRESETS["ideal"].model_copy(update={"threshold": options.threshold}),
+            PRESETS["ideal"].model_copy(
+                update={"threshold": options.threshold, "threshold_minimum": options.threshold}
+            ),
             RenderingOptions(
                 max_displacement_px=options.max_displacement_px,
                 min_interval_us=MIN_INTERVAL_US,

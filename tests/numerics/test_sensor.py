@@ -387,3 +387,10 @@ def test_presets_are_files_too(tmp_path):
             read_preset(path)
     with pytest.raises(DataError, match="No such file"):
         read_preset(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize("name", ["threshold", "threshold_off"])
+def test_a_mean_below_the_least_threshold_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be at least threshold_minimum, 0.05, got 0.03"):
+        SensorOptions(**{name: 0.03})
+    assert SensorOptions(**{name: 0.03}, threshold_minimum=0.03).threshold_minimum == 0.03

@@ -147,3 +147,13 @@ def test_the_budget_is_kept():
             render, 0, STOP_US, IDEAL, RenderingOptions(), sensor_seed=0, seed=0, speed_bound=speed_bound, max_events=50
         )
     assert 0 < len(caught.value.events) <= 50
+
+
+def test_a_bound_that_rounds_to_the_same_interval_again_ends():
+    """250 px/s / 0.7: the interval's path rounds to more than is allowed, the allowed interval to the same interval."""
+    options = RenderingOptions(max_displacement_px=0.25)
+    still = np.full((4, 4), 0.5)
+    _, times_us = simulate_rendered(
+        lambda t: still, 0, 100_000, IDEAL, options, sensor_seed=0, seed=0, speed_bound=lambda a, b: 250 / 0.7
+    )
+    assert np.diff(times_us).max() <= 700 and len(times_us) < 160

@@ -114,6 +114,18 @@ def test_what_a_short_recording_does_not_tell_is_taken_from_the_base_and_named()
             calibrate(bad)
 
 
+def test_a_short_interval_bounds_the_refractory_time_however_rare_it_is():
+    pixels = np.array([1, 1, 5], np.uint16)
+    events = Events(np.array([0, 90, 9000]), pixels, pixels, np.ones(3, np.uint8), (12, 12))
+    base = PRESETS["dvs346"]
+    assert base.refractory_us > 90 and calibrate(events, base).options.refractory_us == 90
+
+
+def test_a_missing_folder_is_said_before_anything_is_read(tmp_path):
+    with pytest.raises(DataError, match="no folder .*absent to write into"):
+        main([str(tmp_path / "none.raw"), "--out", str(tmp_path / "absent" / "preset.yaml")])
+
+
 def test_the_real_person(tmp_path, capsys):
     """The preset of the real recording is read again, and a still scene before it is as noisy as the recording."""
     recording = REAL_DATA / "events" / "person" / "tonic_sample.aedat4"
