@@ -54,9 +54,8 @@ class SensorOptions(Frozen):
     def _thresholds_are_not_below_the_least(self) -> SensorOptions:
         for name, mean in (("threshold", self.threshold), ("threshold_off", self.threshold_off)):
             if mean is not None and mean < self.threshold_minimum:
-                raise ValueError(
-                    f"{name} must be at least threshold_minimum, {self.threshold_minimum:g}, got {mean:g}: lower that too"
-                )
+                least = f"threshold_minimum, {self.threshold_minimum:g}"
+                raise ValueError(f"{name} must be at least {least}, got {mean:g}: lower that too")
         return self
 
 

@@ -53,6 +53,19 @@ _MAX_ELEMENTS = 2**28
 _MAX_DEPTH = 8
 
 
+def given_body_file(body: Path | None, where: str) -> list[Path]:
+    """The SMPL file where one is given, for cache keys.
+
+    Raises:
+        DataError: no such file.
+    """
+    if body is None:
+        return []
+    if not body.is_file():
+        raise DataError(f"{where}: {body}: no such file; expected an SMPL body (.pkl or .npz)")
+    return [body]
+
+
 def read_smpl_file(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an SMPL body file, dense, under SMPL's names.
 

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.render.body_normals import given_body_file, render_labelled_normals
+from ctlev_core.body.smpl_files import given_body_file
+from ctlev_core.render.body_normals import render_labelled_normals
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import BodyMotions, Conditions, Labels, check_body_motions

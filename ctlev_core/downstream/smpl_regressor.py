@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
+from ctlev_core.body.smpl_files import given_body_file
 from ctlev_core.body_samples import BodySamples, mirror_half, shift
 from ctlev_core.frame_sequences import find_sequences
 from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
@@ -33,9 +34,13 @@ from data_contracts.labels import History, Labels, check_labels
 if TYPE_CHECKING:
     import torch
 
+    from ctlev_core.body.torch_layer import BodyLayer
+
 VERSION = 1
 NAME = "smpl_regressor"
 PREDICTS = ("joints2d", "joints3d", "smpl")
+SKELETON = ("joints", "joint_shapedirs")
+"""What joints are made of: those at rest [24, 3] m and how shape moves them [24, 3, 10]."""
 
 
 class Options(SupervisedOptions):
@@ -49,6 +54,11 @@ class Options(SupervisedOptions):
         json_schema_extra=RUN_SETTING,
         description="local folder (config.json, model.safetensors) of a published ResNet of this architecture to start "
         "from; null = random weights",
+    )
+    body: Path | None = Field(
+        default=None,
+        json_schema_extra=RUN_SETTING,
+        description="SMPL file (.pkl, .npz) of the labels' body, whose joints are learnt; the bundled body when null",
     )
     pool_grid: int = Field(default=2, ge=1, description="features are averaged over so many cells a side; Event-HPE: 1")
     head_width: int = Field(default=256, ge=0, description="hidden units of the head, 0 = linear")
@@ -84,12 +94,13 @@ class Options(SupervisedOptions):
 
 
 def input_files(options: Options) -> list[Path]:
-    """The files of the published ResNet to start from, if any.
+    """The files of the published ResNet to start from, and of the body, if any.
 
     Raises:
         DataError: one is missing, or they are of another network.
     """
-    return check_resnet_folder(options.weights, options.architecture) if options.weights else []
+    files = check_resnet_folder(options.weights, options.architecture) if options.weights else []
+    return [*files, *given_body_file(options.body, NAME)]
 
 
 def train(
@@ -144,8 +155,6 @@ def train_sequences(
     import torch
 
     from ctlev_core import supervised
-    from ctlev_core.body.layer import load_body
-    from ctlev_core.body.torch_layer import BodyLayer
     from ctlev_core.networks.resnet import load_backbone
     from ctlev_core.supervised_training import train_model
     from ctlev_core.training_rows import plan_rows
@@ -163,7 +172,7 @@ def train_sequences(
         load_backbone(model.network, options.weights)
     model.start_from(*(torch.from_numpy(array).float() for array in (data.rotations, data.betas, data.transl)))
     model.to(device)
-    body = BodyLayer(load_body()).to(device)
+    body = _skeleton(options.body).to(device)
 
     def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
         chosen, lengths = sequences.ending_at(rows)
@@ -201,6 +210,8 @@ def train_sequences(
         "weights": weights,
         "training": record,
     }
+    if options.body is not None:  # so that the model needs no licensed file to predict
+        config["skeleton"] = {name: getattr(body, name).tolist() for name in SKELETON}
     supervised.write_model(out, model, config)
     return history
 
@@ -227,8 +238,6 @@ def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]
     import torch
 
     from ctlev_core import supervised
-    from ctlev_core.body.layer import load_body
-    from ctlev_core.body.torch_layer import BodyLayer
     from ctlev_core.body.torch_rotations import axis_angle_from_matrix
 
     supervised.check_frames(frames, f"predict {NAME}")
@@ -238,7 +247,10 @@ def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]
     supervised.read_weights(model, network)
     device = supervised.resolve_device("auto")
     network.to(device)
-    body = BodyLayer(load_body()).to(device)
+    body = _skeleton()
+    for name, values in config.get("skeleton", {}).items():
+        setattr(body, name, torch.tensor(values))
+    body.to(device)
     indices = joint_indices("smpl", config["joint_set"])
     intrinsics = torch.tensor(config["intrinsics_px"], device=device)
     sequences = find_sequences(len(frames), options.sequence_length, recordings)
@@ -289,6 +301,14 @@ def _build(options: Options) -> Any:
 
     shape = ARCHITECTURES[options.architecture]
     return SmplRegressor(shape, options.pool_grid, options.head_width, recurrent=options.sequence_length > 1)
+
+
+def _skeleton(body: Path | None = None) -> BodyLayer:
+    """The body, of which joints alone are asked for here."""
+    from ctlev_core.body.layer import load_body
+    from ctlev_core.body.torch_layer import BodyLayer
+
+    return BodyLayer(load_body(body))
 
 
 def _to_input(images: torch.Tensor) -> torch.Tensor:

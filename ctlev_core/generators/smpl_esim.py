@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.render.body_normals import given_body_file
+from ctlev_core.body.smpl_files import given_body_file
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize

@@ -14,19 +14,6 @@ BATCH = 64
 """Bodies posed at a time: 64 of SMPL's are 5 MB."""
 
 
-def given_body_file(body: Path | None, where: str) -> list[Path]:
-    """The SMPL file where one is given, for cache keys.
-
-    Raises:
-        DataError: no such file.
-    """
-    if body is None:
-        return []
-    if not body.is_file():
-        raise DataError(f"{where}: {body}: no such file; expected an SMPL body (.pkl or .npz)")
-    return [body]
-
-
 def render_labelled_normals(
     labels: Labels,
     image_size: tuple[int, int],

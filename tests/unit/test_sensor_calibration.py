@@ -122,7 +122,7 @@ def test_a_short_interval_bounds_the_refractory_time_however_rare_it_is():
 
 
 def test_a_missing_folder_is_said_before_anything_is_read(tmp_path):
-    with pytest.raises(DataError, match="no folder .*absent to write into"):
+    with pytest.raises(DataError, match=r"no folder .*absent to write into"):
         main([str(tmp_path / "none.raw"), "--out", str(tmp_path / "absent" / "preset.yaml")])
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctlev_core.body.layer import joint_transforms, load_body
+from ctlev_core.body.layer import BUNDLED_BODY, joint_transforms, load_body
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ctlev_core.body_samples import BodySamples, mirror_half, shift
 from ctlev_core.body_views import with_joints
@@ -167,3 +167,22 @@ def test_another_number_of_frames_is_refused(tmp_path):
     labels = people(4)
     with pytest.raises(DataError, match="3 frames but 4 labels"):
         smpl_regressor.train(pictures(labels)[:3], labels, TINY, seed=0, out=tmp_path / "a", work=tmp_path / "w")
+
+
+def test_joints_are_those_of_the_body_that_was_named(tmp_path):
+    with np.load(BUNDLED_BODY) as arrays:
+        tree = dict(arrays)
+    tree["v_template"] = 1.5 * tree["v_template"]
+    file = tmp_path / "large.npz"
+    np.savez(file, **tree)
+    large, labels = load_body(file), people(4)
+    options = TINY.model_copy(update={"body": file, "num_steps": 2, "batch_size": 2})
+    assert smpl_regressor.input_files(options) == [file]
+    smpl_regressor.train(pictures(labels), labels, options, seed=0, out=tmp_path / "a", work=tmp_path / "w")
+    file.unlink()  # a licensed file need not be where a model is used
+    found = smpl_regressor.predict(tmp_path / "a", pictures(labels))
+    rotations = matrix_from_axis_angle(found["smpl_pose"].reshape(-1, 24, 3))
+    _, joints = joint_transforms(large, rotations, found["smpl_betas"], found["smpl_transl"])
+    np.testing.assert_allclose(found["joints3d"], 1000 * joints, atol=0.05)
+    with pytest.raises(DataError, match=r"large\.npz: no such file; expected an SMPL body"):
+        smpl_regressor.input_files(options)

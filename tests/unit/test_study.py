@@ -389,7 +389,12 @@ def test_a_path_that_is_given_is_no_longer_missing(tmp_path):
         load_study("paper", [f"paths.smpl={tmp_path / 'body.npz'}"])
     assert "paths.smpl" not in str(raised.value)
     parts = raised.value.asked.experiments
-    assert parts["body"].condition.options["body"] == str(tmp_path / "body.npz")
+    # What is drawn, filmed, learnt and measured is one body.
+    body, filmed = parts["body"], parts["body"].baselines["smpl_esim"]
+    metric = next(metric for metric in body.metrics if metric.name == "pve")
+    learnt = (body.condition.options, body.downstream.options, metric.options)
+    for options in (*learnt, filmed.condition.options, filmed.sampling):
+        assert options["body"] == str(tmp_path / "body.npz")
     # The same lines of the file serve several experiments, and each has a ControlNet of its own.
     controlnets = {name: part.generator.options["controlnet"] for name, part in parts.items() if "pose" in name}
     assert set(controlnets.values()) == {"paths.controlnet_openpose"}
