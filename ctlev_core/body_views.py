@@ -21,6 +21,10 @@ FOCAL_PER_SIDE = 1.4
 OCCLUSION_SIDE_PX = 256
 """The larger side of the depth pictures, at most: a wrist is some pixels wide, and a picture takes a millisecond."""
 OCCLUSION_BATCH = 64
+MAX_WAY_M = 0.3
+"""Who goes farther while a camera looks needs it to stand back; jumps and steps on the spot are seen as one stands."""
+BODY_REACH_M = 0.9
+"""Of an upright body around its pelvis."""
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 """Camera frame of a level camera to a world with y up, in which who faces the camera faces +z."""
 
@@ -112,7 +116,7 @@ def from_new_side(
     """The same bodies as another still camera sees them, drawn at random around the space they move in.
 
     The camera that the labels come from is taken to stand upright and level: yaw and pitch of the new one count from
-    its view.
+    its view. It stands as far away as is drawn, or where they go a long way so far that it sees all of it.
 
     Args:
         labels: N rows with SMPL parameters, one or more.
@@ -126,7 +130,7 @@ def from_new_side(
         DataError: the labels have no SMPL parameters, or no rows.
     """
     joints = smpl_joints(labels)
-    camera = sample_camera(rng, joints @ UPRIGHT.T, sensor_size, ranges)
+    camera = _far_enough(sample_camera(rng, joints @ UPRIGHT.T, sensor_size, ranges), joints @ UPRIGHT.T)
     pose, betas, transl = _bodies(labels)
     root, moved = move_roots(
         matrix_from_axis_angle(pose[:, :3].astype(np.float64)),
@@ -146,6 +150,22 @@ def from_new_side(
         joints3d=None,
         joint_set="",
     )
+
+
+def _far_enough(camera: Camera, joints: np.ndarray) -> Camera:
+    """The camera moved back along its axis until all of a long way [N, J, 3] m is in the picture.
+
+    Who stays about where they are is seen from the distance that was drawn.
+    """
+    pelvis = joints[:, 0]
+    if np.ptp(pelvis, axis=0).max() <= MAX_WAY_M:
+        return camera
+    way = pelvis @ camera.R.T + camera.translation
+    # At depth z the picture reaches z * side / (2 f) to each side.
+    per_depth = 2 * camera.intrinsics[:2] / np.array(camera.image_size)
+    needed = (per_depth * (np.abs(way[:, :2]) + BODY_REACH_M)).max(axis=1) - way[:, 2]
+    back = np.array([0.0, 0.0, max(needed.max(), 0.0)])
+    return replace(camera, translation=camera.translation + back)
 
 
 def default_intrinsics(sensor_size: SensorSize) -> np.ndarray:

@@ -152,9 +152,10 @@ def _by_name(names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def sensor_size_of(recordings: Manifest) -> SensorSize:
-    """(width, height) px of the first recording that has a sensor."""
-    rows = recordings.table.to_pylist()
-    return next((row["sensor_width_px"], row["sensor_height_px"]) for row in rows if row["sensor_width_px"])
+    """(width, height) px of the first recording that was recorded, and is not labels alone."""
+    rows = [row for row in recordings.table.to_pylist() if row["sensor_width_px"]]
+    row = next((row for row in rows if row["splits"] != "condition"), rows[0])
+    return row["sensor_width_px"], row["sensor_height_px"]
 
 
 def image_size_of(frames: Manifest) -> tuple[int, int]:

@@ -58,7 +58,7 @@ def condition_frames(
     return _render(out, rows.source_ids, rows, condition, recordings, frames, encoding, seed)
 
 
-@stage(version=6, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
+@stage(version=7, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
 def condition_samples(
     out: Output,
     poses: Manifest,
@@ -104,7 +104,7 @@ def condition_samples(
             t_start_us=np.maximum(times - half_us, 0),
             t_end_us=times + half_us,
             labelled=labelled,
-            labels=_seen(labelled, recordings, frames, encoding, turned, seed),
+            labels=_seen(labelled, _sensors(poses, names), recordings, frames, encoding, turned, seed),
         )
     elif poses.ref.key != recordings.ref.key:
         raise DataError(f"{poses.ref.path}: the dataset of poses has no recording in split 'condition'")
@@ -135,8 +135,15 @@ def _label_only(poses: Manifest) -> pa.Table:
     return table.filter(pc.is_in(table["recording_id"], pa.array(wanted, pa.string())))
 
 
+def _sensors(poses: Manifest, names: list[str]) -> np.ndarray:
+    """(width, height) [N, 2] px of the sensors that labels of recordings `names` are of, 0 where of none."""
+    rows = {row["recording_id"]: row for row in poses.table.to_pylist()}
+    return np.array([(rows[name]["sensor_width_px"], rows[name]["sensor_height_px"]) for name in names]).reshape(-1, 2)
+
+
 def _seen(
     labels: Labels,
+    sensors: np.ndarray,
     recordings: Manifest,
     frames: Manifest,
     encoding: EncodingChoice,
@@ -145,20 +152,35 @@ def _seen(
 ) -> Labels:
     """Label-only rows as labels in image pixels.
 
-    A label-only recording has no sensor of its own: its labels are in the frame of the dataset's sensor, or a virtual
-    camera with that sensor looks at its bodies; at those of one number in `turned` [N] from one new side.
+    Labels of the experiment's own sensor stay where they are, those of another (`sensors` [N, 2] px) are scaled to fit
+    into its middle. Bodies that no sensor saw, or in `turned` [N] all of one number from one new side, are seen by a
+    virtual camera with the experiment's sensor.
     """
     from ctlev_core.body_views import with_joints  # here, because a cached run needs no numba and no scipy
 
     size = sensor_size_of(recordings)
-    if turned is not None:
-        labels = _from_new_sides(labels, turned, size, seed)
+    labels = _on_sensor(labels, sensors, size) if turned is None else _from_new_sides(labels, turned, size, seed)
     if labels.joints2d is None and labels.smpl_pose is not None:
         labels = with_joints(labels, size, frames.labels.joint_set or "smpl")
     plugin = plugins.load_options(encoding)
     return labels_in_image(
         labels, lambda points: plugin.module.map_points(points, size, plugin.options), image_size_of(frames)
     )
+
+
+def _on_sensor(labels: Labels, sensors: np.ndarray, size: SensorSize) -> Labels:
+    """Labels in px of sensors [N, 2] as labels in px of one, as if it stood in the same place with the same view."""
+    of_row = [size if min(sensor) == 0 else sensor for sensor in map(tuple, sensors.tolist())]
+    if all(sensor == size for sensor in of_row):
+        return labels
+    groups = [np.array([own == sensor for own in of_row]).nonzero()[0] for sensor in dict.fromkeys(of_row)]
+    moved = []
+    for rows in groups:
+        own = np.array(of_row[rows[0]])
+        scale = (np.array(size) / own).min()
+        border = (np.array(size) - scale * own) / 2
+        moved.append(labels_in_image(labels.take(rows), lambda points, k=scale, b=border: k * points + b, size))
+    return concat_labels(moved).take(np.argsort(np.concatenate(groups), kind="stable"))
 
 
 def _from_new_sides(labels: Labels, turned: np.ndarray, sensor_size: SensorSize, seed: int) -> Labels:

@@ -55,7 +55,7 @@ def _list_recordings(plugin: Plugin) -> list[Recording]:
     return recordings
 
 
-@stage(version=3, schema=tables.RECORDINGS, raw_files=_raw_files)
+@stage(version=4, schema=tables.RECORDINGS, raw_files=_raw_files)
 def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     """Read every recording once, check it, and keep events and labels in the project's own form."""
     plugin = plugins.load_options(dataset)
@@ -86,7 +86,8 @@ def _ingest_recording(dataset: DatasetChoice, out: Output, recording: Recording)
         "class_name": recording.class_name,
         "splits": "+".join(part.split for part in recording.parts),
         **dict.fromkeys(("events_file", "event_images_file", "intensity_file"), ""),
-        **dict.fromkeys(("sensor_width_px", "sensor_height_px", "num_events", "num_positive", "num_negative"), 0),
+        **dict(zip(("sensor_width_px", "sensor_height_px"), recording.sensor_size or (0, 0), strict=True)),
+        **dict.fromkeys(("num_events", "num_positive", "num_negative"), 0),
         **dict.fromkeys(("t_first_us", "t_last_us", "duration_us"), 0),
         "num_windows": None,
     }

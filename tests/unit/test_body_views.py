@@ -110,6 +110,16 @@ def test_new_sides_are_views_of_the_same_bodies():
     np.testing.assert_allclose((before - before.mean(0)) @ u @ v + after.mean(0), after, atol=0.02)  # mm; float32
 
 
+@pytest.mark.parametrize("way_m", [8.0, 14.0])
+def test_who_goes_a_long_way_stays_in_the_picture_from_every_new_side(way_m):
+    across = np.linspace([-way_m / 2, 0.1, 6.0], [way_m / 2, 0.1, 9.0], 12)
+    labels = labels_of(np.repeat(facing(), 12, axis=0), across)
+    for seed in range(20):
+        seen = with_joints(from_new_side(labels, np.random.default_rng(seed), SENSOR), SENSOR, "smpl")
+        assert seen.joints3d is not None and seen.visible is not None
+        assert seen.joints3d[..., 2].min() > 1000 and seen.visible.mean(axis=1).min() > 0.85
+
+
 def test_yaw_zero_sees_what_the_old_camera_saw():
     ahead = CameraRange((3.0, 3.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (1.4, 1.4))
     labels = labels_of(facing(), [[0.4, 0.3, 5.0]])

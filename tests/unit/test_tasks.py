@@ -1,5 +1,7 @@
 """Small decisions the tasks take: which labels to sample from, and what the verdict says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -10,7 +12,8 @@ from ctlev_core.metrics import mpjpe2d, mpjpe3d, pck2d
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
-from tasks.condition import _choose, _from_new_sides
+from data_contracts.manifest import concat_labels
+from tasks.condition import _choose, _from_new_sides, _on_sensor
 
 
 @pytest.mark.parametrize(
@@ -66,6 +69,22 @@ def test_new_views_are_one_for_each_number_whatever_the_order_of_rows():
     more = _from_new_sides(bodies(6), np.arange(6), (64, 64), seed=3)
     np.testing.assert_array_equal(more.smpl_pose[:4], _from_new_sides(bodies(), np.arange(4), (64, 64), 3).smpl_pose)
     assert with_joints(more, (64, 64), "dhp19").visible.mean() > 0.9
+
+
+def test_labels_of_another_sensor_are_scaled_into_the_middle():
+    """Bodies before a wider and finer sensor keep their place in the view; those of no sensor stay as they are."""
+    own, wide = with_joints(bodies(), (64, 64), "smpl"), bodies()
+    wide = with_joints(replace(wide, intrinsics=wide.intrinsics * 4 + [0, 0, 72, 0]), (400, 256), "smpl")
+    both = concat_labels([own.take([0]), wide.take([1]), own.take([2])])
+    moved = _on_sensor(both, np.array([[64, 64], [400, 256], [0, 0]]), (64, 64))
+    np.testing.assert_array_equal(moved.joints2d[[0, 2]], own.joints2d[[0, 2]])
+    # 400 px become 64, the 256 rows 40.96 in the middle of 64.
+    expected = 0.16 * wide.joints2d[1] + [0, (64 - 40.96) / 2]
+    np.testing.assert_allclose(moved.joints2d[1], expected, atol=1e-4)
+    assert moved.visible.all()
+    again = with_joints(replace(moved, joints2d=None), (64, 64), "smpl")  # the intrinsics went along
+    np.testing.assert_allclose(again.joints2d, moved.joints2d, atol=1e-3)
+    assert _on_sensor(own, np.tile([64, 64], (4, 1)), (64, 64)) is own
 
 
 def test_new_views_of_labels_without_bodies_are_refused():
