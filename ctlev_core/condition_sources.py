@@ -41,6 +41,19 @@ class LabelledRows:
     labelled: Labels
     labels: Labels
 
+    def take(self, rows: np.ndarray) -> LabelledRows:
+        """Some of the rows, by their numbers."""
+        return LabelledRows(
+            source_ids=[self.source_ids[row] for row in rows],
+            recordings=self.recordings,
+            recording_ids=[self.recording_ids[row] for row in rows],
+            subjects=[self.subjects[row] for row in rows],
+            t_start_us=self.t_start_us[rows],
+            t_end_us=self.t_end_us[rows],
+            labelled=self.labelled.take(rows),
+            labels=self.labels.take(rows),
+        )
+
 
 def half_window_us(frames: Manifest) -> int:
     """Half of the median training window."""

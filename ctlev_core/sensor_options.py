@@ -30,7 +30,10 @@ class SensorOptions(Frozen):
     cutoff_bright_hz: float = Field(default=180.0, gt=0, description="Photoreceptor bandwidth at white.")
     refractory_us: int = Field(default=0, ge=0, description="Time after an event in which a pixel stays silent.")
     leak_rate_hz: float = Field(
-        default=0.0, ge=0, description="ON events a second of a pixel that sees nothing happen."
+        default=0.0,
+        ge=0,
+        description="ON events a second of a pixel that sees nothing happen; half of them in the first 1 / rate "
+        "seconds of a recording that starts settled.",
     )
     shot_rate_hz: float = Field(
         default=0.0, ge=0, description="Noise events a second of a dark pixel, either polarity."

@@ -220,20 +220,19 @@ def _render(
     plugin = _load_condition(condition, recordings)
     labels, seeds = rows.labels, row_seeds(seed, len(rows.labels))
     needs = getattr(plugin.module, "NEEDS", None)
-    further: list[np.ndarray | BodyMotions] = []
-    if needs == "intensity":
-        further = [read_pairs(rows, frames, encoding)]
-    elif needs == "motion":
-        further = [read_motions(rows, recordings, frames, encoding)]
+    motions = read_motions(rows, recordings, frames, encoding) if needs == "motion" else None
     prompts: list[str] = []
-    block = max(len(labels), 1) if needs else BLOCK_ROWS
     with ExitStack() as opened:
         written: dict[str, ArrayWriter] = {}
-        for start in range(0, max(len(labels), 1), block):
-            some = np.arange(start, min(start + block, len(labels)))
-            part = labels if needs else labels.take(some)
-            own = seeds[start : start + block]
-            rendered = plugin.module.render(part, image_size_of(frames), plugin.options, own, *further)
+        for start in range(0, max(len(labels), 1), BLOCK_ROWS):
+            some = np.arange(start, min(start + BLOCK_ROWS, len(labels)))
+            further: list[np.ndarray | BodyMotions] = []
+            if needs == "intensity":
+                further = [read_pairs(rows.take(some), frames, encoding)]
+            elif motions is not None:
+                further = [motions.take(some)]
+            own = seeds[start : start + BLOCK_ROWS]
+            rendered = plugin.module.render(labels.take(some), image_size_of(frames), plugin.options, own, *further)
             prompts += rendered.prompts
             for name, array in condition_arrays(rendered).items():
                 if name not in written:
