@@ -47,6 +47,24 @@ def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarr
     return replace(at_end, t_us=t_end_us, joints2d=joints, visible=visible)
 
 
+def has_label(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarray) -> np.ndarray:
+    """Which windows [N] the track has something to say of: a label within, or as near as labels usually follow.
+
+    Recordings go on where nobody labelled them. What was true half a second ago is no label.
+
+    Args:
+        labels: the track, times ascending; a single row holds throughout.
+        t_start_us: [N] int64, first event of each window.
+        t_end_us: [N] int64, last event of each window.
+    """
+    if len(labels) == 1:
+        return np.ones(len(t_start_us), bool)
+    near_us = int(np.median(np.diff(labels.t_us)))
+    return np.searchsorted(labels.t_us, t_start_us - near_us) < np.searchsorted(
+        labels.t_us, t_end_us + near_us, side="right"
+    )
+
+
 def labels_in_image(
     labels: Labels, map_points: Callable[[np.ndarray], np.ndarray], image_size: tuple[int, int]
 ) -> Labels:

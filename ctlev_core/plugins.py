@@ -6,10 +6,13 @@ What a module must have is said by the Protocols of `ctlev_core.plugin_contracts
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import pkgutil
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, get_args
@@ -47,6 +50,24 @@ def names(kind: str) -> list[str]:
         raise PluginError(f"unknown plug-in kind {kind!r}; known kinds: {', '.join(KINDS)}")
     package = importlib.import_module(f"ctlev_core.{kind}")
     return sorted(module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_"))
+
+
+@cache
+def versions(kind: str) -> dict[str, int]:
+    """VERSION of every plug-in of a kind, by name; read as text, for to import all of them takes seconds.
+
+    Raises:
+        PluginError: a module does not say its VERSION as a number of its own line.
+    """
+    found = {}
+    for name in names(kind):
+        spec = importlib.util.find_spec(f"ctlev_core.{kind}.{name}")
+        text = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
+        match = re.search(r"^VERSION = (\d+)", text, re.MULTILINE)
+        if match is None:
+            raise PluginError(f"{kind}/{name}: expected a line 'VERSION = number' in its module")
+        found[name] = int(match[1])
+    return found
 
 
 def recognise(formats: Mapping[str, ModuleType], path: Path) -> ModuleType | None:

@@ -95,5 +95,7 @@ class Windows(Frozen):
     )
     num_events: int = Field(default=7500, gt=0, description="events a window (count); DHP19's mean per camera")
     duration_us: int = Field(default=8333, gt=0, description="length of a window (duration); CDEHP has 120 a second")
-    max_windows: int | None = Field(default=None, gt=0, description="at most so many per recording, evenly spread")
+    max_windows: int | None = Field(
+        default=None, gt=0, description="at most so many of each split of a recording, evenly spread"
+    )
     min_events: int = Field(default=1, ge=1, description="drop windows with fewer events (duration, whole)")

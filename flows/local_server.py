@@ -38,6 +38,7 @@ _SERVER = {
 }
 _server: subprocess.Popen[bytes] | None = None
 _url = ""
+_log = Path()
 
 
 def configure(home: Path, *, verbose: bool) -> None:
@@ -47,21 +48,24 @@ def configure(home: Path, *, verbose: bool) -> None:
     settings = {"PREFECT_HOME": str(home / "prefect"), "PREFECT_LOGGING_LEVEL": "INFO" if verbose else "CRITICAL"}
     for name, value in {**_QUIET, **settings}.items():
         os.environ.setdefault(name, value)
+    # Where there is a proxy to the world outside, it knows nothing of a server on this machine.
+    for name in ("NO_PROXY", "no_proxy"):
+        os.environ[name] = ",".join(filter(None, [os.environ.get(name, ""), "127.0.0.1", "localhost"]))
 
 
 def start(home: Path) -> None:
     """Start the private server in the background, unless the user named a server in PREFECT_API_URL."""
-    global _server, _url
+    global _server, _url, _log
     if os.environ.get("PREFECT_API_URL"):
         return
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    log = home / "logs" / "prefect_server.log"
-    log.parent.mkdir(parents=True, exist_ok=True)
+    _log = home / "logs" / "prefect_server.log"
+    _log.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]
     command += ["--host", "127.0.0.1", "--port", str(port), "--log-level", "error", "--timeout-keep-alive", "30"]
-    with log.open("wb") as file:
+    with _log.open("wb") as file:
         _server = subprocess.Popen(
             command,
             env={**os.environ, **_SERVER},
@@ -93,18 +97,17 @@ def connected() -> Iterator[None]:
 
 
 def _wait(server: subprocess.Popen[bytes]) -> None:
-    log = Path(os.environ["PREFECT_HOME"]).parent / "logs" / "prefect_server.log"
     deadline = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline:
         if server.poll() is not None:
-            raise RuntimeError(f"the local Prefect server ended with code {server.returncode}; see {log}")
+            raise RuntimeError(f"the local Prefect server ended with code {server.returncode}; see {_log}")
         try:
             with urllib.request.urlopen(f"{_url}/health", timeout=5) as response:
                 if response.status == 200:
                     return
         except (urllib.error.URLError, OSError):
             time.sleep(0.05)
-    raise RuntimeError(f"the local Prefect server did not answer within {START_TIMEOUT_S:.0f} s; see {log}")
+    raise RuntimeError(f"the local Prefect server did not answer within {START_TIMEOUT_S:.0f} s; see {_log}")
 
 
 def stop() -> None:

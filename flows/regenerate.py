@@ -94,6 +94,7 @@ def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: Mani
         conditions,
         sampling=regeneration.sampling_choice,
         max_tries=regeneration.max_tries,
+        rounding=regeneration.rounding,
         seed=seed,
         label=regeneration.generator.name,
     )

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ctlev_core import event_files, plugins
 from ctlev_core.image_resampling import resample_images
-from ctlev_core.labelling import labels_at_windows, labels_in_image
+from ctlev_core.labelling import has_label, labels_at_windows, labels_in_image
 from ctlev_core.windows import cut_chunks, spread
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
@@ -24,6 +24,8 @@ from data_contracts.manifest import Manifest, by_recording, concat_labels, label
 from tasks.stage import Output, stage
 from tasks.workers import is_spread, map_shards
 
+COUNTS = "event_histogram"
+"""The encoding that finished event images, which show how many events there were, can stand for."""
 MAX_EVENTS = 1 << 22
 """Events held at a time; with what reading them takes, 0.2 GiB."""
 MAX_GAP = 1 << 18
@@ -61,7 +63,7 @@ class _Samples(NamedTuple):
     labels: Labels
 
 
-@stage(version=3, schema=tables.FRAMES)
+@stage(version=4, schema=tables.FRAMES)
 def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windows: Windows) -> pa.Table:
     """Cut every recording into windows and encode each: arrays `histograms` (counts) and `frames` (8-bit RGB).
 
@@ -200,8 +202,13 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
             else:
                 events = held.slice(first - start, last - start)
             local = ranges[rows] - first
-            counts = plugin.module.encode(events, local, plugin.options)
             t_start, t_end = events.t[local[:, 0]], events.t[local[:, 1] - 1]
+            if labels is None:
+                known = has_label(source.track, t_start, t_end)
+                rows, local, t_start, t_end = (array[known] for array in (rows, local, t_start, t_end))
+                if not len(rows):
+                    continue
+            counts = plugin.module.encode(events, local, plugin.options)
             own = labels_at_windows(source.track, t_start, t_end) if labels is None else labels.take(rows)
             own = _to_image(own, events.sensor_size, plugin, (counts.shape[3], counts.shape[2]))
             described = _rows(source.recording, part["split"], rows, t_start, t_end, local[:, 1] - local[:, 0])
@@ -231,6 +238,8 @@ def _groups(ranges: np.ndarray) -> Iterator[np.ndarray]:
 def _encode_images(source: _Source, plugin: plugins.Plugin, windows: Windows) -> Iterator[_Samples]:
     """Finished event images: every one is a window; the grey values, in fixed point, stand for counts."""
     recording, name = source.recording, source.recording["recording_id"]
+    if plugin.name != COUNTS:
+        raise DataError(f"{name} comes as grey event images, which only the encoding {COUNTS!r} takes")
     if getattr(plugin.options, "polarity", False):
         raise DataError(
             f"{name} comes as grey event images, which have no polarity; set encoding.options.polarity=false"

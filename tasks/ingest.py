@@ -37,7 +37,23 @@ class _Ingested(NamedTuple):
 def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     plugin = plugins.load_options(arguments["dataset"])
     recordings = _list_recordings(plugin)
-    return [(f"{recording.recording_id}:{path.name}", path) for recording in recordings for path in recording.files]
+    # What a dataset says of a recording need not be in its files or in its id: a caption, a split.
+    named = {
+        recording.recording_id: f"{recording.recording_id}:{recording.subject}:{recording.class_name}:{recording.parts}"
+        for recording in recordings
+    }
+    return [(f"{named[r.recording_id]}:{path.name}", path) for r in recordings for path in r.files]
+
+
+def _check_track(labels: Labels, recording: Recording, where: str) -> Labels:
+    """As `check_labels`; and times must ascend, and what was recorded must have a label."""
+    check_labels(labels, where)
+    if (np.diff(labels.t_us) < 0).any():
+        first = int(np.argmax(np.diff(labels.t_us) < 0))
+        raise DataError(f"{where}: times of labels must ascend, got {labels.t_us[first : first + 2].tolist()} us")
+    if not len(labels) and (recording.has_events or recording.has_event_images):
+        raise DataError(f"{where}: expected one label at least, got none")
+    return labels
 
 
 def _list_recordings(plugin: Plugin) -> list[Recording]:
@@ -55,7 +71,7 @@ def _list_recordings(plugin: Plugin) -> list[Recording]:
     return recordings
 
 
-@stage(version=4, schema=tables.RECORDINGS, raw_files=_raw_files)
+@stage(version=4, schema=tables.RECORDINGS, raw_files=_raw_files, readers=("formats", "motions"))
 def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     """Read every recording once, check it, and keep events and labels in the project's own form."""
     plugin = plugins.load_options(dataset)
@@ -79,7 +95,7 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
 def _ingest_recording(dataset: DatasetChoice, out: Output, recording: Recording) -> _Ingested:
     plugin = plugins.load_options(dataset)
     where = f"{plugin.name} {recording.recording_id}"
-    labels = check_labels(plugin.module.read_labels(recording, plugin.options), where)
+    labels = _check_track(plugin.module.read_labels(recording, plugin.options), recording, where)
     row: dict[str, Any] = {
         "recording_id": recording.recording_id,
         "subject": recording.subject,

@@ -47,7 +47,7 @@ from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
 from tasks.runners import asked_runner
-from tasks.store import RawFileDigests, Store
+from tasks.store import Store, digest_raw_files
 from tasks.workers import current_workers, together
 
 if TYPE_CHECKING:
@@ -144,13 +144,19 @@ class Stage:
     """See the module's docstring. Made by the decorator `stage`."""
 
     def __init__(
-        self, function: Callable[..., pa.Table], version: int, schema: TableSchema, raw_files: RawFiles | None
+        self,
+        function: Callable[..., pa.Table],
+        version: int,
+        schema: TableSchema,
+        raw_files: RawFiles | None,
+        readers: Sequence[str] = (),
     ) -> None:
         self.function = function
         self.name = function.__name__
         self.version = version
         self.schema = schema
         self.raw_files = raw_files
+        self.readers = readers
         self.signature = inspect.signature(function)
         self.__doc__ = function.__doc__
 
@@ -185,9 +191,9 @@ class Stage:
         material: dict[str, Any] = {"stage": self.name, "version": self.version, "table": self.schema.version}
         material["arguments"] = {name: _material(value) for name, value in arguments.items()}
         if self.raw_files is not None:
-            digests = RawFileDigests(store.home)
-            material["raw_files"] = [[name, digests.digest(path)] for name, path in self.raw_files(arguments)]
-            digests.save()
+            material["raw_files"] = digest_raw_files(self.raw_files(arguments), store.home)
+            if material["raw_files"]:
+                material |= {kind: plugins.versions(kind) for kind in self.readers}
         return hashlib.sha256(json.dumps(material, sort_keys=True).encode()).hexdigest()[:32]
 
     def run(self, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
@@ -257,13 +263,25 @@ def numbered(label: str, number: int) -> str:
 
 
 def files_of(places: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Files, and every file of folders, named by the place's number and the path inside it, for `raw_files`."""
+    """Files, and every file of folders, named by the place's number and the path inside it, for `raw_files`.
+
+    Links to folders are followed: parts of a model that several models share are often linked.
+    """
     return [
         (str(number) if path == place else f"{number}/{path.relative_to(place).as_posix()}", path)
         for number, place in enumerate(places)
-        for path in ([place] if place.is_file() else sorted(place.rglob("*")))
+        for path in ([place] if place.is_file() else sorted(_files_within(place)))
         if path.is_file()
     ]
+
+
+def _files_within(folder: Path) -> Iterator[Path]:
+    seen = set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        seen.add(os.path.realpath(place))
+        # Not into a folder that links to one around it.
+        folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) not in seen]
+        yield from (Path(place, name) for name in names)
 
 
 def input_files_of(argument: str) -> RawFiles:
@@ -278,7 +296,7 @@ def input_files_of(argument: str) -> RawFiles:
 
 
 def stage(
-    *, version: int, schema: TableSchema, raw_files: RawFiles | None = None
+    *, version: int, schema: TableSchema, raw_files: RawFiles | None = None, readers: Sequence[str] = ()
 ) -> Callable[[Callable[..., pa.Table]], Stage]:
     """Make a function a stage.
 
@@ -286,8 +304,9 @@ def stage(
         version: raise it when the function's output changes for the same inputs.
         schema: of the table the function returns.
         raw_files: names the files from outside the store that the stage reads.
+        readers: kinds of plug-ins that read them, found by what is in the files: one that is mended reads all anew.
     """
-    return lambda function: Stage(function, version, schema, raw_files)
+    return lambda function: Stage(function, version, schema, raw_files, readers)
 
 
 def _run_as_task(stage: Stage, label: str, key: str, arguments: dict[str, Any]) -> ManifestRef:

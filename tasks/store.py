@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import itertools
 import json
 import os
 import re
@@ -27,7 +28,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, ClassVar
 
 from data_contracts.errors import DataError
 from data_contracts.manifest import RUN_FILE, ManifestRef, file_digest, read_manifest
@@ -103,7 +104,7 @@ class Store:
         """Move a damaged or outdated artefact out of the way without deleting it; returns its new place."""
         target = self.home / "damaged" / folder.parent.name
         target.mkdir(parents=True, exist_ok=True)
-        number = sum(1 for _ in target.glob(f"{folder.name}.*"))
+        number = next(number for number in itertools.count() if not (target / f"{folder.name}.{number}").exists())
         with contextlib.suppress(FileNotFoundError):
             folder.rename(target / f"{folder.name}.{number}")
         return target / f"{folder.name}.{number}"
@@ -256,18 +257,35 @@ class StoreInUseError(RuntimeError):
     """The store cannot be pruned because a run uses it."""
 
 
-class RawFileDigests:
-    """SHA-256 of raw input files, remembered by path, size and modification time.
+def digest_raw_files(files: Sequence[tuple[str, Path]], home: Path) -> list[list[str]]:
+    """[name, SHA-256 of the content] of each named file. What was read before is known by path, size and time.
 
     Planning an experiment hashes its raw recordings; a second plan must not read them again.
     """
+    if not files:
+        return []
+    digests = RawFileDigests(home)
+    found = [[name, digests.digest(path)] for name, path in files]
+    digests.save()
+    return found
+
+
+class RawFileDigests:
+    """SHA-256 of raw input files, remembered by path, size and modification time."""
+
+    _read: ClassVar[dict[Path, tuple[tuple[int, int], dict[str, list]]]] = {}
+    """What a process has read of a home, until somebody writes it anew: of a million files it takes seconds."""
 
     def __init__(self, home: Path) -> None:
+        """Read what the home remembers."""
         self.path = home / "raw_file_digests.json"
         self.artefacts = home.resolve() / "artefacts"
         self.known: dict[str, list] = {}
         with contextlib.suppress(OSError, ValueError):
-            self.known = json.loads(self.path.read_text())
+            written = _identity(self.path)
+            before, known = self._read.get(self.path, (None, {}))
+            self.known = known if before == written else json.loads(self.path.read_text())
+            self._read[self.path] = (written, self.known)
         self.changed = False
 
     def digest(self, path: Path) -> str:
@@ -290,10 +308,17 @@ class RawFileDigests:
         if not self.changed:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.path.with_suffix(f".{os.getpid()}.tmp")
-        temporary.write_text(json.dumps(self.known))
+        temporary = self.path.with_suffix(f".{uuid.uuid4().hex}.tmp")  # threads, and containers that count alike
+        temporary.write_text(json.dumps(dict(self.known)))
+        written = _identity(temporary)
         temporary.replace(self.path)
+        self._read[self.path] = (written, self.known)
         self.changed = False
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
 
 
 def _touch(folder: Path) -> None:

@@ -22,7 +22,7 @@ def take_share(out: Output, synthetic: Manifest, *, share: float) -> pa.Table:
     return _take(out, synthetic, np.arange(max(round(share * len(synthetic)), 1)))
 
 
-@stage(version=1, schema=tables.SYNTHETIC)
+@stage(version=2, schema=tables.SYNTHETIC)
 def take_faithful(
     out: Output,
     model: Manifest,
@@ -45,7 +45,9 @@ def take_faithful(
         raise DataError(f"keep_faithful: metric {metric.name!r} has no score of single frames to choose by")
     prediction: Any = plugin.module.predict(model.ref.path / "model", np.asarray(synthetic.array("frames")))
     scores = scorer.module.compute_rows(prediction, synthetic.labels, scorer.options)
-    errors = scores if lower_is_better(metric.name) else -scores
+    # As elsewhere the name of the score decides, which need not be that of the plug-in.
+    first = next(iter(scorer.module.compute(prediction, synthetic.labels, scorer.options)))
+    errors = scores if lower_is_better(first) else -scores
     errors = np.where(np.isnan(errors), np.inf, errors)
     names = np.array(synthetic.labels.class_names)
     kept = []

@@ -11,7 +11,7 @@ from typing import IO
 
 import numpy as np
 
-from ctlev_core.format_files.event_tables import require_columns
+from ctlev_core.format_files.event_tables import require_columns, times_as_named
 from data_contracts.errors import DataError
 
 MAGIC = b"\x93NUMPY"
@@ -82,7 +82,8 @@ def split_structured(records: np.ndarray, where: str) -> dict[str, np.ndarray]:
         DataError: a field is missing.
     """
     found = require_columns(records.dtype.names or (), where)
-    return {column: records[name] for column, name in found.items()}
+    columns = {column: records[name] for column, name in found.items()}
+    return {**columns, "t": times_as_named(found["t"], columns["t"], where)}
 
 
 def read_items(file: IO[bytes], dtype: np.dtype, count: int, where: str) -> np.ndarray:

@@ -153,6 +153,25 @@ class _Converter:
         return seconds_to_us(values)
 
 
+def says_us(name: str) -> bool:
+    """Does a column's name say that its times are microseconds, whatever their type?"""
+    return name.strip().lower().endswith("_us")
+
+
+def times_as_named(name: str, times: np.ndarray, where: str) -> np.ndarray:
+    """Times of a column that says they are microseconds, rounded to whole ones; others as they are.
+
+    Raises:
+        DataError: they are negative, not finite or too large.
+    """
+    if times.dtype.kind != "f" or not says_us(name):
+        return times
+    wrong = ~((times >= 0) & (times < 2.0**62))
+    if wrong.any():
+        raise DataError(f"{where}: column {name!r} must be microseconds from 0 on, got {times[np.argmax(wrong)]}")
+    return np.rint(times).astype(np.int64)
+
+
 def seconds_to_us(seconds: np.ndarray) -> np.ndarray:
     """Microseconds [N] int64 nearest to the exact value of each float, ties to even.
 

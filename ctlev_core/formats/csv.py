@@ -6,7 +6,8 @@ with `#` are comments; `# sensor_size WIDTHxHEIGHT` before the first row states 
 common one that holds all events.
 
 Times are seconds where any of them in the file has a decimal point or an exponent, else microseconds, and are rounded
-to the nearest microsecond of what is written (never through a binary float). Polarity is {0, 1}, {-1, 1} or True and
+to the nearest microsecond of what is written (never through a binary float). In a column whose name ends in `_us` they
+are whole microseconds. Polarity is {0, 1}, {-1, 1} or True and
 False.
 
 Source: Mueggler et al., The Event-Camera Dataset and Simulator, IJRR 2017 (events.txt).
@@ -26,7 +27,7 @@ from ctlev_core.format_files.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
-VERSION = 1
+VERSION = 2
 SUFFIXES = (".csv", ".txt")
 HAS_SIGNATURE = False
 """Any text of four columns of numbers looks like this: asked only where no other format is recognised."""
@@ -46,6 +47,7 @@ class _Layout:
     offset: int
     names: tuple[str | None, ...]
     sensor_size: SensorSize | None
+    says_us: bool = False
 
 
 def sniff(path: Path) -> bool:
@@ -99,10 +101,10 @@ def _pieces(path: Path) -> Iterator[Events]:
     layout = _find_layout(path)
     if layout is None:
         raise DataError(f"{path}: expected rows of t x y p, or a header line that names these columns")
-    seconds, num_rows, sensor_size = False, 0, layout.sensor_size
+    has_points, num_rows, sensor_size = False, 0, layout.sensor_size
     largest = np.full(4, -1, np.int64)
     for rows, any_point in _read_rows(path, layout):
-        seconds |= any_point
+        has_points |= any_point
         num_rows += len(rows)
         if len(rows):
             np.maximum(largest, rows.max(0), out=largest)
@@ -112,7 +114,7 @@ def _pieces(path: Path) -> Iterator[Events]:
         sensor_size = smallest_sensor(int(largest[1]), int(largest[2]), str(path))
 
     def columns() -> Iterator[event_tables.Columns]:
-        for rows, _ in _read_rows(path, layout, seconds):
+        for rows, _ in _read_rows(path, layout, has_points and not layout.says_us):
             yield dict(zip(EVENT_DTYPES, rows.T, strict=True))
 
     yield event_pieces.empty_events(sensor_size)
@@ -134,7 +136,8 @@ def _find_layout(path: Path) -> _Layout | None:
             sensor_size = event_tables.parse_sensor_size(line.partition("sensor_size")[2].strip(" :=")) or sensor_size
         header = _parse_header(line.removeprefix("#"), path, is_comment) if line else None
         if header:
-            return _Layout(stop, header, sensor_size)
+            named = _field_names(line.removeprefix("#"))[header.index("t")]
+            return _Layout(stop, header, sensor_size, event_tables.says_us(named))
         if line and not is_comment:
             fields = [field for field in _SEPARATORS.split(line) if field]
             is_row = len(fields) == 4 and all(_NUMBER.fullmatch(field) for field in fields)
@@ -143,9 +146,13 @@ def _find_layout(path: Path) -> _Layout | None:
     return None
 
 
+def _field_names(line: str) -> list[str]:
+    return [name.strip("\"'") for name in _SEPARATORS.split(line) if name]
+
+
 def _parse_header(line: str, path: Path, is_comment: bool) -> tuple[str | None, ...] | None:
     """Which column each field names; None where the line does not name all four, an error where it names some."""
-    names = [name.strip("\"'") for name in _SEPARATORS.split(line) if name]
+    names = _field_names(line)
     if not names or any(_NUMBER.fullmatch(name) for name in names):
         return None
     found = {name: column for column, name in event_tables.find_columns(names).items()}

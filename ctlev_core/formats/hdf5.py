@@ -5,7 +5,8 @@
 - MVSEC: a dataset `davis/left/events` [N, 4] with columns x, y, t, p, t in seconds and p in {-1, 1}. `read` takes the
   left camera, on which MVSEC's ground truth is given, or with `camera="right"` the other.
 
-Integer times are microseconds, float times seconds, rounded to the nearest microsecond. An attribute `sensor_size`
+Integer times are microseconds, float times seconds unless their column says `_us`, rounded to the nearest microsecond.
+An attribute `sensor_size`
 (width, height) of the group or dataset states the sensor, else it is the smallest common one that holds all events.
 
 DSEC compresses with blosc: install hdf5plugin to read it.
@@ -26,7 +27,7 @@ from ctlev_core.format_files import event_pieces, event_tables
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
-VERSION = 1
+VERSION = 2
 SUFFIXES = (".h5", ".hdf5")
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -146,7 +147,8 @@ def _find_columns(file: Any, path: Path) -> Source:
         if group is None or not hasattr(group, "keys") or not event_tables.find_columns(_datasets(group)):
             continue
         where = f"{path}: group {name}"
-        columns = {column: group[key] for column, key in event_tables.require_columns(_datasets(group), where).items()}
+        found = event_tables.require_columns(_datasets(group), where)
+        columns = {column: group[key] for column, key in found.items()}
         lengths = {column: dataset.shape for column, dataset in columns.items()}
         if len(set(lengths.values())) != 1 or len(lengths["t"]) != 1:
             raise DataError(f"{where}: columns must be [N] and of one length, got {lengths}")
@@ -154,8 +156,11 @@ def _find_columns(file: Any, path: Path) -> Source:
             _check_stored(dataset, f"{where}, column {column}")
         offset = _time_offset(file, path)
 
-        def read_block(rows: slice, columns: dict[str, Any] = columns, offset: int = offset) -> event_tables.Columns:
+        def read_block(
+            rows: slice, columns: dict[str, Any] = columns, offset: int = offset, name: str = found["t"]
+        ) -> event_tables.Columns:
             values = {column: dataset[rows] for column, dataset in columns.items()}
+            values["t"] = event_tables.times_as_named(name, values["t"], str(path))
             if offset:
                 if values["t"].dtype.kind not in "ui" or (len(values["t"]) and int(values["t"].max()) >= 1 << 62):
                     raise DataError(f"{path}: t_offset needs t as whole microseconds, got {values['t'].dtype}")

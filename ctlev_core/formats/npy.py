@@ -21,7 +21,7 @@ from ctlev_core.format_files.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, check_events
 
-VERSION = 1
+VERSION = 2
 SUFFIXES = (".npy",)
 COLUMNS = ("x", "y", "t", "p")
 """Of an [N, 4] array."""

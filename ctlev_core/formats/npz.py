@@ -4,7 +4,8 @@
 - plain: one key a column, `x_pos`, `y_pos`, `timestamp`, `polarity` or any other name of `event_tables.COLUMN_NAMES`.
 
 Polarity is {0, 1}, {-1, 1} or bool. Times: integers are microseconds, and so are floats none of which has a fraction,
-because N-ImageNet counts microseconds and its own loader casts whatever it finds; other floats are seconds. A key
+because N-ImageNet counts microseconds and its own loader casts whatever it finds; other floats are seconds, unless
+their key or field says `_us`. A key
 `sensor_size` (width, height) states the sensor; without it the sensor is N-ImageNet's, 640 x 480 px, or where that is
 too small for the events the next common one. Archives are never unpickled.
 
@@ -25,7 +26,7 @@ from ctlev_core.format_files.sensor_sizes import COMMON_SENSORS
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
-VERSION = 1
+VERSION = 2
 SUFFIXES = (".npz",)
 
 _STRUCTURED_KEYS = ("event_data", "events")
@@ -147,7 +148,13 @@ def _read_members(
                 column: array_files.read_items(file, headers[column].dtype, count, str(path))
                 for column, file in files.items()
             }
-            yield array_files.split_structured(arrays[""], f"{path}: event_data") if "" in arrays else arrays
+            if "" in arrays:
+                arrays = array_files.split_structured(arrays[""], f"{path}: event_data")
+            else:
+                arrays["t"] = event_tables.times_as_named(
+                    members["t"].removesuffix(".npy"), arrays["t"], f"{path}: key 't'"
+                )
+            yield arrays
             remaining -= count
             if remaining == 0:
                 return

@@ -98,6 +98,28 @@ def test_versions_differ_and_can_be_made_again(home, make_version, tmp_path):
     assert again.model_dump(exclude={"made"}) == second.model_dump(exclude={"made"})
 
 
+def test_versions_are_sampled_as_the_experiments_own_frames_are(monkeypatch, tmp_path):
+    """What the experiment heeds of sampling the versions heed: the plans differ in seed and label alone."""
+    monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
+    from flows import full_experiment, regenerate, synthesize
+    from flows.command_line import load_experiment
+
+    asked = []
+    for module in (regenerate, synthesize):
+
+        def sample(*inputs, made=module.sample, **settings):
+            asked.append(settings)
+            return made(*inputs, **settings)
+
+        monkeypatch.setattr(module, "sample", sample)
+    options = ["baselines={}", "more_real=null", "round_to_counts=true", "max_tries=3"]
+    with planning():
+        regenerate.make_next_version(regenerate.load_regeneration("smoke", options))
+        full_experiment.full_experiment.fn(load_experiment("smoke", options))
+    own = [{name: value for name, value in named.items() if name not in ("seed", "label")} for named in asked]
+    assert own[0] == own[1] and own[0]["rounding"] is not None
+
+
 def test_without_new_poses_only_the_noise_is_new(home, make_version):
     second = make_version(home, "new_poses=false")
     third = make_version(home, "new_poses=false")

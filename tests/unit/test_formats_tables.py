@@ -7,6 +7,7 @@ import pickle
 import zipfile
 from fractions import Fraction
 
+import h5py
 import numpy as np
 import pytest
 from format_helpers import P, T, X, Y, assert_events, raises_both_ways, read_both_ways
@@ -201,3 +202,22 @@ def test_a_damaged_npz_is_an_error(tmp_path):
     damaged[len(content) // 3] ^= 0x55
     path.write_bytes(damaged)
     raises_both_ways(path, r"a\.npz: ")
+
+
+def test_a_column_that_says_microseconds_holds_microseconds(tmp_path):
+    """Whatever their type: what pandas or MATLAB wrote is often a float."""
+    t, x, p = np.array([1000.0, 2000.4]), np.array([1, 2]), np.array([1, 0])
+    np.savez(tmp_path / "a.npz", t_us=t, x=x, y=x, p=p)
+    records = np.empty(2, [("timestamp_us", "f8"), ("x", "u2"), ("y", "u2"), ("p", "u1")])
+    records["timestamp_us"], records["x"], records["y"], records["p"] = t, x, x, p
+    np.save(tmp_path / "b.npy", records)
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        for name, values in {"t_us": t, "x": x, "y": x, "p": p}.items():
+            file[f"events/{name}"] = values
+    (tmp_path / "d.csv").write_text("x,y,time_us,p\n1,1,1000.0,1\n2,2,2000,0\n")
+    for name in ("a.npz", "b.npy", "c.h5", "d.csv"):
+        assert event_files.read_events_file(tmp_path / name).t.tolist() == [1000, 2000]
+    (tmp_path / "e.csv").write_text("x,y,time_us,p\n1,1,1000.5,1\n")
+    raises_both_ways(tmp_path / "e.csv", "not a whole number")
+    np.savez(tmp_path / "f.npz", t_us=-t, x=x, y=x, p=p)
+    raises_both_ways(tmp_path / "f.npz", "'t_us' must be microseconds from 0 on, got -1000.0")

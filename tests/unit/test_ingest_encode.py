@@ -1,6 +1,7 @@
 """The stages between a dataset and its frames and conditions, on a small dataset that offers all a dataset may."""
 
 import types
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from data_contracts.labels import ImageTrack, Labels, Part, Recording
 from data_contracts.manifest import read_manifest
 from tasks.condition import condition_frames
 from tasks.encode import encode
-from tasks.ingest import ingest
+from tasks.ingest import _check_track, ingest
 from tasks.realism import realism
 from tasks.store import Store
 
@@ -210,3 +211,41 @@ def test_recordings_without_events_have_no_event_numbers_in_the_realism_table(fr
         )
     )
     assert set(made.column("group")) == {"frames"}
+
+
+def key_of(dataset):
+    return ingest.key({"dataset": dataset}, Store())
+
+
+def test_what_a_dataset_says_of_a_file_enters_the_key(monkeypatch, tmp_path):
+    """A caption beside it, or the folder it lies in: neither is in the file or need be in the recording's id."""
+    (tmp_path / "a.raw").write_bytes(b"1")
+
+    class Options(Frozen):
+        """None."""
+
+    recording = Recording("a", "someone", (Part("train"),), "walk", files=(tmp_path / "a.raw",))
+    changed = [
+        recording,
+        replace(recording, class_name="run"),
+        replace(recording, subject="another"),
+        replace(recording, parts=(Part("test"),)),
+    ]
+    keys = set()
+    for said in changed:
+        module = types.SimpleNamespace(VERSION=1, Options=Options, list_recordings=lambda options, r=said: [r])
+        monkeypatch.setattr(
+            plugins, "load_options", lambda _, m=module: plugins.Plugin("datasets", "fake", m, Options())
+        )
+        keys.add(key_of(DatasetChoice(name="fake")))
+    assert len(keys) == 4
+
+
+@pytest.mark.parametrize(
+    ("t_us", "message"), [([0, 20, 10], r"times of labels must ascend, got \[20, 10\] us"), ([], "got none")]
+)
+def test_tracks_out_of_order_and_empty_ones_are_refused(t_us, message):
+    recording = Recording("a", "someone", (Part("train"),))
+    labels = Labels(("walk",) * len(t_us), np.array(t_us, np.int64))
+    with pytest.raises(DataError, match=message):
+        _check_track(labels, recording, "test")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.labelling import labels_at_windows
+from ctlev_core.labelling import has_label, labels_at_windows
 from data_contracts.labels import Labels
 
 
@@ -26,6 +26,13 @@ def test_window_between_labels_takes_the_nearest():
     labels = track([0, 100], [[[0, 0]], [[9, 9]]])
     found = labels_at_windows(labels, np.array([40, 60, 300, -50]), np.array([45, 65, 310, -40]))
     assert found.joints2d[:, 0, 0].tolist() == [0, 9, 9, 0]
+
+
+def test_a_label_holds_as_long_as_labels_usually_follow():
+    labels = track([0, 10, 20, 30, 100], [[[0, 0]]] * 5)
+    start, end = np.array([-30, -12, 12, 41, 50, 85, 91, 111]), np.array([-11, -10, 13, 42, 85, 89, 92, 120])
+    assert has_label(labels, start, end).tolist() == [False, True, True, False, False, False, True, False]
+    assert has_label(labels.take([4]), start, end).all(), "a single row labels the whole recording"
 
 
 def test_joint_never_known_is_invisible():

@@ -116,8 +116,12 @@ def test_a_share_is_the_first_rows(tmp_path):
 def test_faithful_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
     errors = np.array([3, 9, 1, 1, 8, 2, 2, 7, 3, np.nan, 6, 4.0])
     model = SimpleNamespace(predict=lambda folder, frames: {})
-    metric = SimpleNamespace(compute_rows=lambda predicted, labels, options: errors)
-    fakes = {"pose2d": model, "mpjpe2d": metric, "pck2d": metric}
+
+    def metric(score):
+        return SimpleNamespace(compute_rows=lambda *given: errors, compute=lambda *given: {score: 1.0, "mpjpe": 2.0})
+
+    scores = {"mpjpe2d": "mpjpe2d_px", "pck2d": "pck2d", "worst_joint": "error_worst_joint_px"}
+    fakes = {"pose2d": model, **{name: metric(score) for name, score in scores.items()}}
     monkeypatch.setattr(
         plugins, "load_options", lambda choice: SimpleNamespace(module=fakes[choice.name], options=None)
     )
@@ -136,7 +140,9 @@ def test_faithful_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
         return table["sample_id"].to_pylist()
 
     # a: rows 0, 3, 6, 9 with errors 3, 1, 2, NaN; b: the other eight.
-    assert kept("mpjpe2d") == ["s2", "s3", "s5", "s6", "s8", "s11"]
+    kept_of_errors = ["s2", "s3", "s5", "s6", "s8", "s11"]
+    assert kept("mpjpe2d") == kept_of_errors
+    assert kept("worst_joint") == kept_of_errors
     # Of a score that wants to be large the largest are kept.
     assert kept("pck2d") == ["s0", "s1", "s4", "s6", "s7", "s10"]
 

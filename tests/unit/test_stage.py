@@ -17,13 +17,14 @@ import pyarrow as pa
 import pytest
 from pydantic import Field
 
+from ctlev_core import plugins
 from ctlev_core.plugins import PluginError
 from data_contracts import tables
 from data_contracts.config import RUN_SETTING, DatasetChoice, Frozen, Windows, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import read_manifest
 from tasks import workers
-from tasks.stage import in_one_run, planning, stage
+from tasks.stage import files_of, in_one_run, planning, stage
 from tasks.store import Store
 
 
@@ -306,8 +307,6 @@ def test_two_processes_make_an_artefact_once():
 
 
 def test_content_of_raw_folders_enters_the_key_and_their_place_does_not(tmp_path):
-    from tasks.stage import files_of
-
     def key(*folders):
         reads = stage(version=1, schema=tables.TRAINING, raw_files=lambda arguments: files_of(folders))(first.function)
         return reads.key({"windows": Windows(), "seed": 0}, Store())
@@ -317,3 +316,25 @@ def test_content_of_raw_folders_enters_the_key_and_their_place_does_not(tmp_path
         (tmp_path / name / "unet" / "config.json").write_text(content)
     assert key(tmp_path / "a") == key(tmp_path / "b") != key(tmp_path / "c")
     assert key(tmp_path / "a", tmp_path / "b") != key(tmp_path / "a")
+
+
+def test_linked_folders_are_read_and_loops_are_not(tmp_path):
+    (tmp_path / "shared").mkdir()
+    (tmp_path / "shared" / "weights").write_bytes(b"1")
+    model = tmp_path / "model"
+    (model / "vae").mkdir(parents=True)
+    (model / "unet").symlink_to(tmp_path / "shared")
+    (model / "vae" / "loop").symlink_to(model)
+    assert [name for name, _ in files_of([model])] == ["0/unet/weights"]
+
+
+def test_versions_of_readers_enter_the_key_of_stages_that_read_files(tmp_path, monkeypatch):
+    (tmp_path / "a").write_bytes(b"1")
+    keys = []
+    for files in ([("a", tmp_path / "a")], []):
+        made = stage(version=1, schema=tables.TRAINING, raw_files=lambda _, f=files: f, readers=("formats",))
+        reads = made(first.function)
+        for version in (1, 2):
+            monkeypatch.setattr(plugins, "versions", lambda kind, v=version: {"evt3": v})
+            keys.append(reads.key({"windows": Windows(), "seed": 0}, Store()))
+    assert keys[0] != keys[1] and keys[2] == keys[3]

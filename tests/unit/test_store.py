@@ -3,12 +3,14 @@
 import contextlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import textwrap
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from data_contracts.published import StoredArtefact, Version, published_folder, 
 from data_contracts.regeneration import Gates
 from data_contracts.tables import TABLES
 from flows import prune, verify
-from tasks.store import RawFileDigests, Store, StoreInUseError
+from tasks.store import RawFileDigests, Store, StoreInUseError, digest_raw_files
 
 DAY_S = 86_400
 TABLE = pa.table(
@@ -493,3 +495,29 @@ def test_a_store_that_may_only_be_read_is_read_and_errors_are_clear(monkeypatch,
             ref = Store(home).find("encode", whole.name)
         assert ref is not None and ref.digest == json.loads((whole / "run.json").read_text())["digest"]
         assert tree(home) == before
+
+
+def test_digests_of_raw_files_are_read_once_and_written_by_many(tmp_path, monkeypatch):
+    for number in range(16):
+        (tmp_path / f"{number}.raw").write_bytes(bytes([number]))
+    with ThreadPoolExecutor(8) as pool:
+        named = [[(str(number), tmp_path / f"{number}.raw")] for number in range(16)]
+        found = list(pool.map(lambda files: digest_raw_files(files, tmp_path), named))
+    assert len({digest for ((_, digest),) in found}) == 16
+    assert not list(tmp_path.glob("*.tmp")) and len(json.loads((tmp_path / "raw_file_digests.json").read_text())) > 0
+    everything = [file for files in named for file in files]
+    assert digest_raw_files(everything, tmp_path) == [row for rows in found for row in rows]
+    monkeypatch.setattr("tasks.store.json.loads", lambda text: pytest.fail("read again"))
+    monkeypatch.setattr("tasks.store.file_digest", lambda path: pytest.fail("hashed again"))
+    assert digest_raw_files(everything, tmp_path) == [row for rows in found for row in rows]
+
+
+def test_what_is_set_aside_gets_a_free_name(tmp_path):
+    store = Store(tmp_path)
+    for number in range(2):
+        (tmp_path / "artefacts" / "encode" / "k").mkdir(parents=True)
+        assert store.set_aside(tmp_path / "artefacts" / "encode" / "k").name == f"k.{number}"
+    shutil.rmtree(tmp_path / "damaged" / "encode" / "k.0")
+    (tmp_path / "artefacts" / "encode" / "k").mkdir(parents=True)
+    (tmp_path / "artefacts" / "encode" / "k" / "file").touch()
+    assert (store.set_aside(tmp_path / "artefacts" / "encode" / "k") / "file").exists()
