@@ -17,6 +17,7 @@ from ctlev_core import event_files, plugins
 from ctlev_core.event_streams import TimeModel, fit_times, sample_streams
 from ctlev_core.format_files import event_pieces
 from ctlev_core.image_counts import CountModel, estimate_counts, fit_counts
+from ctlev_core.image_geometry import image_size, pixel_bins
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
@@ -34,7 +35,7 @@ _COUNT_STREAM, _TIME_STREAM = 1, 2
 _ENCODING = "event_histogram"
 
 
-@stage(version=1, schema=tables.EVENT_STREAMS)
+@stage(version=2, schema=tables.EVENT_STREAMS)
 def export_events(
     out: Output,
     generated: Manifest,
@@ -97,7 +98,19 @@ def _learn(frames: Manifest, recordings: Manifest, plugin: plugins.Plugin) -> tu
     histograms = frames.array("histograms")
     counts = fit_counts(np.asarray(histograms[rows[spread(len(rows), 4 * MAX_WINDOWS)]]), plugin.options)
     chosen = frames.table.take(pa.array(rows[spread(len(rows), MAX_WINDOWS)]))
-    return counts, fit_times(_windows(chosen.to_pylist(), recordings))
+    windows = _windows(chosen.to_pylist(), recordings)
+    return counts, fit_times(_in_image(events, plugin.options) for events in windows)
+
+
+def _in_image(events: Events, options: Any) -> Events:
+    """The events in the pixels that counts are of: many pixels of a sensor may be one of the image, and take turns."""
+    columns, rows = pixel_bins(events.sensor_size, options)
+    x, y = columns[events.x], rows[events.y]
+    inside = (x >= 0) & (y >= 0)
+    return Events(
+        events.t[inside], x[inside].astype(np.uint16), y[inside].astype(np.uint16), events.p[inside],
+        image_size(events.sensor_size, options),
+    )  # fmt: skip
 
 
 def _windows(rows: list[dict[str, Any]], recordings: Manifest) -> Iterator[Events]:

@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
 from ctlev_core.diffusion.latent_cache import cache_latents, check_cache, check_training_data
 from ctlev_core.diffusion.prior import Prior
@@ -54,6 +55,23 @@ def forget_weights(prior: Prior, seed: int) -> Prior:
     return replace(prior, unet=unet, controlnet=controlnet)
 
 
+def check_channel_order(prior: Prior, conditions: Conditions) -> None:
+    """Raise `DataError` where the ControlNet exchanges red and blue of normal maps that are drawn so already, or not.
+
+    Nothing else would notice: it learns slowly, from weights that know other colours.
+    """
+    convention = ""
+    if conditions.made_by is not None and conditions.made_by.name == "normals":
+        convention = plugins.load_options(conditions.made_by).options.convention
+    order = "bgr" if prior.reversed_condition else "rgb"
+    if (convention, order) in (("controlnet", "bgr"), ("controlnet_unreversed", "rgb")):
+        fitting = "controlnet_unreversed" if order == "bgr" else "controlnet"
+        raise DataError(
+            f"condition 'normals': convention {convention!r} does not fit a ControlNet whose channel order is "
+            f"{order!r}; set condition.options.convention={fitting}"
+        )
+
+
 def fine_tune(
     prior: Prior,
     frames: np.ndarray,
@@ -86,6 +104,7 @@ def fine_tune(
             not fit one another.
     """
     check_training_data(frames, conditions, prior.image_size)
+    check_channel_order(prior, conditions)
     if options.turned_share and frames.shape[1] != frames.shape[2]:
         raise DataError(f"turned_share needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0")
     device = prior.unet.device

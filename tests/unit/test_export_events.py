@@ -212,3 +212,15 @@ def test_copies_are_found_with_the_frames_they_copy(tmp_path):
     pairs = manifest.attached(CLOSEST_PAIRS).to_pylist()
     assert [(pair["generated_row"], pair["training_row"]) for pair in pairs[:2]] == [(0, 5), (1, 20)]
     assert pairs[0]["training_id"] == "r0:5" and pairs[0]["distance"] == 0
+
+
+@pytest.mark.parametrize("fit", ["crop", "pad"])
+def test_times_are_learnt_in_the_pixels_that_counts_are_of(fit):
+    """Events in image pixels have the histogram of those in sensor pixels, and one pixel has the gaps of several."""
+    events, options = make_events(0), ENCODING.Options(image_size=(8, 8), fit=fit)
+    seen = task._in_image(events, options)
+    assert seen.sensor_size == (8, 8) and (len(seen) < len(events)) == (fit == "crop")
+    expected = ENCODING.encode(events, np.array([[0, len(events)]]), options)
+    np.testing.assert_array_equal(ENCODING.encode(seen, np.array([[0, len(seen)]]), ENCODING.Options()), expected)
+    own = task._in_image(events, ENCODING.Options())
+    assert all(np.array_equal(getattr(own, name), getattr(events, name)) for name in ("t", "x", "y", "p"))

@@ -12,10 +12,11 @@ from tiny_prior import CORPUS, make_data, make_prior, shared_prior
 
 from ctlev_core.diffusion import trainer
 from ctlev_core.diffusion.checkpoint_training import train_checkpoint
-from ctlev_core.diffusion.finetuning import fine_tune
+from ctlev_core.diffusion.finetuning import check_channel_order, fine_tune
 from ctlev_core.diffusion.latent_cache import cache_latents
 from ctlev_core.diffusion.prior import encode_prompts, save_prior
 from ctlev_core.diffusion.training_options import FineTuningOptions
+from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import Conditions
 
@@ -153,3 +154,15 @@ def test_empty_and_saturated_frames_can_be_learnt(tmp_path):
     frames[0], frames[1] = 0, 255
     prior, history = tuned(tmp_path, frames=frames, conditions=dataclasses.replace(CONDITIONS, images=frames))
     assert finite(prior) and all(math.isfinite(loss) for loss in history.loss)
+
+
+@pytest.mark.parametrize(("order", "convention"), [("bgr", "controlnet"), ("rgb", "controlnet_unreversed")])
+def test_colours_that_are_exchanged_twice_or_never_are_refused(order, convention):
+    prior = make_prior()
+    prior.controlnet.register_to_config(controlnet_conditioning_channel_order=order)
+    asked = Conditions(("a",), made_by=ConditionChoice(name="normals", options={"convention": convention}))
+    with pytest.raises(DataError, match=f"convention '{convention}' does not fit .* '{order}'; set condition.options"):
+        check_channel_order(prior, asked)
+    prior.controlnet.register_to_config(controlnet_conditioning_channel_order="bgr" if order == "rgb" else "rgb")
+    check_channel_order(prior, asked)
+    check_channel_order(prior, Conditions(("a",), made_by=ConditionChoice(name="skeleton")))
