@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ctlev_core.diffusion.prior_parts import PriorFiles, PriorPart, read_json
@@ -15,6 +17,8 @@ CLASSES = {
     "text_encoder": ("CLIPTextModel",),
 }
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
+BETA_SCHEDULES = ("linear", "scaled_linear", "squaredcos_cap_v2")
+"""Those that every solver of diffusers knows."""
 _EXTRA_CHANNELS = {
     9: "a U-Net for inpainting: latents, masked image and mask",
     8: "a U-Net that edits images: latents and those of another image",
@@ -139,6 +143,27 @@ def check_schedule(files: PriorFiles) -> None:
         raise DataError(
             f"{files.place}: prediction_type must be one of {', '.join(PREDICTION_TYPES)}, got {prediction!r}"
         )
+    if config.get("rescale_betas_zero_snr") and prediction == "epsilon":
+        raise DataError(
+            f"{files.place}: rescale_betas_zero_snr leaves no signal at the last step, where predicting the noise "
+            "(epsilon) says nothing of the image; expected prediction_type v_prediction or sample"
+        )
+    steps = config.get("num_train_timesteps", 1000)
+    if not isinstance(steps, int) or steps < 1:
+        raise DataError(f"{files.place}: num_train_timesteps must be a positive whole number, got {steps!r}")
+    if not config.get("trained_betas"):
+        _check_betas(files.place, config)
+
+
+def _check_betas(place: Path, config: Mapping[str, Any]) -> None:
+    """Raise unless every solver can make the noise schedule of these."""
+    if config["beta_schedule"] not in BETA_SCHEDULES:
+        known = ", ".join(BETA_SCHEDULES)
+        raise DataError(f"{place}: beta_schedule must be one of {known}, got {config['beta_schedule']!r}")
+    for name in ("beta_start", "beta_end"):
+        value = config[name]
+        if not isinstance(value, int | float) or not 0 < value < 1:
+            raise DataError(f"{place}: {name} must be a number between 0 and 1, got {value!r}")
 
 
 def complete_schedule(files: PriorFiles) -> dict[str, Any]:

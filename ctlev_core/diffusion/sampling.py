@@ -171,25 +171,30 @@ def sample_shards(
     if not shards:
         return
     table = encode_prompts(prior, [*prompts, ""]).cpu()
-    batches = ShrinkingBatches(options.batch_size)
+    # Apart: the decoder takes more memory than the networks, and what they computed must not be lost for it.
+    batches, decoded = ShrinkingBatches(options.batch_size), ShrinkingBatches(options.batch_size)
     for shard in shards:
         embeddings = table[[prompts.index(prompt) for prompt in shard.conditions.prompts]]
         sample = functools.partial(_sample_rows, prior, shard, embeddings, table[-1:], options)
         parts = []
-        for rows, frames in batches.map(sample, len(shard)):
-            parts.append(frames)
+        for rows, latents in batches.map(sample, len(shard)):
+            decode = functools.partial(_decode_rows, prior, latents, options)
+            parts += [frames for _, frames in decoded.map(decode, len(latents))]
             report(rows.stop - rows.start)
         shard.write(np.concatenate(parts))
 
 
 def _sample_rows(
     prior: Prior, shard: Shard, embeddings: Tensor, empty_embedding: Tensor, options: SamplingOptions, rows: slice
-) -> np.ndarray:
+) -> Tensor:
     images = None
     if shard.conditions.images is not None:
         images = conditions_to_tensor(shard.conditions.images[rows], prior.reversed_condition)
-    latents = sample_latents(prior, embeddings[rows], empty_embedding, images, shard.seeds[rows], options)
-    return decode_frames(prior, latents, options)
+    return sample_latents(prior, embeddings[rows], empty_embedding, images, shard.seeds[rows], options)
+
+
+def _decode_rows(prior: Prior, latents: Tensor, options: SamplingOptions, rows: slice) -> np.ndarray:
+    return decode_frames(prior, latents[rows], options)
 
 
 def sample_checkpoint(

@@ -156,6 +156,16 @@ def test_schedule_comes_from_the_folder(folder, caplog):
     change_json(path, prediction_type="flow_prediction")
     with pytest.raises(DataError, match="prediction_type must be one of epsilon, v_prediction, sample, got 'flow"):
         check_prior_folder(folder)
+    change_json(path, prediction_type="epsilon")
+    for changed, message in (
+        ({"rescale_betas_zero_snr": True}, "expected prediction_type v_prediction or sample"),
+        ({"rescale_betas_zero_snr": False, "num_train_timesteps": "many"}, "positive whole number, got 'many'"),
+        ({"num_train_timesteps": 1000, "beta_schedule": "sigmoid"}, "one of linear, scaled_linear, .* got 'sigmoid'"),
+        ({"beta_schedule": "linear", "beta_end": "x"}, "beta_end must be a number between 0 and 1, got 'x'"),
+    ):
+        change_json(path, **changed)
+        with pytest.raises(DataError, match=message):
+            check_prior_folder(folder)
     path.write_text(json.dumps({"_class_name": "FlowMatchEulerDiscreteScheduler", "num_train_timesteps": 1000}))
     with pytest.raises(DataError, match=r"FlowMatchEuler.* lacks beta_start, beta_end, beta_schedule"):
         check_prior_folder(folder)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from tiny_prior import SIDE, make_data, make_prior, shared_prior
 
+from ctlev_core.diffusion import sampling
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 from ctlev_core.diffusion.prior import images_to_tensor, save_prior
 from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
@@ -71,6 +72,24 @@ def test_batches_are_halved_where_memory_runs_out(tmp_path, caplog, error):
     assert [record.args[:2] for record in caplog.records] == [(4, 2), (2, 1)]
     # 4 and 2 fail at their first step, then six images take three steps each: nothing is tried again.
     assert unet.batches == [4, 2] + [1] * 18
+
+
+def test_what_was_sampled_is_not_sampled_again_for_a_decoder_that_takes_more_memory(tmp_path, monkeypatch):
+    conditions, unet = make_data(6, seed=4)[1], Network(shared_prior().unet)
+    whole = sample_frames(shared_prior(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
+    decode, asked = sampling.decode_latents, []
+
+    def narrow(prior, latents):
+        asked.append(len(latents))
+        if len(latents) > 1:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return decode(prior, latents)
+
+    monkeypatch.setattr(sampling, "decode_latents", narrow)
+    prior = dataclasses.replace(shared_prior(), unet=unet)
+    frames = sample_frames(prior, conditions, FAST, seeds=SEEDS, work=tmp_path / "narrow")
+    assert np.abs(frames.astype(int) - whole.astype(int)).max() <= 1
+    assert unet.batches == [4] * 3 + [2] * 3 and asked == [4, 2] + [1] * 6
 
 
 def test_a_single_image_too_large_is_an_error_that_says_so(tmp_path):

@@ -166,3 +166,30 @@ def test_colours_that_are_exchanged_twice_or_never_are_refused(order, convention
     prior.controlnet.register_to_config(controlnet_conditioning_channel_order="bgr" if order == "rgb" else "rgb")
     check_channel_order(prior, asked)
     check_channel_order(prior, Conditions(("a",), made_by=ConditionChoice(name="skeleton")))
+
+
+def test_latents_are_encoded_fewer_at_a_time_where_memory_runs_out(monkeypatch):
+    prior, encoded = make_prior(), []
+    whole = cache_latents(prior, FRAMES, CONDITIONS)
+    encode = prior.vae.encode
+
+    def narrow(images):
+        encoded.append(len(images))
+        if len(images) > 1:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return encode(images)
+
+    monkeypatch.setattr(prior.vae, "encode", narrow)
+    cache = cache_latents(prior, FRAMES, CONDITIONS, num_turns=4)
+    assert encoded == [4, 2, *[1] * 16]
+    torch.testing.assert_close(cache.mean[:4], whole.mean)
+
+
+def test_many_prompts_are_embedded_some_at_a_time(monkeypatch):
+    prior, taken = make_prior(), []
+    prompts = [f"a photo of a {word}" for word in ("cup", "ball", "human", "moving")]
+    whole = encode_prompts(prior, prompts)
+    monkeypatch.setattr("ctlev_core.diffusion.prior.PROMPT_BATCH", 3)
+    prior.text_encoder.register_forward_pre_hook(lambda module, inputs: taken.append(len(inputs[0])))
+    torch.testing.assert_close(encode_prompts(prior, prompts), whole)
+    assert taken == [3, 1]
