@@ -29,13 +29,16 @@ def score_text(value: float, low: float | None = None, high: float | None = None
         high: its upper end.
         signed: with a sign above zero, too.
     Returns:
-        Four significant digits of the largest of them, at most three decimals: more is not known of any score.
+        Four significant digits of the largest of them, at most three decimals: more is not known of any score. Of what
+        is below 0.01, as kernel distances often are, three significant digits.
     """
     known = low is not None and high is not None and not math.isnan(low)
     numbers = (value, low, high) if known else (value,)
     largest = max(abs(number) for number in numbers if number is not None)
     decimals = 3 if not math.isfinite(largest) else min(3, max(0, 4 - len(f"{largest:.0f}")))
-    shown = [f"{number:{'+' if signed else ''}.{decimals}f}" for number in numbers]
+    if 0 < largest < 0.01:
+        decimals = min(6, 2 - math.floor(math.log10(largest)))
+    shown = [f"{number:{'+' if signed else ''}z.{decimals}f}" for number in numbers]
     return f"{shown[0]} [{shown[1]}, {shown[2]}]" if known else shown[0]
 
 

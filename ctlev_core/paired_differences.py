@@ -50,12 +50,14 @@ class Trainings:
         sample_ids: [N] names of the samples.
         recordings: [N] the recording of each.
         samples_digest: of the samples' images and labels.
+        weights: [N] of the samples in the mean, the same for all trainings; None = all alike.
     """
 
     values: np.ndarray
     sample_ids: tuple[str, ...]
     recordings: tuple[str, ...]
     samples_digest: str = ""
+    weights: np.ndarray | None = None
 
     def scores_the_same_as(self, other: Trainings) -> bool:
         """Are both about the same samples, in the same order?"""
@@ -73,18 +75,18 @@ def read_trainings(samples: pa.Table) -> dict[tuple[str, str], Trainings]:
     """
     found: dict[tuple[str, str], dict[int, list]] = {}
     columns = [samples[name].to_pylist() for name in ("setting", "metric", "training", "sample_id", "recording_id")]
-    values = samples["value"].to_numpy(zero_copy_only=False).astype(np.float64)
+    values, weights = (samples[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in ("value", "weight"))
     digests = samples["samples_digest"].to_pylist()
     for row, (setting, metric, training, sample_id, recording) in enumerate(zip(*columns, strict=True)):
-        same = found.setdefault((setting, metric), {}).setdefault(training, [[], [], [], digests[row]])
-        for column, value in zip(same, (sample_id, recording, values[row]), strict=False):
+        same = found.setdefault((setting, metric), {}).setdefault(training, [[], [], [], digests[row], []])
+        for column, value in zip(same[:3] + same[4:], (sample_id, recording, values[row], weights[row]), strict=True):
             column.append(value)
     trainings = {}
     for key, of_key in found.items():
         first, *others = of_key.values()
         if all((other[0], other[1], other[3]) == (first[0], first[1], first[3]) for other in others):
             stacked = np.array([one[2] for one in of_key.values()], np.float64)
-            trainings[key] = Trainings(stacked, tuple(first[0]), tuple(first[1]), first[3])
+            trainings[key] = Trainings(stacked, tuple(first[0]), tuple(first[1]), first[3], np.array(first[4]))
     return trainings
 
 
@@ -131,13 +133,16 @@ def _means(settings: Sequence[Trainings], seed: int) -> tuple[np.ndarray, np.nda
     first = settings[0]
     if not all(first.scores_the_same_as(other) for other in settings):
         raise ValueError("paired scores must be about the same samples in the same order")
-    scored = ~np.any([np.isnan(setting.values).any(axis=0) for setting in settings], axis=0)
+    weights = np.ones(len(first.recordings)) if first.weights is None else first.weights
+    scored = ~np.any([np.isnan(setting.values).any(axis=0) for setting in settings], axis=0) & (weights > 0)
     if not scored.any():
         raise ValueError(f"none of the {len(scored)} samples is scored by every training")
     names, index = np.unique(np.asarray(first.recordings)[scored], return_inverse=True)
-    counts = np.bincount(index).astype(np.float64)
+    weights = weights[scored]
+    counts = np.bincount(index, weights=weights)
     sums = [
-        np.stack([np.bincount(index, weights=values) for values in setting.values[:, scored]]) for setting in settings
+        np.stack([np.bincount(index, weights=weights * values) for values in setting.values[:, scored]])
+        for setting in settings
     ]
     found = np.array([of_setting.sum() / (len(of_setting) * counts.sum()) for of_setting in sums])
     if len(names) < MIN_RECORDINGS:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -35,15 +34,16 @@ TRACED_SCORES = TableSchema(
 
 PAIRED_SAMPLES = TableSchema(
     "paired_samples",
-    1,
+    2,
     None,
     (
         Column("setting", pa.string(), "what the model was trained on"),
-        Column("metric", pa.string(), "the score that is the mean of these values"),
+        Column("metric", pa.string(), "the score that is the mean of these values by their weights"),
         Column("training", pa.int32(), "number of the training within its setting", minimum=0),
         Column("sample_id", pa.string(), "the join key"),
         Column("recording_id", pa.string(), "its recording"),
         Column("value", pa.float64(), "score of this sample; missing where it has none", nullable=True),
+        Column("weight", pa.float64(), "of the sample in the mean", minimum=0),
         Column("samples_digest", pa.string(), "SHA-256 of all samples scored together, images and labels"),
     ),
 )
@@ -97,32 +97,15 @@ def paired_samples(scored: Iterable[tuple[list[Row], pa.Table, str]]) -> pa.Tabl
     counts: dict[tuple[str, str], int] = {}
     for rows, samples, digest in scored:
         setting = rows[0]["setting"]
-        for metric, column in _by_score(rows, samples).items():
+        names = np.array(samples["metric"].to_pylist())
+        for metric in dict.fromkeys(names.tolist()):
+            column = samples.filter(pa.array(names == metric))
             number = counts.get((setting, metric), 0)
             counts[setting, metric] = number + 1
             same = {"setting": setting, "metric": metric, "training": number, "samples_digest": digest}
-            columns = {name: column[name] for name in ("sample_id", "recording_id", "value")}
+            columns = {name: column[name] for name in ("sample_id", "recording_id", "value", "weight")}
             types = {one.name: one.type for one in PAIRED_SAMPLES.columns}
             columns |= {name: pa.array([value] * len(column), types[name]) for name, value in same.items()}
             parts.append(pa.table(columns).select(list(types)))
     empty = PAIRED_SAMPLES.arrow().empty_table()
     return pa.concat_tables([empty, *(part.cast(PAIRED_SAMPLES.arrow()) for part in parts)])
-
-
-def _by_score(rows: list[Row], samples: pa.Table) -> dict[str, pa.Table]:
-    """The samples' scores by the name of the score that is their mean.
-
-    A metric may give several scores, and a score may weigh samples by their joints; so it is the score of the metric's
-    family (`mpjpe`, `pck` ...) that is nearest to the mean over samples.
-    """
-    found = {}
-    overall = {row["metric"]: row["value"] for row in rows if row["group"] == "all"}
-    plugins = np.array(samples["metric"].to_pylist())
-    for plugin in dict.fromkeys(plugins.tolist()):
-        table = samples.filter(pa.array(plugins == plugin))
-        values = table["value"].to_numpy(zero_copy_only=False).astype(np.float64)
-        family = "".join(re.findall("^[a-z]+", plugin))
-        names = [name for name in overall if name.startswith(family)] or list(overall)
-        if names and not np.isnan(values).all():
-            found[min(names, key=lambda name: abs(overall[name] - np.nanmean(values)))] = table
-    return found

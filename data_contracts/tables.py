@@ -244,13 +244,14 @@ SCORES = TableSchema(
 )
 SAMPLE_SCORES = TableSchema(
     "sample_scores",
-    1,
+    2,
     None,
     (
         Column("sample_id", pa.string(), "the join key"),
         _RECORDING,
-        Column("metric", pa.string(), "metric plug-in"),
+        Column("metric", pa.string(), "the score whose mean over samples, by their weights, this is a part of"),
         Column("value", pa.float64(), "score of this sample alone; missing where it has none", nullable=True),
+        Column("weight", pa.float64(), "of the sample in that mean: its visible joints, for example", minimum=0),
     ),
 )
 NEAREST_SEEN = TableSchema(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,6 +55,9 @@ class _Source(NamedTuple):
     window_labels: Labels | None
 
 
+logger = logging.getLogger(__name__)
+
+
 class _Samples(NamedTuple):
     """Some windows of a recording, encoded."""
 
@@ -88,10 +92,29 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
         if not any(row["split"] == split for row in rows):
             raise DataError(f"encode: no window in split {split!r}; the recordings are too short for {windows!r}")
     stacked = concat_labels(labels)
+    _check_classes(sources, rows, stacked.class_names, windows)
     table = pa.Table.from_pylist(rows).append_column("class_name", pa.array(stacked.class_names, pa.string()))
     for name, column in label_columns(stacked).items():
         table = table.append_column(name, column)
     return table
+
+
+def _check_classes(
+    sources: list[_Source], rows: list[dict[str, Any]], class_names: Sequence[str], windows: Windows
+) -> None:
+    """Say where a class was recorded and none of it is left: what follows does not know that there is such a class."""
+    left = {(row["split"], name) for row, name in zip(rows, class_names, strict=True)}
+    recorded = {
+        (part["split"], source.recording["class_name"])
+        for source in sources
+        for part in source.parts
+        if source.recording["class_name"] and part["split"] in ("train", "test")
+    }
+    for split, name in sorted(recorded - left):
+        logger.warning(
+            "no window of class %r in split %r: its recordings are too short for %r, or have no labels",
+            name, split, windows,
+        )  # fmt: skip
 
 
 def _encode_in_turn(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -27,6 +27,7 @@ from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import SHUFFLED
+from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, Stage
 
@@ -49,7 +50,7 @@ class _DistanceScores(Stage):
         check_distances(arguments["downstream"], arguments["distances"])
 
 
-@partial(_ModelScores, version=8, schema=tables.SCORES, raw_files=None)
+@partial(_ModelScores, version=9, schema=tables.SCORES, raw_files=None)
 def score_model(
     out: Output,
     model: Manifest,
@@ -102,10 +103,6 @@ def score_model(
     groups = _groups(labels.class_names, data, rows, poses, split)
     for choice in metrics:
         metric = plugins.load_options(choice)
-        if hasattr(metric.module, "compute_rows"):
-            values = metric.module.compute_rows(prediction, labels, metric.options)
-            columns = {"sample_id": sample_ids, "recording_id": recordings, "metric": [metric.name] * len(rows)}
-            sample_scores.append(pa.table({**columns, "value": pa.array(values, pa.float64(), from_pandas=True)}))
         for group, members in groups:
             try:
                 scores, low, high = _score(metric, prediction, labels.take(members), members, recordings[members])
@@ -113,6 +110,9 @@ def score_model(
                 if group == "all":
                     raise
                 continue  # a class without a visible joint, for example, has no score of its own
+            if group == "all" and hasattr(metric.module, "compute_rows"):
+                columns = {"sample_id": sample_ids, "recording_id": recordings}
+                sample_scores.append(pa.table(columns | _of_samples(metric, prediction, labels, scores)))
             found += [
                 {
                     **same,
@@ -128,6 +128,34 @@ def score_model(
     if sample_scores:
         out.write_table(pa.concat_tables(sample_scores), tables.SAMPLE_SCORES)
     return pa.Table.from_pylist(found, schema=tables.SCORES.arrow())
+
+
+def _of_samples(
+    metric: plugins.Plugin, prediction: Mapping[str, Any], labels: Labels, scores: Mapping[str, float]
+) -> dict[str, pa.Array]:
+    """What each row adds to the one of the metric's scores that is the rows' mean, and its weight in that mean.
+
+    Joints count alike in a score, not frames: of a frame of which half is out of the picture there are fewer. Which of
+    several scores the rows belong to is seen from their mean.
+    """
+    values = metric.module.compute_rows(prediction, labels, metric.options)
+    sums = (
+        metric.module.compute_sums(prediction, labels, metric.options) if hasattr(metric.module, "compute_sums") else {}
+    )
+    of = {name: np.asarray(sums[name][1] if name in sums else np.ones(len(values)), np.float64) for name in scores}
+
+    def distance(name: str) -> float:
+        scored = ~np.isnan(values) & (of[name] > 0)
+        if not scored.any():
+            return np.inf
+        return round(abs(float(np.average(values[scored], weights=of[name][scored])) - scores[name]), 9)
+
+    name = min(scores, key=distance)  # the first of those that are as near
+    return {
+        "metric": pa.array([name] * len(values), pa.string()),
+        "value": pa.array(values, pa.float64(), from_pandas=True),
+        "weight": pa.array(of[name], pa.float64()),
+    }
 
 
 def _groups(

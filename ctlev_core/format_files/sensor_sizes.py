@@ -12,7 +12,9 @@ COMMON_SENSORS: tuple[SensorSize, ...] = (
     (128, 128),  # DVS128
     (240, 180),  # DAVIS240, and N-Caltech101
     (304, 240),  # ATIS
+    (320, 240),  # DVXplorer Lite and Mini
     (346, 260),  # DAVIS346
+    (320, 320),  # GenX320
     (640, 480),  # Prophesee Gen3, VGA cameras, N-ImageNet, DSEC
     (1280, 720),  # Prophesee Gen4
     (1280, 800),  # CeleX-V

@@ -7,7 +7,7 @@ come from the caller, who has to name the extractor beside the score.
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from ctlev_core.kernel_distance import kernel_distance
 from data_contracts.config import Frozen
@@ -22,6 +22,13 @@ class Options(Frozen):
     subset_size: int = Field(default=1000, ge=0, description="rows of a subset; 0 = all rows at once")
     num_subsets: int = Field(default=100, ge=1, description="subsets the mean is taken over")
     seed: int = Field(default=0, ge=0, description="of the drawing of subsets")
+
+    @field_validator("subset_size")
+    @classmethod
+    def _subsets_have_pairs(cls, size: int) -> int:
+        if size == 1:
+            raise ValueError("a subset must have 2 rows or more, or 0 for all rows at once")
+        return size
 
 
 def compute(predicted: np.ndarray, target: np.ndarray, options: Options) -> dict[str, float]:

@@ -260,6 +260,8 @@ def interval_over_trainings(rows: Sequence[Row]) -> tuple[float, float, float]:
     value = float(values.mean())
     if any(row["low"] is None or row["high"] is None for row in rows):
         return value, float("nan"), float("nan")
-    below, above = (float(np.mean([abs(row["value"] - row[end]) for row in rows])) for end in ("low", "high"))
+    # An interval of a biased score need not hold its value: it then ends there.
+    below = float(np.mean([max(row["value"] - row["low"], 0.0) for row in rows]))
+    above = float(np.mean([max(row["high"] - row["value"], 0.0) for row in rows]))
     spread = 1.96 * float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
     return value, value - math.hypot(below, spread), value + math.hypot(above, spread)

@@ -119,9 +119,8 @@ class Experiment:
             values = 6 + np.arange(len(names)) / 10 + SETTINGS[setting] + 0.01 * int(seed)
             rows = [_score(setting, int(seed), float(values.mean()), model, self.frames)]
             rows += [{**rows[0], "group": "walk"}, {**rows[0], "group": "classes with real training frames"}]
-            samples = pa.table(
-                {"sample_id": names, "recording_id": names, "metric": ["mpjpe2d"] * len(names), "value": values}
-            )
+            columns = {"sample_id": names, "recording_id": names, "metric": [rows[0]["metric"]] * len(names)}
+            samples = pa.table({**columns, "value": values, "weight": np.ones(len(names))})
             found.append(self._score_artefact(rows, model, {tables.SAMPLE_SCORES.name: samples}))
         model = self.models[0]
         for setting, value in (("labels of synthetic", 5.0), ("shuffled labels of synthetic", 15.0)):

@@ -1,5 +1,7 @@
 """Differences of two settings on the same samples, against closed forms and simulated experiments."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -108,3 +110,18 @@ def test_results_do_not_depend_on_the_order_of_trainings():
     first, second = (paired_difference(trainings(rows), other) for rows in (values, values[::-1]))
     assert first.value == pytest.approx(second.value)
     assert (first.low, first.high) == pytest.approx((second.low, second.high), abs=0.03)
+
+
+def test_the_difference_is_that_of_the_weighted_means():
+    """A little worse on whole people, better on those of whom two joints are in the picture: worse in all."""
+    random = np.random.default_rng(0)
+    weights = np.tile([13.0, 2.0], 100)
+    before = 6 + random.normal(0, 0.1, 200)
+    after = before + np.where(weights > 2, 0.5, -3.0)
+    names, recordings = tuple(map(str, range(200))), tuple(str(row // 10) for row in range(200))
+    one, other = (Trainings(values[None], names, recordings, "d", weights) for values in (before, after))
+    found = paired_difference(one, other)
+    expected = np.average(after, weights=weights) - np.average(before, weights=weights)
+    assert found.value == pytest.approx(expected) and expected > 0 and found.low <= found.value <= found.high
+    alike = paired_difference(replace(one, weights=None), replace(other, weights=None))
+    assert alike.value == pytest.approx((after - before).mean()) and alike.value < 0

@@ -159,8 +159,9 @@ def run_of(store, name, value, *, digest="d", shift=0.0, **changes) -> Run:
     records = records_of(store)
     changed = [replace(record, **changes.get(record.key, {})) for record in records]
     values = value + np.random.default_rng(0).normal(0, 1, 30) + shift
-    samples = pa.table({"sample_id": NAMES, "recording_id": NAMES, "metric": ["mpjpe2d"] * 30, "value": values})
+    samples = pa.table({"sample_id": NAMES, "recording_id": NAMES, "value": values, "weight": np.ones(30)})
     scores = score_rows(float(values.mean()))
+    samples = samples.append_column("metric", pa.array([scores["metric"][0].as_py()] * 30))
     folder = store.parent / "reports" / name
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(trace_scores([("0f", scores)], records), folder / "scores.parquet")

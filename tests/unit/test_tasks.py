@@ -6,14 +6,16 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from ctlev_core import plugins
 from ctlev_core.body_views import with_joints
 from ctlev_core.joint_errors import quotients
-from ctlev_core.metrics import mpjpe2d, mpjpe3d, pck2d
+from ctlev_core.metrics import mpjpe2d, mpjpe3d, oks, pck2d
 from ctlev_core.report.verdict import Difference, lower_is_better, verdict
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 from data_contracts.manifest import concat_labels
 from tasks.condition import _choose, _from_new_sides, _on_sensor
+from tasks.evaluate import _of_samples
 
 
 @pytest.mark.parametrize(
@@ -147,3 +149,22 @@ def test_directions():
 
 def test_verdict_without_scores_says_so():
     assert verdict([], SETTINGS) == "No downstream model was scored."
+
+
+@pytest.mark.parametrize(("module", "score"), [(mpjpe2d, "mpjpe2d_px"), (oks, "oks_mean"), (pck2d, "pck_torso0.2")])
+def test_the_rows_of_a_metric_are_parts_of_one_of_its_scores(module, score):
+    """Joints count alike, so that rows with fewer of them weigh less; another metric's scores are not looked at."""
+    random = np.random.default_rng(0)
+    joints, visible = random.uniform(5, 60, (30, 13, 2)).astype(np.float32), random.random((30, 13)) < 0.6
+    visible[:, :10] |= np.arange(30)[:, None] % 3 == 0
+    visible[:, [1, 2, 7, 8]] = True  # shoulders and hips, or there is no torso to measure by
+    labels = Labels(("",) * 30, np.arange(30), joints, visible, "dhp19")
+    predicted = {"joints2d": joints + random.normal(0, 6, joints.shape)}
+    options = module.Options()
+    metric = plugins.Plugin("metrics", "m", module, options)
+    scores = module.compute(predicted, labels, options)
+    found = _of_samples(metric, predicted, labels, scores)
+    assert set(found["metric"].to_pylist()) == {score}
+    values, weights = (np.array(found[name].to_pylist(), float) for name in ("value", "weight"))
+    known = ~np.isnan(values)
+    assert np.average(values[known], weights=weights[known]) == pytest.approx(scores[score])
