@@ -35,6 +35,8 @@ class Benchmark:
     name: str
     arguments: tuple[str, ...] = ()
     needs_gpu: bool = False
+    script: str = ""
+    """Its file, where that has another name."""
 
 
 ALL = (
@@ -44,6 +46,7 @@ ALL = (
     Benchmark("metrics", ("--figure", "build/metrics.png")),
     Benchmark("downstream"),
     Benchmark("training"),
+    Benchmark("training_compiled", ("--set", "compile_networks=true"), script="training"),
     Benchmark("sampling"),
     Benchmark("operations"),
     Benchmark("gpu", needs_gpu=True),
@@ -101,8 +104,9 @@ def main() -> int:
 
 def run(benchmark: Benchmark) -> Outcome:
     """Run one script; what it prints is shown as it comes, and kept."""
-    command = [sys.executable, "-u", str(HERE / f"{benchmark.name}.py"), *benchmark.arguments]
-    said = " ".join(["python", f"benchmarks/{benchmark.name}.py", *benchmark.arguments])
+    script = f"{benchmark.script or benchmark.name}.py"
+    command = [sys.executable, "-u", str(HERE / script), *benchmark.arguments]
+    said = " ".join(["python", f"benchmarks/{script}", *benchmark.arguments])
     print(f"\n== {said}", flush=True)
     started, lines = time.perf_counter(), []
     with subprocess.Popen(

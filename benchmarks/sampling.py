@@ -241,7 +241,7 @@ def run_trajectory(prior: Prior, scheduler: str, num_steps: int, count: int, of_
     embeddings = encode_prompts(prior, list(conditions.prompts)).to(network)
     images = None
     if conditions.images is not None:
-        images = conditions_to_tensor(conditions.images, prior.reversed_condition).to(device, network)
+        images = conditions_to_tensor(conditions.images).to(device, network)
     denoiser = Denoiser(prior.unet, prior.controlnet)
 
     def predict(state: Tensor, timestep: Tensor) -> Tensor:

@@ -65,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             options = make_options(chosen.batch_size, precision, chosen.set)
             priors = [load_prior(chosen.prior, with_controlnet=route == "controlnet") for _ in range(2)]
             found.append(compare(priors[0], priors[1], options, route, chosen.rounds, chosen.steps))
-    print_comparisons(f"fine-tuning, batches of {chosen.batch_size}", "diffusers", found + beside_default(found))
+    found += beside_default(found)
+    print_comparisons(f"fine-tuning, batches of {chosen.batch_size}", "diffusers", found)
     print_targets(found)
 
 
@@ -74,7 +75,7 @@ def beside_default(found: Sequence[Comparison]) -> list[Comparison]:
     by_name = {comparison.name: comparison for comparison in found}
     pairs = [(route, by_name.get(f"{route}, bfloat16"), by_name.get(f"{route}, float32")) for route in get_args(Route)]
     return [
-        Comparison(f"{route}, bfloat16 beside float32", half.images, ours=half.ours, peer=whole.peer)
+        Comparison(f"{route}, bfloat16 beside float32", half.images, WANTED, ours=half.ours, peer=whole.peer)
         for route, half, whole in pairs
         if half is not None and whole is not None
     ]

@@ -27,11 +27,17 @@ class _CachedEmbedding(torch.nn.Module):
 
 @contextmanager
 def cached_condition_embedding(controlnet: Any | None, conditions: Tensor | None) -> Iterator[None]:
-    """Within the context the condition embedding is computed once; exact, and most of a tiny ControlNet's time."""
+    """Within the context the condition embedding is computed once; exact, and most of a tiny ControlNet's time.
+
+    Red and blue are exchanged where the ControlNet's config asks for it: its own forward pass does so with what it is
+    handed, which is too late for what is computed here.
+    """
     if controlnet is None or conditions is None:
         yield
         return
     original = controlnet.controlnet_cond_embedding
+    if getattr(controlnet.config, "controlnet_conditioning_channel_order", "rgb") == "bgr":
+        conditions = conditions.flip(1)
     controlnet.controlnet_cond_embedding = _CachedEmbedding(original(conditions))
     try:
         yield

@@ -34,7 +34,6 @@ class LatentCache:
         embeddings: [P, L, D] of the distinct prompts; the last is the empty prompt.
         prompt_rows: for each of N frames the indices into `embeddings` of the prompts it may be shown with.
         conditions: [N, H, W, 3] uint8, or None.
-        reversed_condition: the ControlNet expects BGR.
         made_by: the plug-in of the conditions, where known.
     """
 
@@ -44,7 +43,6 @@ class LatentCache:
     embeddings: Tensor
     prompt_rows: tuple[Tensor, ...]
     conditions: np.ndarray | None
-    reversed_condition: bool
     made_by: ConditionChoice | None = None
 
     def batch(
@@ -78,7 +76,7 @@ class LatentCache:
             images = self.conditions[rows]
             if turns is not None:
                 images = turn_conditions(images, turns, self.made_by)
-            conditions = conditions_to_tensor(images, self.reversed_condition).to(device)
+            conditions = conditions_to_tensor(images).to(device)
         latents = latents * self.scaling_factor
         return Batch(latents.to(device), self.embeddings[prompts].to(device), conditions)
 
@@ -124,7 +122,6 @@ def cache_latents(
         embeddings=encode_prompts(prior, [*prompts, ""]).float().cpu(),
         prompt_rows=_prompt_rows([position[prompt] for prompt in conditions.prompts], class_names),
         conditions=conditions.images,
-        reversed_condition=prior.reversed_condition,
         made_by=conditions.made_by,
     )
 

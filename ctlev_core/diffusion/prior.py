@@ -217,8 +217,9 @@ def images_to_tensor(images: Any) -> torch.Tensor:
     return torch.from_numpy(images.astype("float32")).permute(0, 3, 1, 2).contiguous() / 127.5 - 1
 
 
-def conditions_to_tensor(images: Any, reversed_channels: bool = False) -> torch.Tensor:
-    """Condition images [N, H, W, 3] uint8 to [N, 3, H, W] float32 in [0, 1], what ControlNets take."""
-    if reversed_channels:
-        images = images[..., ::-1]
+def conditions_to_tensor(images: Any) -> torch.Tensor:
+    """Condition images [N, H, W, 3] uint8 to [N, 3, H, W] float32 in [0, 1], what ControlNets take.
+
+    Red first: a ControlNet that was trained on blue first says so in its config and exchanges them itself.
+    """
     return torch.from_numpy(images.astype("float32")).permute(0, 3, 1, 2).contiguous() / 255

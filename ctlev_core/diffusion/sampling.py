@@ -189,7 +189,7 @@ def _sample_rows(
 ) -> Tensor:
     images = None
     if shard.conditions.images is not None:
-        images = conditions_to_tensor(shard.conditions.images[rows], prior.reversed_condition)
+        images = conditions_to_tensor(shard.conditions.images[rows])
     return sample_latents(prior, embeddings[rows], empty_embedding, images, shard.seeds[rows], options)
 
 

@@ -112,7 +112,7 @@ def _trajectory(
     embeddings = encode_prompts(prior, list(conditions.prompts)).to(device, network)
     images = None
     if conditions.images is not None:
-        images = conditions_to_tensor(conditions.images, prior.reversed_condition).to(device, network)
+        images = conditions_to_tensor(conditions.images).to(device, network)
     denoiser = Denoiser(prior.unet, prior.controlnet)
     with cached_condition_embedding(prior.controlnet, images):
         for timestep in scheduler.timesteps:

@@ -21,7 +21,7 @@ from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History
 
-VERSION = 2
+VERSION = 3
 
 
 class Options(FineTuningOptions):

@@ -21,7 +21,7 @@ def run_all(monkeypatch, tmp_path):
 
 def test_every_benchmark_is_a_script(run_all):
     for benchmark in run_all.ALL:
-        assert (BENCHMARKS / f"{benchmark.name}.py").exists()
+        assert (BENCHMARKS / f"{benchmark.script or benchmark.name}.py").exists()
 
 
 def test_what_ran_and_what_did_not(run_all, monkeypatch, tmp_path):

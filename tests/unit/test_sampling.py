@@ -11,6 +11,7 @@ from ctlev_core.diffusion import sampling, sampling_shards
 from ctlev_core.diffusion.prior import load_prior, save_prior
 from ctlev_core.diffusion.sampling import cached_condition_embedding, decode_frames, sample_frames
 from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions
+from ctlev_core.diffusion.small_prior import break_zeros
 from ctlev_core.generators import controlnet, stable_diffusion
 from data_contracts.labels import Conditions
 
@@ -81,9 +82,11 @@ def test_shards_of_other_options_or_checkpoints_are_not_reused(tmp_path):
     assert not np.array_equal(first, sample_frames(other, conditions, FAST, seeds=[0, 1], work=tmp_path, identity="b"))
 
 
-def test_cached_condition_embedding_is_exact():
-    prior = shared_prior()
-    network = prior.controlnet
+@pytest.mark.parametrize("order", ["rgb", "bgr"])
+def test_cached_condition_embedding_is_exact(order):
+    network = make_prior().controlnet.eval()
+    network.register_to_config(controlnet_conditioning_channel_order=order)
+    break_zeros(network)
     noisy, embeddings = torch.randn(2, 48, 4, 4), torch.randn(2, 24, 64)
     images = torch.rand(2, 3, SIDE, SIDE)
 

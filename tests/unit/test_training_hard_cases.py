@@ -12,9 +12,12 @@ from tiny_prior import CORPUS, make_data, make_prior, shared_prior
 
 from ctlev_core.diffusion import trainer
 from ctlev_core.diffusion.checkpoint_training import train_checkpoint
+from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.finetuning import check_channel_order, fine_tune
 from ctlev_core.diffusion.latent_cache import cache_latents
 from ctlev_core.diffusion.prior import encode_prompts, save_prior
+from ctlev_core.diffusion.sampling import sample_frames
+from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError, TrainingError
@@ -193,3 +196,20 @@ def test_many_prompts_are_embedded_some_at_a_time(monkeypatch):
     prior.text_encoder.register_forward_pre_hook(lambda module, inputs: taken.append(len(inputs[0])))
     torch.testing.assert_close(encode_prompts(prior, prompts), whole)
     assert taken == [3, 1]
+
+
+def test_a_controlnet_that_exchanges_colours_is_handed_them_as_they_are(tmp_path):
+    """Once in its own forward pass; exchanged before, too, it would be trained on what it is never asked with."""
+    prior, seen = make_prior(), []
+    prior.controlnet.register_to_config(controlnet_conditioning_channel_order="bgr")
+    prior.controlnet.controlnet_cond_embedding.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    red = np.zeros_like(FRAMES)
+    red[..., 0] = 255
+    batch = cache_latents(prior, FRAMES, Conditions(CONDITIONS.prompts, red)).batch(
+        np.arange(2), torch.Generator().manual_seed(0), 0.0, torch.device("cpu")
+    )
+    denoising_loss(
+        Denoiser(prior.unet, prior.controlnet), NoiseSchedule(prior.scheduler_config), batch, generator_for(0)
+    )
+    sample_frames(prior, Conditions(("a",), red[:1]), SamplingOptions(num_inference_steps=1), seeds=[0], work=tmp_path)
+    assert [image.mean(dim=(0, 2, 3)).tolist() for image in seen] == [[0.0, 0.0, 1.0]] * 2
