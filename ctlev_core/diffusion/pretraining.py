@@ -1,4 +1,4 @@
-"""Pre-train the small prior on procedural images, and write it as a diffusers folder."""
+"""Pre-train the small prior on procedural or on a user's own pictures, and write it as a diffusers folder."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
-from ctlev_core.diffusion import procedural_images
+from ctlev_core.diffusion import labelled_pictures, procedural_images
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
+from ctlev_core.diffusion.labelled_pictures import LabelledPictures, PictureOptions
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.prior import (
     Prior,
@@ -44,7 +45,7 @@ from data_contracts.labels import History
 FIT_IMAGES = 384
 VALIDATION_IMAGES = 128
 VALIDATION_OFFSET = 2**31
-VALIDATION_STREAM, STYLE_STREAM = 1, 2  # entropy that keeps the random streams apart
+VALIDATION_STREAM, STYLE_STREAM, PICTURE_STREAM = 1, 2, 3  # entropy that keeps the random streams apart
 DrawScene = Callable[[np.random.Generator, int], procedural_images.Scene]
 
 logger = logging.getLogger(__name__)
@@ -81,7 +82,13 @@ class PretrainingOptions(Frozen):
         description="U-Net and ControlNet together, a ControlNet for the U-Net of `start` alone, or a U-Net without "
         "ControlNet",
     )
-    diet: procedural_images.Diet = Field(default=procedural_images.DEFAULT_DIET, description="what the pictures are of")
+    diet: procedural_images.Diet = Field(
+        default=procedural_images.DEFAULT_DIET,
+        description="what procedural pictures are of, and the styles that any pictures are shown in",
+    )
+    pictures: PictureOptions = Field(
+        default=PictureOptions(), description="pictures of one's own, with class names, in place of procedural ones"
+    )
     condition_dropout: float = Field(default=0.2, ge=0, le=1, description="share of people without their condition")
     image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
     widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
@@ -112,6 +119,8 @@ class PretrainingOptions(Frozen):
     def _check(self) -> PretrainingOptions:
         if self.num_processes > 1 and self.max_seconds is not None:
             raise ValueError("max_seconds must be null with several processes, which would not end together")
+        if self.pictures.root is not None and self.tune != "unet":
+            raise ValueError(f"pictures of one's own have no condition images; set tune=unet, got {self.tune!r}")
         Ranks(0, self.num_processes).batches(self.training.gradient_accumulation)
         return self
 
@@ -163,17 +172,44 @@ class ImageStream:
     def _scenes(self, block: int) -> list[procedural_images.Scene]:
         if self._block[0] != block:
             options = self._options
-            wanted = options.block_scenes, options.image_size, options.condition, options.diet
             if self._pool is None:
-                self._block = (block, procedural_images.draw_block(options.seed, block, *wanted))
+                self._block = (block, draw_block(options, block))
             else:
                 for ahead in range(block, block + 1 + options.workers):
                     if ahead not in self._ahead:
-                        self._ahead[ahead] = self._pool.submit(
-                            procedural_images.draw_block, options.seed, ahead, *wanted
-                        )
+                        self._ahead[ahead] = self._pool.submit(draw_block, options, ahead)
                 self._block = (block, self._ahead.pop(block).result())
         return self._block[1]
+
+
+def draw_block(options: PretrainingOptions, block: int) -> list[procedural_images.Scene]:
+    """The scenes of a block: procedural ones, or pictures of the user's, each moved about anew."""
+    if options.pictures.root is None:
+        return procedural_images.draw_block(
+            options.seed, block, options.block_scenes, options.image_size, options.condition, options.diet
+        )
+    pictures = labelled_pictures.open_pictures(options.pictures)
+    learnt, _ = split_pictures(len(pictures), options.seed)
+    rows = learnt[sample_rows(options.seed, block, options.block_scenes, len(learnt))]
+    first = block * options.block_scenes
+    streams = [np.random.default_rng([options.seed, PICTURE_STREAM, first + number]) for number in range(len(rows))]
+    return [_scene_of(pictures, int(row), options, rng) for row, rng in zip(rows, streams, strict=True)]
+
+
+def split_pictures(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of pictures to learn from, and of those held back for validation: a tenth, `VALIDATION_IMAGES` at most."""
+    order = np.random.default_rng([seed, VALIDATION_STREAM]).permutation(count)
+    held_back = min(VALIDATION_IMAGES, count // 10)
+    return order[held_back:], order[:held_back]
+
+
+def _scene_of(
+    pictures: LabelledPictures, row: int, options: PretrainingOptions, rng: np.random.Generator
+) -> procedural_images.Scene:
+    name = pictures.names[row]
+    called = str(rng.choice([name, *options.pictures.synonyms.get(name, ())])).replace("_", " ")
+    image = labelled_pictures.move(pictures.read(row, options.image_size), options.pictures, rng)
+    return procedural_images.Scene(image, None, called, called)
 
 
 def make_batch(prior: Prior, rows: list[Row]) -> Batch:
@@ -185,6 +221,18 @@ def make_batch(prior: Prior, rows: list[Row]) -> Batch:
     embeddings = encode_prompts(prior, [row.caption for row in rows])
     conditions = [row.condition for row in rows if row.condition is not None]
     return Batch(latents, embeddings, conditions_to_tensor(np.stack(conditions)) if conditions else None)
+
+
+def draw_picture_rows(options: PretrainingOptions) -> list[Row]:
+    """The user's pictures that were held back, in a random style each."""
+    pictures = labelled_pictures.open_pictures(options.pictures)
+    rows = []
+    for number, row in enumerate(split_pictures(len(pictures), options.seed)[1]):
+        rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + number])
+        scene = _scene_of(pictures, int(row), options, rng)
+        image, caption = procedural_images.apply_style(scene, rng, options.diet)
+        rows.append(Row(image, caption, None))
+    return rows
 
 
 def draw_validation_rows(options: PretrainingOptions, draw: DrawScene) -> list[Row]:
@@ -208,11 +256,18 @@ def new_prior(options: PretrainingOptions) -> Prior:
     start = start_folder(options)
     if start is not None:
         return load_prior(start, with_controlnet=options.tune != "unet")
-    scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
     rng = np.random.default_rng([options.seed, STYLE_STREAM])
-    images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
-    vae: PatchAutoencoder = fit_patch_autoencoder(images_to_tensor(images))
     corpus = procedural_images.caption_corpus()
+    if options.pictures.root is None:
+        scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
+        images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
+    else:
+        scenes = draw_block(options.model_copy(update={"block_scenes": FIT_IMAGES}), 0)
+        images = np.stack([procedural_images.apply_style(scene, rng, options.diet)[0] for scene in scenes])
+        classes = labelled_pictures.open_pictures(options.pictures).classes
+        # Often enough that every name becomes a word of its own.
+        corpus = corpus + 40 * [name.replace("_", " ") for name in classes] + 40 * _synonyms(options)
+    vae: PatchAutoencoder = fit_patch_autoencoder(images_to_tensor(images))
     prior = build_prior(
         corpus,
         vae,
@@ -222,6 +277,10 @@ def new_prior(options: PretrainingOptions) -> Prior:
         prediction_type=options.prediction_type,
     )
     return dataclasses.replace(prior, controlnet=None) if options.tune == "unet" else prior
+
+
+def _synonyms(options: PretrainingOptions) -> list[str]:
+    return [name for names in options.pictures.synonyms.values() for name in names]
 
 
 def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:
@@ -260,8 +319,12 @@ def _pretrain(options: PretrainingOptions, out: Path, work: Path, ranks: Ranks) 
     prior, trainer = prepare(options)
     denoiser = Denoiser(prior.unet, prior.controlnet)
     schedule = NoiseSchedule(prior.scheduler_config)
-    draw_thing = partial(procedural_images.draw_thing, diet=options.diet)
-    validation = {"own caption": make_batch(prior, draw_validation_rows(options, draw_thing))}
+    if options.pictures.root is None:
+        draw_thing = partial(procedural_images.draw_thing, diet=options.diet)
+        captioned = draw_validation_rows(options, draw_thing)
+    else:
+        captioned = draw_picture_rows(options)
+    validation = {"own caption": make_batch(prior, captioned)}
     if prior.controlnet is not None:
         draw_person = partial(procedural_images.draw_person, condition=options.condition)
         people = make_batch(prior, draw_validation_rows(options, draw_person))
