@@ -147,6 +147,32 @@ def spread(count: int, wanted: int | None) -> np.ndarray:
     return (2 * np.arange(wanted, dtype=np.int64) + 1) * count // (2 * wanted)
 
 
+def time_bins(t_us: np.ndarray, windows: np.ndarray, num_bins: int) -> np.ndarray:
+    """Each window cut into bins of equal duration, from its first event to its last.
+
+    Bin b of an event at t is floor(B (t - t_first) / (t_last - t_first + 1)), in integers; where all times of a window
+    are equal every event is in the first.
+
+    Args:
+        t_us: [E] int64, us, non-decreasing.
+        windows: [N, 2] int64, start and stop of each window in events.
+        num_bins: B.
+    Returns:
+        [N, B, 2] int64, start and stop of each bin in events; bins may be empty.
+    """
+    ranges = np.empty((len(windows), num_bins, 2), np.int64)
+    for row, (start, stop) in enumerate(windows.tolist()):
+        edges = np.full(num_bins + 1, stop, np.int64)
+        if stop > start:
+            times = t_us[start:stop]
+            span = int(times[-1] - times[0]) + 1
+            # The first time that belongs to bin b: ceil(b span / B).
+            firsts = times[0] + (np.arange(num_bins, dtype=np.int64) * span + num_bins - 1) // num_bins
+            edges[:-1] = start + np.searchsorted(times, firsts)
+        ranges[row, :, 0], ranges[row, :, 1] = edges[:-1], edges[1:]
+    return ranges
+
+
 def check_ranges(windows: np.ndarray, num_events: int) -> np.ndarray:
     """The windows as contiguous [N, 2] int64.
 

@@ -88,6 +88,11 @@ class Experiment(Frozen):
     windows: Windows = Windows()
     encoding: EncodingChoice
     condition: ConditionChoice
+    base_model: dict[str, Any] | None = Field(
+        None,
+        description="options of pre-training (flows/presets/pretraining): a base model is made of pictures first, and "
+        "generators that name no `prior` start from it",
+    )
     generator: GeneratorChoice
     sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
     num_synthetic: int = Field(gt=0, description="synthetic frames to sample, of the generator and of each baseline")

@@ -18,6 +18,7 @@ from flows.prepare_dataset import (
     prepare_dataset,
 )
 from flows.settings import flow
+from flows.train_generator import base_model_of
 from tasks.finetune import finetune
 from tasks.ingest import ingest
 from tasks.sample import sample, simulate
@@ -63,7 +64,8 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         )
         return BaselineFrames(sample_conditions=asked, checkpoint=None, synthetic=synthetic)
     learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition)
-    checkpoint = finetune(dataset.frames, learnt, generator=baseline.generator, seed=seed, label=label)
+    base_model = base_model_of(experiment, baseline.generator)
+    checkpoint = finetune(dataset.frames, learnt, base_model, generator=baseline.generator, seed=seed, label=label)
     synthetic = sample(
         checkpoint,
         dataset.frames,

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
 
+from ctlev_core import plugins
+from ctlev_core.plugins import validate_options
+from data_contracts.config import GeneratorChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from flows.command_line import main
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from tasks.finetune import finetune
+from tasks.pretrain import pretrain_prior
 from tasks.stage import call_flow, numbered
+
+if TYPE_CHECKING:  # torch, which most plans do without
+    from ctlev_core.diffusion.pretraining import PretrainingOptions
 
 
 @flow(name="train-generator")
@@ -21,10 +29,35 @@ def train_generator(experiment: Experiment, dataset: PreparedDataset | None = No
     return finetune(
         dataset.frames,
         dataset.frame_conditions,
+        base_model_of(experiment, experiment.generator),
         generator=experiment.generator,
         seed=experiment.seed + number,
         label=numbered(experiment.generator.name, number),
     )
+
+
+def base_model_of(experiment: Experiment, generator: GeneratorChoice) -> ManifestRef | None:
+    """The experiment's own base model, for a generator that starts from one and names none; made if it must be."""
+    options = plugins.load_options(generator).options
+    if experiment.base_model is None or getattr(options, "prior", ...) is not None:
+        return None
+    return pretrain_prior(options=base_model_options(experiment), label="base model of pictures")
+
+
+def base_model_options(experiment: Experiment) -> PretrainingOptions:
+    """The options of the experiment's base model, checked; its pictures are looked through.
+
+    Raises:
+        PluginError: an option is unknown or wrong.
+        DataError: there are no pictures.
+    """
+    from ctlev_core.diffusion.labelled_pictures import open_pictures
+    from ctlev_core.diffusion.pretraining import PretrainingOptions
+
+    options = validate_options(PretrainingOptions, experiment.base_model or {}, "base_model")
+    if options.pictures.root is not None:
+        open_pictures(options.pictures)
+    return options
 
 
 if __name__ == "__main__":

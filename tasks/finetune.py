@@ -17,19 +17,35 @@ from tasks.stage import Output, files_of, stage
 
 
 def _prior_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
+    if arguments["base_model"] is not None:
+        return []  # it is an artefact, and its key is part of ours
     plugin = plugins.load_options(arguments["generator"])
     return files_of(plugin.module.prior_folders(plugin.options))
 
 
 @stage(version=1, schema=tables.TRAINING, raw_files=_prior_files)
-def finetune(out: Output, frames: Manifest, conditions: Manifest, *, generator: GeneratorChoice, seed: int) -> pa.Table:
-    """Tune the prior on the training frames; the artefact's `checkpoint/` is an ordinary diffusers folder."""
+def finetune(
+    out: Output,
+    frames: Manifest,
+    conditions: Manifest,
+    base_model: Manifest | None = None,
+    *,
+    generator: GeneratorChoice,
+    seed: int,
+) -> pa.Table:
+    """Tune the prior on the training frames; the artefact's `checkpoint/` is an ordinary diffusers folder.
+
+    With `base_model`, an artefact of pre-training, that is the prior.
+    """
     plugin = plugins.load_options(generator)
     rows = matching_rows(frames, conditions)
+    options = plugin.options
+    if base_model is not None:
+        options = options.model_copy(update={"prior": base_model.ref.path / "prior"})
     history = plugin.module.train(
         np.asarray(frames.array("frames")[rows]),
         conditions_of(conditions),
-        plugin.options,
+        options,
         seed=seed,
         out=out.folder / "checkpoint",
         work=out.work,

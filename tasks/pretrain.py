@@ -1,24 +1,33 @@
-"""Make the small prior."""
+"""Make a small prior: the bundled ones, or a base model of a user's own pictures."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from ctlev_core.diffusion.pretraining import PretrainingOptions, pretrain, start_folder
 from data_contracts import tables
 from data_contracts.manifest import history_table
 from tasks.stage import Output, files_of, stage
 
-
-def _start_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
-    start = start_folder(arguments["options"])
-    return [] if start is None else files_of([start])
+if TYPE_CHECKING:  # torch, which flows that pre-train nothing need not wait for
+    from ctlev_core.diffusion.pretraining import PretrainingOptions
 
 
-@stage(version=3, schema=tables.TRAINING, raw_files=_start_files)
+def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
+    from ctlev_core.diffusion.labelled_pictures import picture_files
+    from ctlev_core.diffusion.pretraining import start_folder
+
+    options: PretrainingOptions = arguments["options"]
+    start = start_folder(options)
+    pictures = [(f"pictures/{name}", path) for name, path in files_of(picture_files(options.pictures))]
+    return ([] if start is None else files_of([start])) + pictures
+
+
+@stage(version=4, schema=tables.TRAINING, raw_files=_raw_files)
 def pretrain_prior(out: Output, *, options: PretrainingOptions) -> pa.Table:
-    """Train the small prior on procedural images; the artefact's `prior/` is an ordinary diffusers folder."""
+    """Train the small prior on pictures; the artefact's `prior/` is an ordinary diffusers folder."""
+    from ctlev_core.diffusion.pretraining import pretrain
+
     return history_table(pretrain(options, out.folder / "prior", out.work))

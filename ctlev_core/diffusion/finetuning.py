@@ -19,7 +19,7 @@ import torch
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
-from ctlev_core.diffusion.latent_cache import cache_latents, check_cache, check_training_data
+from ctlev_core.diffusion.latent_cache import cache_latents, check_cache, check_training_data, encode_images
 from ctlev_core.diffusion.prior import Prior
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.sampling import sample_frames
@@ -29,6 +29,7 @@ from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
 from ctlev_core.diffusion.training import check_run, run_training, sample_rows
 from ctlev_core.diffusion.training_log import picture_of_samples
 from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.image_moves import move_image
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
@@ -36,7 +37,7 @@ from data_contracts.labels import Conditions
 Tune = Literal["unet", "controlnet", "both"]
 SHOWN, SHOWN_STEPS = 6, 10
 """Samples in a picture, and evaluations of the network for each."""
-SPLIT_STREAM, LATENT_STREAM, DROPOUT_STREAM, WEIGHT_STREAM, TURN_STREAM = 1, 2, 3, 4, 5
+SPLIT_STREAM, LATENT_STREAM, DROPOUT_STREAM, WEIGHT_STREAM, TURN_STREAM, MOVE_STREAM = 1, 2, 3, 4, 5, 6
 """Entropy that keeps random streams apart."""
 
 
@@ -107,6 +108,8 @@ def fine_tune(
     check_channel_order(prior, conditions)
     if options.turned_share and frames.shape[1] != frames.shape[2]:
         raise DataError(f"turned_share needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0")
+    if options.moves.moves_anything and (options.turned_share or conditions.images is not None):
+        raise DataError("moves are for the text route, whose prompts hold wherever a thing is, without turned_share")
     device = prior.unet.device
     networks = {"unet": (prior.unet,), "controlnet": (prior.controlnet,), "both": (prior.unet, prior.controlnet)}[tune]
     parameters = []
@@ -129,7 +132,12 @@ def fine_tune(
     def fetch(number: int) -> Batch:
         rows = training_rows[sample_rows(seed, number, options.batch_size, len(training_rows))]
         turns = draw_turns(len(rows), options.turned_share, seed, number) if options.turned_share else None
-        return cache.batch(rows, generator_for(seed, LATENT_STREAM, number), options.prompt_dropout, device, turns)
+        generator = generator_for(seed, LATENT_STREAM, number)
+        batch = cache.batch(rows, generator, options.prompt_dropout, device, turns)
+        if options.moves.moves_anything:
+            moved = move_frames(frames[rows], options, seed, number)
+            return replace(batch, latents=encode_images(prior, moved, generator).to(device))
+        return batch
 
     def validate() -> tuple[float, float]:
         batch = cache.batch(validation_rows, generator_for(seed, DROPOUT_STREAM), 0.0, device)
@@ -164,6 +172,12 @@ def draw_turns(count: int, share: float, seed: int, number: int) -> np.ndarray:
     """Quarter turns [count] of micro-batch `number`: 0 but for `share` of them, which are 1, 2 or 3 alike."""
     rng = np.random.default_rng([seed, TURN_STREAM, number])
     return np.where(rng.random(count) < share, rng.integers(1, 4, count), 0)
+
+
+def move_frames(frames: np.ndarray, options: FineTuningOptions, seed: int, number: int) -> np.ndarray:
+    """The frames [B, H, W, 3] uint8 of micro-batch `number`, each moved at random."""
+    rng = np.random.default_rng([seed, MOVE_STREAM, number])
+    return np.stack([move_image(frame, options.moves, rng, interpolation="nearest") for frame in frames])
 
 
 def draw_samples(prior: Prior, frames: np.ndarray, conditions: Conditions) -> np.ndarray:

@@ -25,7 +25,8 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from ctlev_core.dataset_files.trees import check_inside, list_folder
-from data_contracts.config import RUN_SETTING, Frozen
+from ctlev_core.image_moves import Moves, move_image
+from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
@@ -33,14 +34,13 @@ IDX_IMAGES, IDX_LABELS = "train-images-idx3-ubyte", "train-labels-idx1-ubyte"
 MAX_BYTES = 4 * 2**30
 """Of the pictures in one file, which are held in memory; a folder of class folders has no limit."""
 MIN_PICTURES = 20
-MOVE_STREAM = 3
 EXPECTED = f"""expected one of
   ROOT/<class>/<picture>{"|".join(SUFFIXES)}
   FILE.npz with `images` [N, H, W] or [N, H, W, 3] uint8 and `labels` [N]
   ROOT/{IDX_IMAGES} and ROOT/{IDX_LABELS} (MNIST), plain or .gz"""
 
 
-class PictureOptions(Frozen):
+class PictureOptions(Moves):
     """Which pictures, and how much each is moved about whenever it is shown."""
 
     root: Path | None = Field(
@@ -54,10 +54,9 @@ class PictureOptions(Frozen):
     synonyms: dict[str, list[str]] = Field(
         default_factory=dict, description="further names of a class, of which captions take one at random"
     )
-    shift: float = Field(default=0.08, ge=0, le=0.5, description="at most so far, as a share of the side")
-    turn_deg: float = Field(default=8.0, ge=0, le=180, description="at most so far, either way")
-    scale: float = Field(default=0.1, ge=0, lt=1, description="at most so much larger or smaller")
-    mirror: bool = Field(default=False, description="mirror half of them; letters and digits must not be")
+    shift: float = Field(default=0.08, ge=0, le=0.5, description="as a share of the side, along each axis")
+    turn_deg: float = Field(default=8.0, ge=0, le=180, description="either way, about the centre")
+    scale: float = Field(default=0.1, ge=0, lt=1, description="so much larger or smaller")
 
     @field_validator("class_names")
     @classmethod
@@ -123,16 +122,8 @@ def picture_files(options: PictureOptions) -> list[Path]:
 
 
 def move(picture: np.ndarray, options: PictureOptions, rng: np.random.Generator) -> np.ndarray:
-    """The picture shifted, turned and scaled at random as `options` say; what comes in is its border colour."""
-    height, width = picture.shape[:2]
-    angle = rng.uniform(-options.turn_deg, options.turn_deg)
-    matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle, 1 + options.scale * rng.uniform(-1, 1))
-    matrix[:, 2] += options.shift * np.array([width, height]) * rng.uniform(-1, 1, 2)
-    moved = cv2.warpAffine(
-        picture, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
-        borderValue=border_colour(picture),
-    )  # fmt: skip
-    return moved[:, ::-1].copy() if options.mirror and rng.random() < 0.5 else moved
+    """The picture [H, W, 3] moved at random as `options` say; what comes into view has its border colour."""
+    return move_image(picture, options, rng, interpolation="linear", border=border_colour(picture))
 
 
 def border_colour(picture: np.ndarray) -> tuple[float, float, float]:
@@ -148,9 +139,10 @@ def read_picture(path: Path) -> np.ndarray:
     Raises:
         DataError: it cannot be read as a picture.
     """
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if picture is None or picture.size == 0:
+    read = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if read is None or read.size == 0:
         raise DataError(f"{path}: cannot be read as a picture")
+    picture = np.asarray(read)
     if picture.dtype == np.uint16:
         picture = (picture >> 8).astype(np.uint8)
     if picture.dtype != np.uint8:
@@ -231,13 +223,14 @@ def _open_npz(path: Path, class_names: Sequence[str]) -> LabelledPictures:
 
 
 def _open_idx(root: Path, class_names: Sequence[str]) -> LabelledPictures:
-    arrays = []
+    arrays: list[np.ndarray] = []
     for name, magic in ((IDX_IMAGES, 0x803), (IDX_LABELS, 0x801)):
         path = _idx_file(root, name)
         if path is None:
             raise DataError(f"{root}: expected {name} beside the other file; {EXPECTED}")
         arrays.append(_read_idx(path, magic))
-    return _checked(*arrays, class_names, str(root))
+    images, labels = arrays
+    return _checked(images, labels, class_names, str(root))
 
 
 def _idx_file(root: Path, name: str) -> Path | None:
@@ -279,7 +272,8 @@ def _checked(images: np.ndarray, labels: np.ndarray, class_names: Sequence[str],
         raise DataError(f"{where}: labels must be names, or numbers from 0 on, got {labels.dtype}")
     if class_names and len(labels) and labels.max() >= len(class_names):
         raise DataError(f"{where}: label {labels.max()} has no name; class_names has {len(class_names)}")
-    return LabelledPictures(tuple(class_names[n] if class_names else str(n) for n in labels.tolist()), images)
+    names = tuple(str(class_names[number] if class_names else number) for number in labels.tolist())
+    return LabelledPictures(names, images)
 
 
 def _known(classes: Sequence[str]) -> str:

@@ -126,6 +126,17 @@ def cache_latents(
     )
 
 
+@torch.no_grad()
+def encode_images(prior: Prior, images: np.ndarray, generator: torch.Generator) -> Tensor:
+    """Scaled latents [B, C, h, w] float32 of images [B, H, W, 3] uint8, drawn from their posteriors."""
+    posterior = prior.vae.encode(images_to_tensor(images).to(prior.vae.device, prior.vae.dtype)).latent_dist
+    latents = posterior.mean.float()
+    if hasattr(posterior, "std"):
+        noise = torch.randn(latents.shape, generator=generator)
+        latents = latents + posterior.std.float() * noise.to(latents.device)
+    return latents * prior.scaling_factor
+
+
 def turn_conditions(images: np.ndarray, turns: np.ndarray, made_by: ConditionChoice | None) -> np.ndarray:
     """Square condition images [B, S, S, 3] in `turns` [B] quarter turns against the clock.
 

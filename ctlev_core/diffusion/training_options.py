@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from ctlev_core.image_moves import Moves
 from data_contracts.config import RUN_SETTING, Frozen
 
 
@@ -112,6 +113,11 @@ class FineTuningOptions(TrainingOptions):
         le=1,
         description="share of frames shown turned by 90, 180 or 270 degrees, with their condition images, as a rolled "
         "camera would see them: bodies lie that only stood",
+    )
+    moves: Moves = Field(
+        default=Moves(),
+        description="frames are shifted, turned and scaled at random whenever they are shown, for few recordings teach "
+        "their own places and sizes; of the text route only, and each batch goes through the autoencoder anew",
     )
     num_validation: int = Field(
         default=64, ge=0, description="frames held back for the validation loss, a tenth at most"
