@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.diffusion.labelled_pictures import picture_files
 from data_contracts import tables
 from data_contracts.config import GeneratorChoice
 from data_contracts.errors import DataError
@@ -17,10 +18,11 @@ from tasks.stage import Output, files_of, stage
 
 
 def _prior_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
-    if arguments["base_model"] is not None:
-        return []  # it is an artefact, and its key is part of ours
     plugin = plugins.load_options(arguments["generator"])
-    return files_of(plugin.module.prior_folders(plugin.options))
+    # A base model is an artefact, and its key is part of ours.
+    places = [] if arguments["base_model"] is not None else plugin.module.prior_folders(plugin.options)
+    shown = [] if not getattr(plugin.options, "rehearsal_share", 0) else picture_files(plugin.options.rehearsal)
+    return files_of(places) + [(f"rehearsal/{name}", path) for name, path in files_of(shown)]
 
 
 @stage(version=1, schema=tables.TRAINING, raw_files=_prior_files)

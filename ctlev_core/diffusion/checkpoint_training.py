@@ -25,6 +25,7 @@ from ctlev_core.diffusion.sharding import check_sharding, gather_networks, shard
 from ctlev_core.diffusion.trainer import TrainingHistory
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from ctlev_core.diffusion.training_processes import run_rank, train_in_processes
+from ctlev_core.diffusion.value_table import write_value_table
 from data_contracts.config import ConditionChoice
 from data_contracts.labels import Conditions
 
@@ -114,6 +115,9 @@ def _train(
     written = gather_networks(prior, keep=ranks.rank == 0) if ranks.sharded else prior
     if ranks.rank == 0 and written is not None:
         save_prior(written, Path(job["out"]))
+        if history.value_table is not None:
+            write_value_table(Path(job["out"]), history.value_table)
+            history.value_table = None  # it is in the checkpoint; histories travel as text
     return history
 
 

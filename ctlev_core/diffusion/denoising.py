@@ -106,6 +106,16 @@ class NoiseSchedule:
             return noisy, noise if self.prediction_type == "epsilon" else latents
         return noisy, self._scheduler.get_velocity(latents, noise, timesteps)
 
+    def clean_of(self, predicted: Tensor, noisy: Tensor, timesteps: Tensor) -> Tensor:
+        """The clean latents [B, C, h, w] that a prediction stands for."""
+        if self.prediction_type == "sample":
+            return predicted
+        alpha_bar = self.alphas_cumprod.to(noisy.device)[timesteps][:, None, None, None]
+        signal, noise = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
+        if self.prediction_type == "epsilon":
+            return (noisy - noise * predicted) / signal
+        return signal * noisy - noise * predicted
+
     def loss_weights(self, timesteps: Tensor, emphasis: Emphasis = PLAIN) -> Tensor:
         """Weights [B] of the squared errors.
 

@@ -19,8 +19,15 @@ import torch
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
-from ctlev_core.diffusion.latent_cache import cache_latents, check_cache, check_training_data, encode_images
-from ctlev_core.diffusion.prior import Prior
+from ctlev_core.diffusion.latent_cache import (
+    LatentCache,
+    cache_latents,
+    check_cache,
+    check_training_data,
+    encode_images,
+)
+from ctlev_core.diffusion.picture_scenes import Rehearsal
+from ctlev_core.diffusion.prior import Prior, encode_prompts
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.sampling import sample_frames
 from ctlev_core.diffusion.sampling_options import SamplingOptions
@@ -29,6 +36,7 @@ from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
 from ctlev_core.diffusion.training import check_run, run_training, sample_rows
 from ctlev_core.diffusion.training_log import picture_of_samples
 from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.value_table import fit_value_table
 from ctlev_core.image_moves import move_image
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
@@ -37,7 +45,8 @@ from data_contracts.labels import Conditions
 Tune = Literal["unet", "controlnet", "both"]
 SHOWN, SHOWN_STEPS = 6, 10
 """Samples in a picture, and evaluations of the network for each."""
-SPLIT_STREAM, LATENT_STREAM, DROPOUT_STREAM, WEIGHT_STREAM, TURN_STREAM, MOVE_STREAM = 1, 2, 3, 4, 5, 6
+SPLIT_STREAM, LATENT_STREAM, DROPOUT_STREAM, WEIGHT_STREAM, TURN_STREAM = 1, 2, 3, 4, 5
+MOVE_STREAM, REHEARSAL_STREAM, VALUE_STREAM = 6, 7, 8
 """Entropy that keeps random streams apart."""
 
 
@@ -108,8 +117,7 @@ def fine_tune(
     check_channel_order(prior, conditions)
     if options.turned_share and frames.shape[1] != frames.shape[2]:
         raise DataError(f"turned_share needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0")
-    if options.moves.moves_anything and (options.turned_share or conditions.images is not None):
-        raise DataError("moves are for the text route, whose prompts hold wherever a thing is, without turned_share")
+    _check_text_route(options, conditions)
     device = prior.unet.device
     networks = {"unet": (prior.unet,), "controlnet": (prior.controlnet,), "both": (prior.unet, prior.controlnet)}[tune]
     parameters = []
@@ -128,16 +136,18 @@ def fine_tune(
     cache = cache_latents(prior, frames, conditions, class_names, num_turns=num_turns)
     check_cache(cache, conditions)
     prior.text_encoder.to("cpu")
+    num_pictures = round(options.batch_size * options.rehearsal_share)
+    rehearsal = Rehearsal(options.rehearsal, prior.image_size[0]) if num_pictures else None
 
     def fetch(number: int) -> Batch:
-        rows = training_rows[sample_rows(seed, number, options.batch_size, len(training_rows))]
+        rows = training_rows[sample_rows(seed, number, options.batch_size - num_pictures, len(training_rows))]
         turns = draw_turns(len(rows), options.turned_share, seed, number) if options.turned_share else None
         generator = generator_for(seed, LATENT_STREAM, number)
         batch = cache.batch(rows, generator, options.prompt_dropout, device, turns)
         if options.moves.moves_anything:
             moved = move_frames(frames[rows], options, seed, number)
-            return replace(batch, latents=encode_images(prior, moved, generator).to(device))
-        return batch
+            batch = replace(batch, latents=encode_images(prior, moved, generator).to(device))
+        return batch if rehearsal is None else _with_pictures(batch, prior, rehearsal, options, seed, number)
 
     def validate() -> tuple[float, float]:
         batch = cache.batch(validation_rows, generator_for(seed, DROPOUT_STREAM), 0.0, device)
@@ -158,7 +168,20 @@ def fine_tune(
     )
     for network in networks:
         network.eval().requires_grad_(False)
+    if options.values_at and ranks.rank == 0:
+        history.value_table = _value_table(prior, frames, cache, training_rows, options, seed)
     return history
+
+
+def _check_text_route(options: FineTuningOptions, conditions: Conditions) -> None:
+    """Raise `DataError` where something is asked for that holds for prompts alone."""
+    asked = {"moves": options.moves.moves_anything, "rehearsal_share": options.rehearsal_share > 0}
+    asked["values_at"] = options.values_at > 0
+    for name, is_asked in asked.items():
+        if is_asked and (conditions.images is not None or options.turned_share):
+            raise DataError(
+                f"{name} is for the text route, whose prompts hold wherever a thing is, without turned_share"
+            )
 
 
 def split_rows(count: int, options: FineTuningOptions, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -178,6 +201,26 @@ def move_frames(frames: np.ndarray, options: FineTuningOptions, seed: int, numbe
     """The frames [B, H, W, 3] uint8 of micro-batch `number`, each moved at random."""
     rng = np.random.default_rng([seed, MOVE_STREAM, number])
     return np.stack([move_image(frame, options.moves, rng, interpolation="nearest") for frame in frames])
+
+
+def _with_pictures(
+    batch: Batch, prior: Prior, rehearsal: Rehearsal, options: FineTuningOptions, seed: int, number: int
+) -> Batch:
+    """The batch, and behind it pictures with their captions up to the whole batch size."""
+    rng = np.random.default_rng([seed, REHEARSAL_STREAM, number])
+    images, captions = rehearsal.draw(options.batch_size - len(batch.latents), rng)
+    captions = ["" if rng.random() < options.prompt_dropout else caption for caption in captions]
+    latents = encode_images(prior, images, generator_for(seed, REHEARSAL_STREAM, number)).to(batch.latents)
+    embeddings = encode_prompts(prior, captions).to(batch.embeddings)
+    return Batch(torch.cat([batch.latents, latents]), torch.cat([batch.embeddings, embeddings]))
+
+
+def _value_table(
+    prior: Prior, frames: np.ndarray, cache: LatentCache, rows: np.ndarray, options: FineTuningOptions, seed: int
+) -> np.ndarray:
+    batch = cache.batch(rows, generator_for(seed, VALUE_STREAM), 0.0, torch.device("cpu"))
+    timestep = round(options.values_at * (len(NoiseSchedule(prior.scheduler_config).alphas_cumprod) - 1))
+    return fit_value_table(prior, frames[rows], batch.latents, batch.embeddings, timestep=timestep, seed=seed)
 
 
 def draw_samples(prior: Prior, frames: np.ndarray, conditions: Conditions) -> np.ndarray:

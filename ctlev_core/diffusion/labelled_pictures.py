@@ -19,8 +19,8 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
@@ -29,6 +29,7 @@ from ctlev_core.image_moves import Moves, move_image
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 
+Style = Literal["photo", "grey", "lines", "coloured lines"]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 IDX_IMAGES, IDX_LABELS = "train-images-idx3-ubyte", "train-labels-idx1-ubyte"
 MAX_BYTES = 4 * 2**30
@@ -54,9 +55,23 @@ class PictureOptions(Moves):
     synonyms: dict[str, list[str]] = Field(
         default_factory=dict, description="further names of a class, of which captions take one at random"
     )
+    styles: dict[Style, float] = Field(
+        default={"photo": 0.3, "lines": 0.7},
+        description="shares of the styles that pictures are shown in; an event camera sees outlines",
+    )
+    bare_caption_share: float = Field(
+        default=0.5, ge=0, le=1, description="captions that say the name and not the style"
+    )
     shift: float = Field(default=0.08, ge=0, le=0.5, description="as a share of the side, along each axis")
     turn_deg: float = Field(default=8.0, ge=0, le=180, description="either way, about the centre")
     scale: float = Field(default=0.1, ge=0, lt=1, description="so much larger or smaller")
+
+    @field_validator("styles")
+    @classmethod
+    def _shares_sum_to_one(cls, styles: dict[Style, float]) -> dict[Style, float]:
+        if min(styles.values(), default=0) < 0 or abs(sum(styles.values()) - 1) > 1e-6:
+            raise ValueError(f"the shares of styles must not be negative and sum to 1, got {styles}")
+        return styles
 
     @field_validator("class_names")
     @classmethod
@@ -139,12 +154,14 @@ def read_picture(path: Path) -> np.ndarray:
     Raises:
         DataError: it cannot be read as a picture.
     """
+    import cv2
+
     read = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if read is None or read.size == 0:
         raise DataError(f"{path}: cannot be read as a picture")
     picture = np.asarray(read)
     if picture.dtype == np.uint16:
-        picture = (picture >> 8).astype(np.uint8)
+        picture = (picture // 256).astype(np.uint8)
     if picture.dtype != np.uint8:
         raise DataError(f"{path}: expected 8 or 16 bits a channel, got {picture.dtype}")
     if picture.ndim == 2:
@@ -156,6 +173,8 @@ def read_picture(path: Path) -> np.ndarray:
 
 
 def _fit(picture: np.ndarray, size: int) -> np.ndarray:
+    import cv2
+
     height, width = picture.shape[:2]
     scale = size / max(height, width)
     new = max(round(width * scale), 1), max(round(height * scale), 1)

@@ -21,8 +21,9 @@ from pydantic import Field, model_validator
 
 from ctlev_core.diffusion import labelled_pictures, procedural_images
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
-from ctlev_core.diffusion.labelled_pictures import LabelledPictures, PictureOptions
+from ctlev_core.diffusion.labelled_pictures import PictureOptions
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
+from ctlev_core.diffusion.picture_scenes import picture_diet, scene_of
 from ctlev_core.diffusion.prior import (
     Prior,
     conditions_to_tensor,
@@ -84,7 +85,7 @@ class PretrainingOptions(Frozen):
     )
     diet: procedural_images.Diet = Field(
         default=procedural_images.DEFAULT_DIET,
-        description="what procedural pictures are of, and the styles that any pictures are shown in",
+        description="what procedural pictures are of",
     )
     pictures: PictureOptions = Field(
         default=PictureOptions(), description="pictures of one's own, with class names, in place of procedural ones"
@@ -162,7 +163,7 @@ class ImageStream:
         rng = np.random.default_rng([options.seed, STYLE_STREAM, number])
         batch = []
         for row in rows:
-            image, caption = procedural_images.apply_style(scenes[row], rng, options.diet)
+            image, caption = procedural_images.apply_style(scenes[row], rng, diet_of(options))
             condition = scenes[row].condition
             steered = condition is not None and rng.random() >= options.condition_dropout
             caption = "" if rng.random() < options.text_dropout else caption
@@ -193,7 +194,13 @@ def draw_block(options: PretrainingOptions, block: int) -> list[procedural_image
     rows = learnt[sample_rows(options.seed, block, options.block_scenes, len(learnt))]
     first = block * options.block_scenes
     streams = [np.random.default_rng([options.seed, PICTURE_STREAM, first + number]) for number in range(len(rows))]
-    return [_scene_of(pictures, int(row), options, rng) for row, rng in zip(rows, streams, strict=True)]
+    wanted = options.pictures, options.image_size
+    return [scene_of(pictures, int(row), *wanted, rng) for row, rng in zip(rows, streams, strict=True)]
+
+
+def diet_of(options: PretrainingOptions) -> procedural_images.Diet:
+    """Styles and captions: those of the user's pictures where there are any."""
+    return options.diet if options.pictures.root is None else picture_diet(options.pictures)
 
 
 def split_pictures(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -201,15 +208,6 @@ def split_pictures(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     order = np.random.default_rng([seed, VALIDATION_STREAM]).permutation(count)
     held_back = min(VALIDATION_IMAGES, count // 10)
     return order[held_back:], order[:held_back]
-
-
-def _scene_of(
-    pictures: LabelledPictures, row: int, options: PretrainingOptions, rng: np.random.Generator
-) -> procedural_images.Scene:
-    name = pictures.names[row]
-    called = str(rng.choice([name, *options.pictures.synonyms.get(name, ())])).replace("_", " ")
-    image = labelled_pictures.move(pictures.read(row, options.image_size), options.pictures, rng)
-    return procedural_images.Scene(image, None, called, called)
 
 
 def make_batch(prior: Prior, rows: list[Row]) -> Batch:
@@ -229,8 +227,8 @@ def draw_picture_rows(options: PretrainingOptions) -> list[Row]:
     rows = []
     for number, row in enumerate(split_pictures(len(pictures), options.seed)[1]):
         rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + number])
-        scene = _scene_of(pictures, int(row), options, rng)
-        image, caption = procedural_images.apply_style(scene, rng, options.diet)
+        scene = scene_of(pictures, int(row), options.pictures, options.image_size, rng)
+        image, caption = procedural_images.apply_style(scene, rng, diet_of(options))
         rows.append(Row(image, caption, None))
     return rows
 
@@ -263,7 +261,7 @@ def new_prior(options: PretrainingOptions) -> Prior:
         images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
     else:
         scenes = draw_block(options.model_copy(update={"block_scenes": FIT_IMAGES}), 0)
-        images = np.stack([procedural_images.apply_style(scene, rng, options.diet)[0] for scene in scenes])
+        images = np.stack([procedural_images.apply_style(scene, rng, diet_of(options))[0] for scene in scenes])
         classes = labelled_pictures.open_pictures(options.pictures).classes
         # Often enough that every name becomes a word of its own.
         corpus = corpus + 40 * [name.replace("_", " ") for name in classes] + 40 * _synonyms(options)

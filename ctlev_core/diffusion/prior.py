@@ -38,6 +38,8 @@ class Prior:
         controlnet: steers the U-Net by a condition image; None where the folder has none.
         scheduler_config: the noise schedule the prior was trained with.
         image_size: (width, height) px of the images the U-Net was trained on.
+        value_table: [256, 256], how values are drawn about those the networks expect; None = they are taken as they
+            are.
     """
 
     tokenizer: Any
@@ -47,6 +49,7 @@ class Prior:
     controlnet: Any | None
     scheduler_config: dict[str, Any]
     image_size: tuple[int, int]
+    value_table: Any | None = None
 
     @property
     def scaling_factor(self) -> float:

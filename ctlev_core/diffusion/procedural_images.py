@@ -27,6 +27,7 @@ from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.body_views import labels_in_camera
 from ctlev_core.camera import is_inside, project
 from ctlev_core.conditions import normals
+from ctlev_core.diffusion.labelled_pictures import Style
 from ctlev_core.render.compositions import RELATIONS, all_compositions
 from ctlev_core.render.object_drawing import draw_composition, draw_object
 from ctlev_core.render.objects import COLOURS, NAMES, OBJECTS
@@ -44,7 +45,6 @@ PLAIN_PEOPLE_SHARE = 0.4
 """How many people stand before a plain background, so that their line drawings are clean."""
 THING_SIZE = (0.6, 0.95)
 CAMERA = CameraRange(distance_m=(3.0, 4.2), pitch_rad=(-0.3, 0.5), focal_per_side=(1.3, 1.9))
-Style = Literal["photo", "grey", "lines", "coloured lines"]
 SAY_STYLE_SHARE = 0.6
 GRAIN_SHARE = 0.1
 PERSON_CAPTIONS = (

@@ -38,12 +38,15 @@ from ctlev_core.diffusion.sampling_memory import ShrinkingBatches
 from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling_shards import Shard, plan_shards
 from ctlev_core.diffusion.schedulers import make_scheduler as make_scheduler
+from ctlev_core.diffusion.value_table import draw_values, read_value_table
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 
 logger = logging.getLogger(__name__)
 
+VALUE_STREAM = 1
+"""Entropy that keeps the values drawn apart from the noise of the same seed."""
 SHARDS_A_PROCESS = 4
 """Fewer are sampled before another process has started, which takes some ten seconds of imports."""
 
@@ -112,13 +115,16 @@ def _is_guided(timestep: Tensor, num_timesteps: int, options: SamplingOptions) -
 
 
 @torch.no_grad()
-def decode_frames(prior: Prior, latents: Tensor, options: SamplingOptions) -> np.ndarray:
-    """Frames [B, H, W, 3] uint8 of scaled latents; dark values become exactly 0."""
+def decode_frames(prior: Prior, latents: Tensor, options: SamplingOptions, seeds: Sequence[int] = ()) -> np.ndarray:
+    """Frames [B, H, W, 3] uint8 of scaled latents; dark values become exactly 0, or values are drawn from `seeds`."""
     values = ((decode_latents(prior, latents) + 1) * 127.5).clamp(0, 255)
     if options.palette == "grey":
         values = values.mean(dim=1, keepdim=True).expand_as(values)
     elif options.palette == "red_blue":
         values = values * torch.tensor([1.0, 0.0, 1.0], device=values.device)[:, None, None]
+    if prior.value_table is not None:
+        expected = values.permute(0, 2, 3, 1).float().cpu().numpy()
+        return draw_values(expected, prior.value_table, [(int(seed), VALUE_STREAM) for seed in seeds])
     values = torch.where(values < options.dark_level, 0.0, values)
     return values.round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
 
@@ -178,7 +184,7 @@ def sample_shards(
         sample = functools.partial(_sample_rows, prior, shard, embeddings, table[-1:], options)
         parts = []
         for rows, latents in batches.map(sample, len(shard)):
-            decode = functools.partial(_decode_rows, prior, latents, options)
+            decode = functools.partial(_decode_rows, prior, latents, options, shard.seeds[rows])
             parts += [frames for _, frames in decoded.map(decode, len(latents))]
             report(rows.stop - rows.start)
         shard.write(np.concatenate(parts))
@@ -193,8 +199,10 @@ def _sample_rows(
     return sample_latents(prior, embeddings[rows], empty_embedding, images, shard.seeds[rows], options)
 
 
-def _decode_rows(prior: Prior, latents: Tensor, options: SamplingOptions, rows: slice) -> np.ndarray:
-    return decode_frames(prior, latents[rows], options)
+def _decode_rows(
+    prior: Prior, latents: Tensor, options: SamplingOptions, seeds: Sequence[int], rows: slice
+) -> np.ndarray:
+    return decode_frames(prior, latents[rows], options, seeds[rows])
 
 
 def sample_checkpoint(
@@ -265,6 +273,8 @@ def load_for_sampling(checkpoint: Path, options: SamplingOptions, device: str, w
 
     place, dtype = choose_device(device), getattr(torch, options.precision)
     prior = load_prior(checkpoint, with_controlnet=with_controlnet, dtype=dtype, device=place)
+    if options.values == "drawn":
+        prior = dataclasses.replace(prior, value_table=read_value_table(checkpoint))
     if not isinstance(prior.vae, PatchAutoencoder) or dtype == torch.float32:
         return prior
     exact: Any = PatchAutoencoder.from_config(prior.vae.config)

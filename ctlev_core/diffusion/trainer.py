@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributed.tensor import DTensor
@@ -29,6 +30,8 @@ class TrainingHistory(History):
     """Curves of a diffusion training, and the step whose averaged weights were kept; None until it has ended."""
 
     kept_step: int | None = None
+    value_table: np.ndarray | None = None
+    """[256, 256], see `ctlev_core.diffusion.value_table`; None where it was not asked for."""
 
 
 class Trainer:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from ctlev_core.diffusion.labelled_pictures import PictureOptions
 from ctlev_core.image_moves import Moves
 from data_contracts.config import RUN_SETTING, Frozen
 
@@ -119,6 +120,23 @@ class FineTuningOptions(TrainingOptions):
         description="frames are shifted, turned and scaled at random whenever they are shown, for few recordings teach "
         "their own places and sizes; of the text route only, and each batch goes through the autoencoder anew",
     )
+    rehearsal_share: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="share of each batch that is `rehearsal` pictures in place of event images, so that what the base "
+        "model knows of pictures is not forgotten; of the text route only",
+    )
+    rehearsal: PictureOptions = Field(
+        default=PictureOptions(), description="the pictures, as a rule those that the base model has learnt from"
+    )
+    values_at: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="time step, as a share of the schedule, at which it is measured how real values scatter about "
+        "expected ones, for sampling.values=drawn; 0 = not measured; of the text route only",
+    )
     num_validation: int = Field(
         default=64, ge=0, description="frames held back for the validation loss, a tenth at most"
     )
@@ -156,3 +174,9 @@ class FineTuningOptions(TrainingOptions):
         description="share out weights, gradients and moments over `num_processes` (fully sharded data parallelism): "
         "less memory of each GPU for more traffic between them; null = as `accelerate launch` was told",
     )
+
+    @model_validator(mode="after")
+    def _rehearsal_needs_pictures(self) -> Self:
+        if self.rehearsal_share and self.rehearsal.root is None:
+            raise ValueError("rehearsal_share needs rehearsal.root, the pictures that are shown")
+        return self
