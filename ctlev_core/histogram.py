@@ -239,7 +239,7 @@ def full_scales(histogram: np.ndarray, scales: np.ndarray) -> None:
     pixel it is 0, so that a lone event comes out white, like equal counts. A window without events gets the floor.
 
     Args:
-        histogram: [N, C, H, W] uint16, C = 1 or 2, contiguous.
+        histogram: [N, C, H, W] uint16, contiguous.
         scales: [N] float64, filled.
     """
     num_windows, num_channels, height, width = histogram.shape
@@ -250,8 +250,8 @@ def full_scales(histogram: np.ndarray, scales: np.ndarray) -> None:
         num_pixels, total = 0, 0
         for pixel in range(num_cells):
             count = np.int64(channels[0, pixel])
-            if num_channels == 2:
-                count += np.int64(channels[1, pixel])
+            for channel in range(1, num_channels):
+                count += np.int64(channels[channel, pixel])
             counts[num_pixels] = count
             # A pixel without events is overwritten by the next.
             num_pixels += count > 0
@@ -284,7 +284,28 @@ def draw(histogram: np.ndarray, scales: np.ndarray, images: np.ndarray) -> None:
                 count = counts[channel, pixel]
                 if count == 0:
                     continue
-                value = np.uint8(min(255.0, np.floor(255.0 * count / scales[window])))
+                value = _grey_level(count, scales[window])
                 values[pixel, 2 * channel] = value
                 if num_channels == 1:
                     values[pixel, 1] = values[pixel, 2] = value
+
+
+@njit(cache=True, nogil=True)
+def grey_levels(histogram: np.ndarray, scales: np.ndarray, levels: np.ndarray) -> None:
+    """Counts to the grey levels of `draw`, every channel by itself.
+
+    Args:
+        histogram: [N, C, H, W] uint16, contiguous.
+        scales: [N] float64, positive.
+        levels: [N, C, H, W] uint8, filled.
+    """
+    for window in range(len(histogram)):
+        counts, values = histogram[window].reshape(-1), levels[window].reshape(-1)
+        for cell in range(len(counts)):
+            count = counts[cell]
+            values[cell] = _grey_level(count, scales[window]) if count != 0 else np.uint8(0)
+
+
+@njit(cache=True, nogil=True)
+def _grey_level(count: int, scale: float) -> int:
+    return np.uint8(min(255.0, np.floor(255.0 * count / scale)))

@@ -8,6 +8,7 @@ from data_contracts.event_export import EventExport
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from flows.command_line import main
+from flows.inputs import check_whole_counts
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import HOME, flow
 from flows.synthesize import synthesize
@@ -20,6 +21,7 @@ def export_streams(
     experiment: Experiment, dataset: PreparedDataset | None = None, synthetic: ManifestRef | None = None
 ) -> ManifestRef:
     """Write the experiment's synthetic frames as event streams; what is not given is made first."""
+    check_whole_counts(experiment, "export of events")
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     if synthetic is None:

@@ -42,6 +42,7 @@ def check_inputs(asked: Experiment | Study, *, thoroughly: bool = False) -> None
                 plugins.load_options(choice)
             _check_intensity(experiment)
             _check_labels(experiment)
+            _check_counts(experiment)
     except (PluginError, DataError) as error:
         # What is found by looking again need not be what was found first: folders change.
         raise InputsMissing(_problems(experiments) or [str(error)], asked) from error
@@ -58,7 +59,7 @@ def _problems(experiments: Mapping[str, Experiment]) -> list[str]:
                 _look_for(choice)
             except (PluginError, DataError, OSError) as error:
                 found.setdefault(str(error), []).append(name)
-        for check in (_check_intensity, _check_labels):
+        for check in (_check_intensity, _check_labels, _check_counts):
             try:
                 check(experiment)
             except (PluginError, DataError, OSError) as error:
@@ -86,6 +87,34 @@ def _look_for(choice: Choice) -> None:
 
 def _check_labels(experiment: Experiment) -> None:
     check_dataset(experiment.metrics, experiment.tested_dataset)
+
+
+def _check_counts(experiment: Experiment) -> None:
+    asking = {"round_to_counts": experiment.round_to_counts, "export": experiment.export is not None}
+    for what, is_asked in asking.items():
+        if is_asked:
+            check_whole_counts(experiment, what)
+
+
+def check_whole_counts(experiment: Experiment, what: str) -> None:
+    """Raise `PluginError` where event images of the dataset will not show whole counts, which `what` needs."""
+    plugin, encoding = plugins.load_options(experiment.dataset), plugins.load_options(experiment.encoding).options
+    recordings = plugin.module.list_recordings(plugin.options)
+    finished = [one.recording_id for one in recordings if one.has_event_images and not one.has_events]
+    if finished:
+        raise PluginError(f"{what} needs events, and {finished[0]} comes as finished event images")
+    image_size = getattr(encoding, "image_size", None)
+    if image_size is None or getattr(encoding, "resampling", "") != "area":
+        return
+    # A sensor whose size only its files tell may have that of the image; with `events` it comes to the same.
+    other = [one for one in recordings if one.has_events and one.sensor_size != image_size]
+    if other:
+        width, height = other[0].sensor_size or ("unknown", "unknown")
+        raise PluginError(
+            f"{what} needs whole counts of image pixels, and images of {image_size[0]} x {image_size[1]} px are "
+            f"averages over areas of sensors of {width} x {height} px: set encoding.options.resampling=events, or no "
+            "encoding.options.image_size"
+        )
 
 
 def _check_intensity(experiment: Experiment) -> None:

@@ -43,7 +43,7 @@ BLOCK_ROWS = 256
 """Rows rendered at a time; pictures of 512 x 512 px take 0.2 GiB."""
 
 
-@stage(version=4, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
+@stage(version=5, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
 def condition_frames(
     out: Output,
     recordings: Manifest,
@@ -58,7 +58,7 @@ def condition_frames(
     return _render(out, rows.source_ids, rows, condition, recordings, frames, encoding, seed)
 
 
-@stage(version=7, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
+@stage(version=8, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
 def condition_samples(
     out: Output,
     poses: Manifest,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,6 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from ctlev_core import event_files, plugins
-from ctlev_core.image_resampling import resample_images
 from ctlev_core.labelling import has_label, labels_at_windows, labels_in_image
 from ctlev_core.windows import cut_chunks, spread
 from data_contracts import tables
@@ -33,12 +33,12 @@ MAX_GAP = 1 << 18
 """Events between two windows that are read rather than skipped."""
 MAX_WINDOWS = 64
 """Frames made at a time: the pages of large new arrays cost more than the counting in them."""
+BLOCK_BYTES = 1 << 26
+"""What `encode` returns at a time: 64 windows of 512 x 512 px in two channels, 18 of 1280 x 720 px."""
 HELD_BYTES = 1 << 23
 """Images of a recording that wait in memory until their turn comes; four frames of 512 x 512 px fit."""
 MAX_GROUP = 4
 """Recordings that travel together; up to two such groups a worker wait, so that 16 workers hold 1 GiB at most."""
-GREY_SCALE = 256
-"""Counts that a grey value of 1 becomes, so that averages keep their fractions."""
 
 
 class _Source(NamedTuple):
@@ -67,25 +67,29 @@ class _Samples(NamedTuple):
     labels: Labels
 
 
-@stage(version=4, schema=tables.FRAMES)
+@stage(version=5, schema=tables.FRAMES)
 def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windows: Windows) -> pa.Table:
     """Cut every recording into windows and encode each: arrays `histograms` (counts) and `frames` (8-bit RGB).
 
-    Event images that come finished take the place of both: every image is a window, its grey values stand for counts.
+    Counts have the size of the sensor, or with resampling `events` that of the image. Where sensors differ, counts lie
+    in the upper left corner of an array that is as large as the largest, with zeros beyond. Of event images that come
+    finished every one is a window, and its grey values stand for counts.
     """
     sources = _sources(recordings, windows)
+    canvas = _canvas(sources, encoding)
     rows: list[dict[str, Any]] = []
     labels: list[Labels] = []
     with out.open_array("histograms") as histograms, out.open_array("frames") as frames:
         encoded = _encode_spread if is_spread(len(sources)) else _encode_in_turn
         for name, samples in encoded(sources, encoding, windows, out.work):
             try:
-                histograms.append(samples.histograms)
+                for counts in _on_canvas(samples.histograms, canvas):
+                    histograms.append(counts)
+                frames.append(samples.frames)
             except DataError as error:
                 raise DataError(
                     f"encode: sensors differ in size, {name} does; set encoding.options.image_size ({error})"
                 ) from error
-            frames.append(samples.frames)
             rows += samples.rows
             labels.append(samples.labels)
     for split in ("train", "test"):
@@ -97,6 +101,29 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
     for name, column in label_columns(stacked).items():
         table = table.append_column(name, column)
     return table
+
+
+def _canvas(sources: list[_Source], encoding: EncodingChoice) -> tuple[int, int] | None:
+    """(height, width) px that the counts of every sensor fit into; None where counts have the size of the image."""
+    if getattr(plugins.load_options(encoding).options, "resampling", "") != "area":
+        return None
+    sizes = [_sensor_size(source.recording) for source in sources]
+    return (max(height for _, height in sizes), max(width for width, _ in sizes)) if sizes else None
+
+
+def _on_canvas(histograms: np.ndarray, canvas: tuple[int, int] | None) -> Iterator[np.ndarray]:
+    """Counts [N, C, H, W] at the size of the canvas: as they are, else window by window, for canvases may be large."""
+    height, width = histograms.shape[2:]
+    if canvas is None or canvas == (height, width):
+        yield histograms
+        return
+    beyond = (0, 0), (0, 0), (0, canvas[0] - height), (0, canvas[1] - width)
+    for row in range(len(histograms)):
+        yield np.pad(histograms[row : row + 1], beyond)
+
+
+def _sensor_size(recording: dict[str, Any]) -> tuple[int, int]:
+    return recording["sensor_width_px"], recording["sensor_height_px"]
 
 
 def _check_classes(
@@ -206,7 +233,7 @@ def _encode_source(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
 
 def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) -> Iterator[_Samples]:
     """The windows of each part, some at a time: neither events nor histograms of a recording need fit into memory."""
-    path = source.file
+    path, at_once = source.file, _windows_at_once(plugin, _sensor_size(source.recording))
     for part in source.parts:
         start, stop = part["event_start"], part["event_stop"]
         held = event_files.read_events_range(path, start, stop) if stop - start <= MAX_EVENTS else None
@@ -218,7 +245,7 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
             chosen = chosen[spread(len(chosen), windows.max_windows)]
             ranges = source.windows[chosen]
             labels = None if source.window_labels is None else source.window_labels.take(chosen)
-        for rows in _groups(ranges):
+        for rows in _groups(ranges, at_once):
             first, last = int(ranges[rows[0], 0]), int(ranges[rows[-1], 1])
             if held is None:
                 events = event_files.read_events_range(path, first, last)
@@ -232,10 +259,11 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
                 if not len(rows):
                     continue
             counts = plugin.module.encode(events, local, plugin.options)
+            frames = plugin.module.render_image(counts, plugin.options)
             own = labels_at_windows(source.track, t_start, t_end) if labels is None else labels.take(rows)
-            own = _to_image(own, events.sensor_size, plugin, (counts.shape[3], counts.shape[2]))
+            own = _to_image(own, events.sensor_size, plugin, (frames.shape[2], frames.shape[1]))
             described = _rows(source.recording, part["split"], rows, t_start, t_end, local[:, 1] - local[:, 0])
-            yield _Samples(described, counts, plugin.module.render_image(counts, plugin.options), own)
+            yield _Samples(described, counts, frames, own)
 
 
 def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iterator[np.ndarray]:
@@ -246,20 +274,31 @@ def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iter
         yield event_files.read_events_range(path, first, min(first + MAX_EVENTS, stop)).t
 
 
-def _groups(ranges: np.ndarray) -> Iterator[np.ndarray]:
+def _windows_at_once(plugin: plugins.Plugin, sensor_size: tuple[int, int]) -> int:
+    """How many windows are encoded together: few of a large sensor."""
+    columns = (np.zeros(0, dtype) for dtype in (np.int64, np.uint16, np.uint16, np.uint8))
+    none = plugin.module.encode(Events(*columns, sensor_size), np.zeros((0, 2), np.int64), plugin.options)
+    window_bytes = math.prod(none.shape[1:]) * none.itemsize
+    return min(max(BLOCK_BYTES // max(window_bytes, 1), 1), MAX_WINDOWS)
+
+
+def _groups(ranges: np.ndarray, at_once: int) -> Iterator[np.ndarray]:
     """Consecutive windows that are encoded together: few, close, and of few events unless a window alone has more."""
     first = 0
     skips = np.flatnonzero(ranges[1:, 0] - ranges[:-1, 1] > MAX_GAP) + 1
     while first < len(ranges):
         fitting = int(np.searchsorted(ranges[:, 1], ranges[first, 0] + MAX_EVENTS, side="right"))
         skip = int(np.append(skips, len(ranges))[np.searchsorted(skips, first, side="right")])
-        last = min(max(fitting, first + 1), first + MAX_WINDOWS, skip)
+        last = min(max(fitting, first + 1), first + at_once, skip)
         yield np.arange(first, last)
         first = last
 
 
 def _encode_images(source: _Source, plugin: plugins.Plugin, windows: Windows) -> Iterator[_Samples]:
-    """Finished event images: every one is a window; the grey values, in fixed point, stand for counts."""
+    """Finished event images: every one is a window; the grey values stand for counts.
+
+    They are what counts of a recording become by the encoding's normalisation, and go on as those do.
+    """
     recording, name = source.recording, source.recording["recording_id"]
     if plugin.name != COUNTS:
         raise DataError(f"{name} comes as grey event images, which only the encoding {COUNTS!r} takes")
@@ -271,21 +310,19 @@ def _encode_images(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
         raise DataError(f"{name}: finished event images cannot be split in time")
     images = np.load(source.file, mmap_mode="r", allow_pickle=False)
     t_us = np.load(source.file.with_suffix(".t_us.npy"), mmap_mode="r", allow_pickle=False)
-    sensor_size = (recording["sensor_width_px"], recording["sensor_height_px"])
-    image_size = getattr(plugin.options, "image_size", None) or sensor_size
+    sensor_size = _sensor_size(recording)
     chosen = spread(len(images), windows.max_windows)
-    for first in range(0, len(chosen), MAX_WINDOWS):
-        rows = chosen[first : first + MAX_WINDOWS]
-        grey = resample_images(
-            images[rows], lambda points: plugin.module.map_points(points, sensor_size, plugin.options), image_size
-        )
-        # Averaging over pixels dims sparse images; the encoding's own normalisation brings them back to full scale.
-        values = np.rint(GREY_SCALE * grey[:, None]).astype(np.uint16)
+    at_once = _windows_at_once(plugin, sensor_size)
+    for first in range(0, len(chosen), at_once):
+        rows = chosen[first : first + at_once]
+        grey = np.asarray(images[rows])[:, None]
+        frames = plugin.module.render_levels(grey, plugin.options)
         times = np.asarray(t_us[rows])
+        image_size = (frames.shape[2], frames.shape[1])
         labels = _to_image(labels_at_windows(source.track, times, times), sensor_size, plugin, image_size)
         numbers = np.arange(first, first + len(rows))
         described = _rows(recording, source.parts[0]["split"], numbers, times, times, np.zeros(len(times), np.int64))
-        yield _Samples(described, values, plugin.module.render_image(values, plugin.options), labels)
+        yield _Samples(described, grey.astype(np.uint16), frames, labels)
 
 
 def _rows(

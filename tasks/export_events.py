@@ -17,7 +17,7 @@ from ctlev_core import event_files, plugins
 from ctlev_core.event_streams import TimeModel, fit_times, sample_streams
 from ctlev_core.format_files import event_pieces
 from ctlev_core.image_counts import CountModel, estimate_counts, fit_counts
-from ctlev_core.image_geometry import image_size, pixel_bins
+from ctlev_core.image_geometry import check_whole_counts, count_size, pixel_bins
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
@@ -96,6 +96,7 @@ def _learn(frames: Manifest, recordings: Manifest, plugin: plugins.Plugin) -> tu
             "events can be drawn only where the real windows have events"
         )
     histograms = frames.array("histograms")
+    check_whole_counts(histograms.shape, frames.array("frames").shape, "export of events")
     counts = fit_counts(np.asarray(histograms[rows[spread(len(rows), 4 * MAX_WINDOWS)]]), plugin.options)
     chosen = frames.table.take(pa.array(rows[spread(len(rows), MAX_WINDOWS)]))
     windows = _windows(chosen.to_pylist(), recordings)
@@ -109,7 +110,7 @@ def _in_image(events: Events, options: Any) -> Events:
     inside = (x >= 0) & (y >= 0)
     return Events(
         events.t[inside], x[inside].astype(np.uint16), y[inside].astype(np.uint16), events.p[inside],
-        image_size(events.sensor_size, options),
+        count_size(events.sensor_size, options),
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling_shards import SHARD
 from ctlev_core.dithering import dither_counts
 from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
+from ctlev_core.image_geometry import check_whole_counts
 from ctlev_core.row_seeds import row_seeds
 from ctlev_core.windows import spread, window_around
 from data_contracts import tables
@@ -57,6 +58,8 @@ def sample(
     training frames, each frame becomes the rendering of event counts that it is the expectation of.
     """
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
+    if rounding is not None:
+        _check_rounding(frames)
     folder = checkpoint.ref.path / "checkpoint"
 
     def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
@@ -96,6 +99,16 @@ class _Told(NamedTuple):
 def _block_rows(frames: Manifest) -> int:
     """Rows that are sampled before their frames are written: whole shards, so that batches are what they were."""
     return max(BLOCK_BYTES // math.prod(frames.array("frames").shape[1:]) // SHARD, 1) * SHARD
+
+
+def _check_rounding(frames: Manifest) -> None:
+    """Raise `DataError` where the counts of image pixels are not known."""
+    check_whole_counts(frames.array("histograms").shape, frames.array("frames").shape, "round_to_counts")
+    if not all(frames.column("num_events")):
+        raise DataError(
+            f"{frames.ref.path}: round_to_counts needs event counts, and there are windows without any, as finished "
+            "event images are; set round_to_counts=false"
+        )
 
 
 def _rounded(made: GatedImages, frames: Manifest, encoding: EncodingChoice) -> np.ndarray:

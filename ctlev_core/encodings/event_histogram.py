@@ -11,16 +11,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import image_geometry
+from ctlev_core import image_drawing, image_geometry
 from ctlev_core.windows import check_ranges
 from data_contracts.events import Events
 
-VERSION = 1
+VERSION = 2
 
 
 class Options(image_geometry.ImageFit):
@@ -29,7 +28,7 @@ class Options(image_geometry.ImageFit):
     polarity: bool = Field(
         default=True, description="count positive and negative events apart; DHP19 discards polarity"
     )
-    normalisation: Literal["three_sigma", "max", "count"] = Field(
+    normalisation: image_drawing.Normalisation = Field(
         default="three_sigma",
         description="what count becomes 255: three standard deviations of the window's counts (DHP19), the window's "
         "largest count, or full_scale_count",
@@ -38,9 +37,8 @@ class Options(image_geometry.ImageFit):
 
 
 def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
-    """Count the events of each window.
+    """Count the events of each window, in pixels of the sensor; with resampling `events` in those of the image.
 
-    Each sensor pixel belongs to the image pixel its centre falls into; scaling up thus leaves pixels without events.
     With short windows most of the time goes into new memory: `encode_each` needs none.
 
     Args:
@@ -99,10 +97,10 @@ def encode_each(events: Events, windows: np.ndarray, options: Options) -> Iterat
 
 def _shape(events: Events, options: Options) -> tuple[int, int, int]:
     """(C, H, W) of one window."""
-    width, height = image_geometry.image_size(events.sensor_size, options)
+    width, height = image_geometry.count_size(events.sensor_size, options)
     num_channels = 2 if options.polarity else 1
     if num_channels * height * width >= 2**32:
-        raise ValueError(f"an image must have fewer than 2^32 cells, got {num_channels} x {height} x {width}")
+        raise ValueError(f"a window must have fewer than 2^32 cells, got {num_channels} x {height} x {width}")
     return num_channels, height, width
 
 
@@ -129,13 +127,15 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     """Images of the counts: value = min(255, floor(255 count / full scale)), black where there are no events.
 
     Both polarities share one full scale, so that their ratio survives: three standard deviations of the total counts
-    over the pixels with events (n - 1 in the divisor, at least 0.1 / 255), or the largest count of any channel.
+    over the pixels with events (n - 1 in the divisor, at least 0.1 / 255), or the largest count of any channel. What
+    comes of that in an image of another size than the sensor's says `ctlev_core.image_drawing`.
 
     Args:
         histogram: [N, C, H, W] uint16 as `encode` returns it.
         options: options of this encoding.
     Returns:
-        [N, H, W, 3] uint8 RGB: red = positive, green = 0, blue = negative; three equal channels without polarity.
+        [N, image height, image width, 3] uint8 RGB: red = positive, green = 0, blue = negative; three equal channels
+        without polarity.
     Raises:
         ValueError: the shape or dtype is not that of counts encoded with these options.
     Source: SensorsINI/DHP19, normalizeImage3Sigma.m. There one channel holds both polarities.
@@ -145,9 +145,28 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     from ctlev_core import histogram as kernels
 
     histogram = np.ascontiguousarray(histogram)
+    size = histogram.shape[:1:-1]
+    if options.resampling == "area" and image_geometry.image_size(size, options) != size:
+        levels = image_drawing.draw_counts(histogram, options, options.normalisation, options.full_scale_count)
+        return _as_colours(levels)
     images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
     kernels.draw(histogram, full_scales(histogram, options), images)
     return images
+
+
+def render_levels(levels: np.ndarray, options: Options) -> np.ndarray:
+    """Images of grey levels at the size of the sensor, as finished event images have them; goes on as `render_image`.
+
+    Args:
+        levels: [N, C, H, W] uint8, channels as `encode` returns them.
+        options: options of this encoding; areas are averaged with any `resampling`.
+    Returns:
+        [N, image height, image width, 3] uint8 RGB.
+    Raises:
+        ValueError: the shape or dtype is another.
+    """
+    image_geometry.check_encoded(levels, 2 if options.polarity else 1, np.uint8)
+    return _as_colours(image_drawing.fit_levels(levels, options, options.normalisation))
 
 
 map_points = image_geometry.map_points
@@ -155,12 +174,13 @@ map_points = image_geometry.map_points
 
 def full_scales(histogram: np.ndarray, options: Options) -> np.ndarray:
     """The count that becomes 255 in each window, [N] float64, positive."""
-    if options.normalisation == "count":
-        return np.full(len(histogram), float(options.full_scale_count))
-    if options.normalisation == "max":
-        return np.maximum(histogram.max(axis=(1, 2, 3), initial=0), 1).astype(np.float64)
-    from ctlev_core import histogram as kernels
+    return image_drawing.full_scales(histogram, options.normalisation, options.full_scale_count)
 
-    scales = np.empty(len(histogram))
-    kernels.full_scales(np.ascontiguousarray(histogram), scales)
-    return scales
+
+def _as_colours(levels: np.ndarray) -> np.ndarray:
+    """Channels [N, C, H, W] as red and blue, or as grey where there is one."""
+    if levels.shape[1] == 1:
+        return np.repeat(levels[:, 0, :, :, None], 3, axis=3)
+    images = np.zeros((len(levels), *levels.shape[2:], 3), np.uint8)
+    images[..., 0], images[..., 2] = levels[:, 0], levels[:, -1]
+    return images

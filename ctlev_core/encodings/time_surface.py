@@ -16,11 +16,11 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import image_geometry
+from ctlev_core import image_drawing, image_geometry
 from ctlev_core.windows import check_order, check_ranges
 from data_contracts.events import Events
 
-VERSION = 1
+VERSION = 2
 
 
 class Options(image_geometry.ImageFit):
@@ -39,7 +39,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         options: options of this encoding.
     Returns:
         [N, C, H, W] float32 in 0 .. 1; channels (positive, negative), or one channel without polarity. A window without
-        events is 0. Where several sensor pixels share an image pixel, the newest counts.
+        events is 0. Where, with resampling `events`, several sensor pixels share an image pixel, the newest counts.
     Raises:
         ValueError: a window is not a range of the events.
         DataError: an event lies outside the sensor, or time stamps go back.
@@ -48,7 +48,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
 
     windows = check_ranges(windows, len(events))
     check_order(events.t)
-    width, height = image_geometry.image_size(events.sensor_size, options)
+    width, height = image_geometry.count_size(events.sensor_size, options)
     column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
     num_channels = 2 if options.polarity else 1
     surfaces = np.zeros((len(windows), num_channels * height * width), np.float32)
@@ -72,18 +72,22 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
 def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     """Images of the surfaces: value = floor(255 S), red where positive and blue where negative.
 
+    With resampling `area` these are averaged over image pixels; of a smaller image the brightest is white again.
+
     Args:
         histogram: [N, C, H, W] float32 as `encode` returns it.
         options: options of this encoding.
     Returns:
-        [N, H, W, 3] uint8 RGB; three equal channels without polarity.
+        [N, image height, image width, 3] uint8 RGB; three equal channels without polarity.
     Raises:
         ValueError: the shape or dtype is not that of surfaces encoded with these options.
     """
     channels = 2 if options.polarity else 1
     image_geometry.check_encoded(histogram, channels, np.float32)
     values = np.floor(255.0 * histogram).astype(np.uint8)
-    images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
+    if options.resampling == "area":
+        values = image_drawing.fit_levels(values, options, "max")
+    images = np.zeros((len(values), *values.shape[2:], 3), np.uint8)
     images[..., 0], images[..., 2] = values[:, 0], values[:, -1]
     if not options.polarity:
         images[..., 1] = values[:, 0]

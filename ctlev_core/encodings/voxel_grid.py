@@ -18,11 +18,11 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import image_geometry
+from ctlev_core import image_drawing, image_geometry
 from ctlev_core.windows import check_order, check_ranges
 from data_contracts.events import Events
 
-VERSION = 1
+VERSION = 2
 
 
 class Options(image_geometry.ImageFit):
@@ -65,7 +65,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
 
     windows = check_ranges(windows, len(events))
     check_order(events.t)
-    width, height = image_geometry.image_size(events.sensor_size, options)
+    width, height = image_geometry.count_size(events.sensor_size, options)
     column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
     is_separate = options.polarity == "separate"
     num_channels = options.num_bins * (2 if is_separate else 1)
@@ -115,30 +115,39 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
 
     The bins are added up: of `signed` grids red is the sum of what is positive, blue that of what is negative. Full
     scale is three standard deviations (n - 1) of red + blue over the pixels where that is not 0; equal ones are at it.
+    With resampling `area` these values are averaged over image pixels; in a smaller image the contrast is brought back
+    by three standard deviations, but not where `full_scale` is given.
 
     Args:
         histogram: [N, C, H, W] float32 as `encode` returns it.
         options: options of this encoding.
     Returns:
-        [N, H, W, 3] uint8 RGB; three equal channels where polarity is discarded.
+        [N, image height, image width, 3] uint8 RGB; three equal channels where polarity is discarded.
     Raises:
         ValueError: the shape or dtype is not that of grids encoded with these options.
     """
     channels = options.num_bins * (2 if options.polarity == "separate" else 1)
     image_geometry.check_encoded(histogram, channels, np.float32)
-    images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
+    is_grey = options.polarity == "discarded"
+    width, height = size = histogram.shape[:1:-1]
+    if options.resampling == "area":
+        width, height = image_geometry.image_size(size, options)
+    images = np.zeros((len(histogram), height, width, 3), np.uint8)
     for grid, image in zip(histogram, images, strict=True):
         if options.polarity == "separate":
             red, blue = (np.abs(half).sum(axis=0) for half in np.split(grid, 2))
         else:
             red, blue = np.maximum(grid, 0).sum(axis=0), np.maximum(-grid, 0).sum(axis=0)
-        if options.polarity == "discarded":
-            red = blue = red + blue
-        full_scale = options.full_scale or _three_sigma(red if options.polarity == "discarded" else red + blue)
-        for channel, values in ((0, red), (2, blue)):
-            image[..., channel] = np.minimum(255, np.floor(255.0 * values.astype(np.float64) / full_scale))
-        if options.polarity == "discarded":
-            image[..., 1] = image[..., 0]
+        values = (red + blue)[None] if is_grey else np.stack([red, blue])
+        full_scale = options.full_scale or _three_sigma(red + blue)
+        levels = np.minimum(255, np.floor(255.0 * values.astype(np.float64) / full_scale)).astype(np.uint8)
+        if options.resampling == "area":
+            levels = image_drawing.fit_levels(levels[None], options, "count" if options.full_scale else "three_sigma")[
+                0
+            ]
+        image[..., 0], image[..., 2] = levels[0], levels[-1]
+        if is_grey:
+            image[..., 1] = levels[0]
     return images
 
 

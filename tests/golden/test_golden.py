@@ -48,7 +48,8 @@ def fixed_labels():
 
 def histogram_counts(module):
     windows = np.array([[0, 1000], [1000, 1001], [2000, 2000], [500, 3000]])
-    options = [module.Options(), module.Options(polarity=False, image_size=(16, 16), fit="crop")]
+    other_size = {"image_size": (16, 16), "fit": "crop", "resampling": "events"}
+    options = [module.Options(), module.Options(polarity=False, **other_size)]
     return [module.encode(fixed_events(), windows, option) for option in options]
 
 

@@ -66,9 +66,10 @@ def test_counts_equal_the_slow_loop(sensor_size, image_size, fit):
     events = random_events(1, 20_000, sensor_size)
     windows = np.array([[0, 7500], [7500, 15000], [3, 3], [19_999, 20_000], [0, 20_000]])
     expected = slow_encode(events, windows, image_size, fit)
-    counts = encode(events, windows, Options(image_size=image_size, fit=fit))
+    counts = encode(events, windows, Options(image_size=image_size, fit=fit, resampling="events"))
     assert (counts == expected).all()
-    without = encode(events, windows, Options(image_size=image_size, fit=fit, polarity=False))
+    options = Options(image_size=image_size, fit=fit, polarity=False, resampling="events")
+    without = encode(events, windows, options)
     assert (without[:, 0] == expected.sum(axis=1)).all()
 
 

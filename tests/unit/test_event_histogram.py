@@ -62,15 +62,15 @@ def test_the_sum_is_the_number_of_events(rows):
 @given(ROWS, SIZES, st.sampled_from(["pad", "stretch"]))
 def test_pad_and_stretch_lose_no_event(rows, image_size, fit):
     events = make_events(rows, (7, 5))
-    counts = encode(events, whole(events), Options(image_size=image_size, fit=fit))
+    counts = encode(events, whole(events), Options(image_size=image_size, fit=fit, resampling="events"))
     assert counts.shape == (1, 2, image_size[1], image_size[0])
     assert counts.sum() == len(rows)
 
 
 @settings(deadline=None)
-@given(ROWS, SIZES, FITS)
-def test_swapping_the_polarity_exchanges_the_channels(rows, image_size, fit):
-    options = Options(image_size=image_size, fit=fit)
+@given(ROWS, SIZES, FITS, st.sampled_from(["area", "events"]))
+def test_swapping_the_polarity_exchanges_the_channels(rows, image_size, fit, resampling):
+    options = Options(image_size=image_size, fit=fit, resampling=resampling)
     events, swapped = make_events(rows, (7, 5)), make_events([(x, y, 1 - p) for x, y, p in rows], (7, 5))
     counts, exchanged = encode(events, whole(events), options), encode(swapped, whole(swapped), options)
     assert (counts == exchanged[:, ::-1]).all()
@@ -80,7 +80,7 @@ def test_swapping_the_polarity_exchanges_the_channels(rows, image_size, fit):
 @settings(deadline=None)
 @given(ROWS, SIZES, FITS)
 def test_events_fall_where_their_points_map_to(rows, image_size, fit):
-    options = Options(polarity=False, image_size=image_size, fit=fit)
+    options = Options(polarity=False, image_size=image_size, fit=fit, resampling="events")
     events = make_events(rows, (7, 5))
     centres = np.array([(x + 0.5, y + 0.5) for x, y, _ in rows]).reshape(-1, 2)
     mapped = map_points(centres, (7, 5), options)
@@ -149,7 +149,8 @@ def columns_and_rows(sensor_size, **options) -> tuple[list[int], list[int]]:
     width, height = sensor_size
 
     def where(position: tuple[int, int], axis: int) -> int:
-        counts = encode(make_events([(*position, 1)], sensor_size), np.array([[0, 1]]), Options(**options))
+        chosen = Options(**options, resampling="events")
+        counts = encode(make_events([(*position, 1)], sensor_size), np.array([[0, 1]]), chosen)
         return int(np.argwhere(counts)[0][axis]) if counts.any() else -1
 
     middle_x, middle_y = width // 2, height // 2
@@ -268,7 +269,7 @@ def test_windows_one_by_one_equal_windows_together(rows, bounds, image_size, as_
     events = make_events(rows, (7, 5))
     windows = np.array([sorted(min(b, len(rows)) for b in bound) for bound in bounds], np.int64).reshape(-1, 2)
     for polarity in (True, False):
-        options = Options(image_size=None if as_sensor else image_size, polarity=polarity)
+        options = Options(image_size=None if as_sensor else image_size, polarity=polarity, resampling="events")
         one_by_one = [counts.copy() for counts in encode_each(events, windows, options)]
         assert len(one_by_one) == len(windows)
         assert all((a == b).all() for a, b in zip(one_by_one, encode(events, windows, options), strict=True))
@@ -317,7 +318,7 @@ def test_the_first_event_outside_is_named_wherever_it_is(position, row, image_si
     events = make_events(rows)
     windows = np.array([[row + 1, 1000], [0, 1000]])
     with pytest.raises(DataError, match=rf"event {row} at x = {position[0]}, y = {position[1]} px"):
-        encode(events, windows, Options(image_size=image_size, fit="stretch"))
+        encode(events, windows, Options(image_size=image_size, fit="stretch", resampling="events"))
 
 
 def test_events_on_the_last_row_and_column_count():
@@ -328,4 +329,4 @@ def test_events_on_the_last_row_and_column_count():
 
 def test_an_image_too_large_for_its_cell_numbers_is_refused():
     with pytest.raises(ValueError, match="fewer than 2\\^32 cells"):
-        encode(make_events([]), np.zeros((0, 2), np.int64), Options(image_size=(65536, 65536)))
+        encode(make_events([]), np.zeros((0, 2), np.int64), Options(image_size=(65536, 65536), resampling="events"))

@@ -217,7 +217,7 @@ def test_copies_are_found_with_the_frames_they_copy(tmp_path):
 @pytest.mark.parametrize("fit", ["crop", "pad"])
 def test_times_are_learnt_in_the_pixels_that_counts_are_of(fit):
     """Events in image pixels have the histogram of those in sensor pixels, and one pixel has the gaps of several."""
-    events, options = make_events(0), ENCODING.Options(image_size=(8, 8), fit=fit)
+    events, options = make_events(0), ENCODING.Options(image_size=(8, 8), fit=fit, resampling="events")
     seen = task._in_image(events, options)
     assert seen.sensor_size == (8, 8) and (len(seen) < len(events)) == (fit == "crop")
     expected = ENCODING.encode(events, np.array([[0, len(events)]]), options)

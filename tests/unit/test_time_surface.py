@@ -93,7 +93,8 @@ def test_a_window_that_is_no_range():
 
 
 def test_the_newest_of_the_pixels_that_share_an_image_pixel_counts():
-    surface = surface_of([(0, 0, 0, 1), (10, 1, 0, 1), (20, 4, 3, 1)], image_size=(1, 1), fit="stretch")
+    rows = [(0, 0, 0, 1), (10, 1, 0, 1), (20, 4, 3, 1)]
+    surface = surface_of(rows, image_size=(1, 1), fit="stretch", resampling="events")
     assert surface[0, 0, 0] == 1
 
 

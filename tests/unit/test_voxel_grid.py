@@ -144,7 +144,7 @@ def test_a_window_that_is_no_range():
 
 def test_scaled_images_keep_every_event_where_its_point_maps_to():
     rows = [(0, 4, 3, 1), (5, 0, 0, 1)]
-    options = Options(image_size=(10, 8), polarity="discarded")
+    options = Options(image_size=(10, 8), polarity="discarded", resampling="events")
     grid = encode(make_events(rows), np.array([[0, 2]]), options)[0].sum(axis=0)
     x, y = map_points(np.array([4.5, 3.5]), SENSOR, options)
     assert grid[int(y), int(x)] == 1 and grid.sum() == 2
