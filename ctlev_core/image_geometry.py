@@ -13,7 +13,7 @@ from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 
-Fit = Literal["pad", "crop", "stretch"]
+Fit = Literal["pad", "crop", "stretch", "centre"]
 
 
 class ImageFit(Frozen):
@@ -25,7 +25,8 @@ class ImageFit(Frozen):
     fit: Fit = Field(
         default="pad",
         description="how the sensor meets another image size: whole sensor with black bars, image filled and the rest "
-        "of the sensor dropped, or both axes scaled on their own; pad and crop keep the aspect and the centre",
+        "of the sensor dropped, or both axes scaled on their own; pad and crop keep the aspect and the centre, and "
+        "centre keeps the scale too: black bars around a smaller sensor, the border of a larger one dropped",
     )
     resampling: Literal["area", "events"] = Field(
         default="area",
@@ -133,6 +134,9 @@ def check_whole_counts(count_shape: Sequence[int], image_shape: Sequence[int], w
 def _scale_and_offset(sensor_size: SensorSize, options: ImageFit) -> tuple[tuple[Fraction, Fraction], ...]:
     """Of x and of y: image px = scale * sensor px + offset. Exact, or rounding would decide about a pixel."""
     sizes = image_size(sensor_size, options)
+    if options.fit == "centre":  # whole pixels: of an odd difference the smaller half comes first
+        pairs = zip(sizes, sensor_size, strict=True)
+        return tuple((Fraction(1), Fraction((image - sensor) // 2)) for image, sensor in pairs)
     scales = [Fraction(image, sensor) for image, sensor in zip(sizes, sensor_size, strict=True)]
     if options.fit == "pad":
         scales = [min(scales)] * 2

@@ -1,4 +1,4 @@
-"""Object classification from one event image: a ResNet.
+"""Object classification from one event image: a ResNet, or for images of some 32 px a small CNN.
 
 The paper trains a pre-trained ResNet-34 with a randomly initialised MLP head (N-ImageNet, its Table 1). The default
 here is a ResNet-10 of a quarter of the width from random weights, which two CPU cores train in a minute;
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
+from ctlev_core.networks.resnet_files import ARCHITECTURES, SMALL_CNN, check_batch, check_resnet_folder
 from ctlev_core.supervised_options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
@@ -32,8 +32,9 @@ PREDICTS = ("classes",)
 class Options(SupervisedOptions):
     """Network and training budget."""
 
-    architecture: Literal["resnet10-quarter", "resnet10-half", "resnet18", "resnet34"] = Field(
-        default="resnet10-quarter", description="the paper's is resnet34"
+    architecture: Literal["small-cnn", "resnet10-quarter", "resnet10-half", "resnet18", "resnet34"] = Field(
+        default="resnet10-quarter",
+        description="the paper's is resnet34; small-cnn is for images of some 32 px, which a ResNet shrinks to one",
     )
     head_width: int = Field(
         default=0, ge=0, description="hidden units of the head, 0 = linear; the paper gives no width"
@@ -46,6 +47,11 @@ class Options(SupervisedOptions):
     )
     learning_rate: float = Field(default=2e-3, gt=0, description="peak of AdamW's learning rate")
     flip: bool = Field(default=False, description="mirror half of the training images")
+    by_recording: bool = Field(
+        default=False,
+        description="a recording has the mean of the probabilities of its frames: where a recording is cut into "
+        "windows, scores are then by recording",
+    )
 
 
 def input_files(options: Options) -> list[Path]:
@@ -54,6 +60,8 @@ def input_files(options: Options) -> list[Path]:
     Raises:
         DataError: one is missing, or they are of another network.
     """
+    if options.weights and options.architecture == SMALL_CNN:
+        raise DataError(f"downstream 'classifier': {SMALL_CNN} has no published weights, got weights={options.weights}")
     return check_resnet_folder(options.weights, options.architecture) if options.weights else []
 
 
@@ -143,10 +151,30 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
     return {"probability": probability.reshape(len(frames), len(classes)), "classes": classes}
 
 
+def predict_sequences(model: Path, frames: np.ndarray, *, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+    """As `predict`; a classifier trained with `by_recording` gives all N frames of a recording their mean.
+
+    Args:
+        model: folder written by `train`.
+        frames: [N, H, W, 3] uint8.
+        recordings: [N] the recording of each frame.
+    """
+    from ctlev_core import supervised
+
+    found = predict(model, frames)
+    if not supervised.read_config(model, NAME)["options"]["by_recording"]:
+        return found
+    names, index = np.unique(np.asarray(recordings), return_inverse=True)
+    sums = np.zeros((len(names), found["probability"].shape[1]))
+    np.add.at(sums, index, found["probability"])
+    means = sums / np.bincount(index, minlength=len(names))[:, None]
+    return {**found, "probability": means[index].astype(np.float32)}
+
+
 def features(model: Path, frames: np.ndarray) -> np.ndarray:
     """Pooled features [N, D] float32 in front of the head: what the Frechet distance compares."""
     network, config = _read_model(model)
-    return _run(network, network.features, frames).reshape(len(frames), config["shape"]["hidden_sizes"][-1])
+    return _run(network, network.features, frames).reshape(len(frames), _num_features(config["shape"]))
 
 
 def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) -> tuple[tuple[str, ...], np.ndarray]:
@@ -161,7 +189,8 @@ def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) ->
     classes = tuple(sorted(set(labels.class_names)))
     if len(classes) < 2:
         raise DataError(f"{where}: needs at least two classes, got {', '.join(classes) or 'no rows'}")
-    check_batch(options.batch_size, frames.shape[1], frames.shape[2], where)
+    if options.architecture != SMALL_CNN:
+        check_batch(options.batch_size, frames.shape[1], frames.shape[2], where)
     columns = {name: column for column, name in enumerate(classes)}
     return classes, np.array([columns[name] for name in labels.class_names], dtype=np.int64)
 
@@ -171,20 +200,33 @@ def _shape(options: Options) -> dict[str, Any]:
 
 
 def _build_from_options(num_classes: int, options: Options) -> Any:
-    from ctlev_core.networks.resnet import ResNetClassifier, load_backbone
+    from ctlev_core.networks.resnet import load_backbone
 
-    network = ResNetClassifier(_shape(options), num_classes, options.head_width)
+    network = _build(_shape(options), num_classes, options.head_width)
     if options.weights:
         load_backbone(network, options.weights)
     return network
 
 
+def _build(shape: dict[str, Any], num_classes: int, head_width: int) -> Any:
+    from ctlev_core.networks.resnet import ResNetClassifier
+    from ctlev_core.networks.small_cnn import SmallCNN
+
+    network = SmallCNN if "widths" in shape else ResNetClassifier
+    return network(shape, num_classes, head_width)
+
+
+def _num_features(shape: dict[str, Any]) -> int:
+    from ctlev_core.networks.small_cnn import num_features
+
+    return num_features(shape) if "widths" in shape else shape["hidden_sizes"][-1]
+
+
 def _read_model(folder: Path) -> tuple[Any, dict[str, Any]]:
     from ctlev_core import supervised
-    from ctlev_core.networks.resnet import ResNetClassifier
 
     config = supervised.read_config(folder, NAME)
-    network = ResNetClassifier(config["shape"], len(config["classes"]), config["options"]["head_width"])
+    network = _build(config["shape"], len(config["classes"]), config["options"]["head_width"])
     supervised.read_weights(folder, network)
     return network.to(supervised.resolve_device("auto")), config
 

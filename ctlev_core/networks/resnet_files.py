@@ -25,6 +25,9 @@ ARCHITECTURES: dict[str, dict[str, Any]] = {
         "layer_type": "bottleneck",
     },
 }
+SMALL_CNN = "small-cnn"
+"""No ResNet, and without published weights; see `ctlev_core.networks.small_cnn`."""
+ARCHITECTURES[SMALL_CNN] = {"widths": [16, 32, 64, 64], "dropout": 0.3}
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 STRIDE = 32
 """Image px a pixel of the last feature map."""
