@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,11 @@ from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 
+logger = logging.getLogger(__name__)
+
+USUAL_SIZE = (0.4, 4.0)
+"""Root mean square of scaled latents, about 1: .7 to 2.5 of the bundled priors' images, black to white; .9 to 1.8 of
+photographs and event images in Stable Diffusion's space, where they are 5 to 10 if not scaled, .2 to .3 if twice."""
 ENCODE_BATCH = 32
 """Images that are encoded at once, unless memory runs out: of 512 px each takes .7 GB in Stable Diffusion's."""
 
@@ -175,7 +181,11 @@ def check_training_data(frames: np.ndarray, conditions: Conditions, image_size: 
 
 
 def check_cache(cache: LatentCache, conditions: Conditions) -> None:
-    """Raise `DataError` naming the first frame or prompt whose latents or embedding are not finite."""
+    """Raise `DataError` naming the first frame or prompt whose latents or embedding are not finite.
+
+    Latents of an unusual size are logged: the scaling factor is a number in the prior's config that nothing else
+    vouches for, and networks given latents of another size than they were trained on learn and draw badly, in silence.
+    """
     for name, values in (("mean", cache.mean), ("standard deviation", cache.std)):
         wrong = None if values is None else ~torch.isfinite(values).flatten(1).all(dim=1)
         if wrong is not None and bool(wrong.any()):
@@ -190,3 +200,11 @@ def check_cache(cache: LatentCache, conditions: Conditions) -> None:
         row = int(wrong.nonzero()[0])
         prompt = [*sorted(set(conditions.prompts)), ""][row]
         raise DataError(f"prompt {prompt!r}: its embedding is not finite; check the prior's text encoder")
+    sizes = torch.linalg.vector_norm(cache.mean.flatten(1), dim=1).double() / cache.mean[0].numel() ** 0.5
+    size = float(sizes.square().mean().sqrt()) * cache.scaling_factor
+    if not USUAL_SIZE[0] <= size <= USUAL_SIZE[1]:
+        logger.warning(
+            "latents of the frames have a root mean square of %.2g after scaling by %g, expected about 1; "
+            "check scaling_factor in the config of the prior's autoencoder (Stable Diffusion v1: 0.18215)",
+            size, cache.scaling_factor,
+        )  # fmt: skip

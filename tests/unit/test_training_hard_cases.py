@@ -14,7 +14,7 @@ from ctlev_core.diffusion import trainer
 from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.finetuning import check_channel_order, fine_tune
-from ctlev_core.diffusion.latent_cache import cache_latents
+from ctlev_core.diffusion.latent_cache import cache_latents, check_cache
 from ctlev_core.diffusion.prior import encode_prompts, save_prior
 from ctlev_core.diffusion.sampling import sample_frames
 from ctlev_core.diffusion.sampling_options import SamplingOptions
@@ -107,6 +107,14 @@ def test_prompts_beyond_the_tokenizers_limit_are_cut_off_and_named(caplog):
     with caplog.at_level(logging.WARNING):
         cache_latents(prior, FRAMES[:2], Conditions(CORPUS[:2]))
     assert not caplog.records
+
+
+@pytest.mark.parametrize(("times", "noticed"), [(0.1, True), (1.0, False), (10.0, True)])
+def test_a_scaling_factor_that_does_not_fit_the_latents_is_noticed(caplog, times, noticed):
+    cache = cache_latents(shared_prior(), FRAMES, CONDITIONS)
+    with caplog.at_level(logging.WARNING):
+        check_cache(dataclasses.replace(cache, scaling_factor=times * cache.scaling_factor), CONDITIONS)
+    assert [f"{times * cache.scaling_factor:g}" in record.getMessage() for record in caplog.records] == [True] * noticed
 
 
 def overflow_at(monkeypatch, steps):
