@@ -1,4 +1,4 @@
-"""Ordinary labelled pictures that a base model learns from: what things look like and are called. Never events.
+"""Ordinary labelled pictures: what things look like and are called. A base model learns from them, or they are filmed.
 
 Three layouts are read:
 
@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
@@ -40,8 +39,8 @@ EXPECTED = f"""expected one of
   ROOT/{IDX_IMAGES} and ROOT/{IDX_LABELS} (MNIST), plain or .gz"""
 
 
-class PictureOptions(Frozen):
-    """Which pictures, and how much each is moved about whenever it is shown."""
+class PictureSource(Frozen):
+    """Which pictures."""
 
     root: Path | None = Field(
         default=None,
@@ -51,13 +50,6 @@ class PictureOptions(Frozen):
     class_names: tuple[str, ...] = Field(
         default=(), description="names of the labels 0, 1, 2, ... where labels are numbers; empty = the numbers"
     )
-    synonyms: dict[str, list[str]] = Field(
-        default_factory=dict, description="further names of a class, of which captions take one at random"
-    )
-    shift: float = Field(default=0.08, ge=0, le=0.5, description="at most so far, as a share of the side")
-    turn_deg: float = Field(default=8.0, ge=0, le=180, description="at most so far, either way")
-    scale: float = Field(default=0.1, ge=0, lt=1, description="at most so much larger or smaller")
-    mirror: bool = Field(default=False, description="mirror half of them; letters and digits must not be")
 
     @field_validator("class_names")
     @classmethod
@@ -65,6 +57,18 @@ class PictureOptions(Frozen):
         if any(not name.strip() for name in names) or len(set(names)) < len(names):
             raise ValueError(f"class_names must be different and not empty, got {list(names)}")
         return names
+
+
+class PictureOptions(PictureSource):
+    """Which pictures, and how much each is moved about whenever it is shown."""
+
+    synonyms: dict[str, list[str]] = Field(
+        default_factory=dict, description="further names of a class, of which captions take one at random"
+    )
+    shift: float = Field(default=0.08, ge=0, le=0.5, description="at most so far, as a share of the side")
+    turn_deg: float = Field(default=8.0, ge=0, le=180, description="at most so far, either way")
+    scale: float = Field(default=0.1, ge=0, lt=1, description="at most so much larger or smaller")
+    mirror: bool = Field(default=False, description="mirror half of them; letters and digits must not be")
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +105,7 @@ class LabelledPictures:
         return _fit(picture, size)
 
 
-def open_pictures(options: PictureOptions) -> LabelledPictures:
+def open_pictures(options: PictureSource) -> LabelledPictures:
     """Look through the pictures that `options.root` names; those of a folder are listed, not read.
 
     Raises:
@@ -111,19 +115,22 @@ def open_pictures(options: PictureOptions) -> LabelledPictures:
     assert root is not None
     # What does not change between calls is read once: by every stage of a plan, and every block of pictures.
     found = _open(root, options.class_names, _modified(root))
-    unknown = sorted(set(options.synonyms) - set(found.names))
+    synonyms = options.synonyms if isinstance(options, PictureOptions) else {}
+    unknown = sorted(set(synonyms) - set(found.names))
     if unknown:
         raise DataError(f"{root}: synonyms of {unknown[0]!r}, which no picture shows; {_known(found.classes)}")
     return found
 
 
-def picture_files(options: PictureOptions) -> list[Path]:
+def picture_files(options: PictureSource) -> list[Path]:
     """What the content of the pictures is: the folder or file, for a cache key."""
     return [] if options.root is None else [options.root]
 
 
 def move(picture: np.ndarray, options: PictureOptions, rng: np.random.Generator) -> np.ndarray:
     """The picture shifted, turned and scaled at random as `options` say; what comes in is its border colour."""
+    import cv2
+
     height, width = picture.shape[:2]
     angle = rng.uniform(-options.turn_deg, options.turn_deg)
     matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle, 1 + options.scale * rng.uniform(-1, 1))
@@ -148,6 +155,8 @@ def read_picture(path: Path) -> np.ndarray:
     Raises:
         DataError: it cannot be read as a picture.
     """
+    import cv2
+
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if picture is None or picture.size == 0:
         raise DataError(f"{path}: cannot be read as a picture")
@@ -164,6 +173,8 @@ def read_picture(path: Path) -> np.ndarray:
 
 
 def _fit(picture: np.ndarray, size: int) -> np.ndarray:
+    import cv2
+
     height, width = picture.shape[:2]
     scale = size / max(height, width)
     new = max(round(width * scale), 1), max(round(height * scale), 1)
