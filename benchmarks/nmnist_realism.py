@@ -168,7 +168,9 @@ def told_apart(first: np.ndarray, second: np.ndarray, epochs: int = 12, folds: i
         scored = predict(learn(images[learnt], labels[learnt], 2, 0, epochs), images[tested])
         scores[tested] = scored[:, 1] - scored[:, 0]
     flat = images.reshape(len(images), -1)
-    linear = cross_val_predict(LogisticRegression(C=0.01, max_iter=500), flat, labels, cv=splits, method="decision_function")
+    linear = cross_val_predict(
+        LogisticRegression(C=0.01, max_iter=500), flat, labels, cv=splits, method="decision_function"
+    )
     return float(roc_auc_score(labels, scores)), float(roc_auc_score(labels, linear))
 
 
@@ -224,11 +226,16 @@ def main() -> None:
     labels_made = np.array([row % 10 for row in range(NUM_LEARNT)])
     labels_real = np.array([CLASSES.index(name) for name in real_names])
     x_made, x_real = images_of(made, False), images_of(real, False)
-    accuracies = [np.mean(predict(learn(x_made, labels_made, 10, seed, 40), x_real).argmax(1) == labels_real) for seed in range(3)]
+    accuracies = [
+        np.mean(predict(learn(x_made, labels_made, 10, seed, 40), x_real).argmax(1) == labels_real) for seed in range(3)
+    ]
     print(f"learnt from {NUM_LEARNT} simulated, tested on {len(real)} real: {np.round(accuracies, 3).tolist()}")
     labels_known = np.array([CLASSES.index(name) for name in names])
     x_known = images_of(known, False)
-    accuracies = [np.mean(predict(learn(x_known, labels_known, 10, seed, 60), x_real).argmax(1) == labels_real) for seed in range(3)]
+    accuracies = [
+        np.mean(predict(learn(x_known, labels_known, 10, seed, 60), x_real).argmax(1) == labels_real)
+        for seed in range(3)
+    ]
     print(f"learnt from {len(known)} real: {np.round(accuracies, 3).tolist()}")
 
 

@@ -2,11 +2,14 @@
 
 What is fitted, and from what:
 
-    noise          events of pixels that the picture never reaches: one polarity in excess is leak, the rest shot noise
+    noise          events of pixels that the picture never reaches: one polarity in excess is leak, the rest shot noise.
+                   A recording starts with pixels anywhere between two thresholds, and in the first 1 / rate a leak
+                   sends half of its events: in a shorter one it is twice what is counted
+    hot pixels     pixels with far more events than all their neighbours, and their rates
     flipped        a leak sends ON events, so p = 0 is ON where more noise is 0
     refractory     the interval between two events of a pixel that one in a hundred is below
     negative       ON events are ahead of OFF events in a bright picture's motion, and behind in a dark one's
-    centre         the middle of the events of real recordings and of simulated ones
+    centre, size   middle and spread of the events of real recordings and of simulated ones
     thresholds     the number of events without noise of either polarity: contrast and threshold enter as their quotient
                    alone, so this is the threshold at the contrast that the options give
 
@@ -27,13 +30,13 @@ from data_contracts.events import Events, SensorSize
 Simulate = Callable[[np.ndarray, SensorSize, dict[str, Any]], Iterator[Events]]
 """From numbers of pictures, sensor size and options to the events of each."""
 NUM_BINS = 12
-MAX_SIMULATED = 48
+MAX_SIMULATED = 40
 QUIET_MARGIN_PX = 3
 MIN_QUIET_PX = 16
-HOT_FACTOR = 8.0
+HOT_FACTOR, HOT_EVENTS = 5.0, 20
 INTERVAL_SHARE = 0.01
 MIN_INTERVALS = 200
-ROUNDS, TRIES, TOLERANCE = 3, 8, 0.005
+ROUNDS, TRIES, TOLERANCE = 3, 5, 0.005
 MIN_THRESHOLD, MAX_THRESHOLD = 0.02, 3.0
 LEAK_SIGMAS = 3.0
 
@@ -73,8 +76,8 @@ def fit(
         class_names: N.
         picture_names: classes of the pictures that there are.
         simulate: films some of them.
-        start: first values of the options `centre_px`, `negative`, `flipped`, `threshold`, `threshold_off`,
-            `refractory_us`, `leak_rate_hz` and `shot_rate_hz`.
+        start: first values of the options `centre_px`, `picture_share`, `negative`, `flipped`, `threshold`,
+            `threshold_off`, `refractory_us`, `leak_rate_hz`, `shot_rate_hz` and `hot_pixels`.
         given: those of them that stay as they are.
         duration_us: of a simulated recording.
     Returns:
@@ -92,31 +95,38 @@ def fit(
     def simulated(**changes: Any) -> Sums:
         return _sum_up(simulate(rows, size, found | changes), duration_us)[0]
 
-    silent = {"leak_rate_hz": 0.0, "shot_rate_hz": 0.0}
+    silent = {"leak_rate_hz": 0.0, "shot_rate_hz": 0.0, "hot_pixels": ()}
     if real.intervals_us:
         set_open(refractory_us=round(float(np.median(real.intervals_us))))
-    set_open(centre_px=_moved(found["centre_px"], real, simulated(**silent), np.zeros((2, 1, 1))))
+    set_open(hot_pixels=_take_hot(real))
+    set_open(centre_px=_moved(found["centre_px"], real.counts.sum(axis=0), simulated(**silent)))
     quiet = _quiet(simulated(**silent).counts.sum(axis=0))
-    noise_hz, num_quiet = _noise(real, quiet)
+    num_quiet = int(np.count_nonzero(quiet))
+    noise_hz = np.zeros(2)
     if num_quiet >= MIN_QUIET_PX:
-        error_hz = np.sqrt(max(noise_hz.sum(), 1e-9) / (num_quiet * real.seconds))
-        is_leak = abs(noise_hz[1] - noise_hz[0]) > LEAK_SIGMAS * error_hz
-        set_open(flipped=bool(is_leak and noise_hz[0] > noise_hz[1]))
-        set_open(leak_rate_hz=float(abs(noise_hz[1] - noise_hz[0])), shot_rate_hz=float(2 * noise_hz.min()))
-    else:
-        noise_hz = np.zeros(2)
-    noise = (noise_hz * real.seconds)[:, None, None]
+        noise_hz = real.counts[:, quiet].mean(axis=1) / real.seconds
+        error_hz = np.sqrt(noise_hz.sum() / (num_quiet * real.seconds))
+        excess_hz = abs(noise_hz[1] - noise_hz[0])
+        set_open(flipped=bool(noise_hz[0] > noise_hz[1] and excess_hz > LEAK_SIGMAS * error_hz))
+        early = excess_hz * real.seconds / real.num < 0.5
+        set_open(leak_rate_hz=float(excess_hz * (2 if early else 1)), shot_rate_hz=float(2 * noise_hz.min()))
+    signal = np.maximum(real.counts - (noise_hz * real.seconds)[:, None, None], 0)
     set_open(negative=bool(found["negative"]) ^ (_agreement(real, simulated(**silent)) < 0))
-    wanted = np.maximum(real.counts - noise, 0).sum(axis=(1, 2)) / real.num
+    wanted = signal.sum(axis=(1, 2)) / real.num
     if found["flipped"]:
         wanted = wanted[::-1]  # from here on by light
     for _ in range(ROUNDS):
         _fit_thresholds(wanted, found, given, lambda: simulated(**silent))
-        set_open(centre_px=_moved(found["centre_px"], real, simulated(**silent), noise))
+        made = simulated(**silent)
+        larger = _spread(signal.sum(axis=0)) / max(_spread(made.counts.sum(axis=0)), 1e-9)
+        set_open(centre_px=_moved(found["centre_px"], signal.sum(axis=0), made))
+        set_open(picture_share=float(found["picture_share"] * np.clip(larger, 0.8, 1.25)))
+    _fit_thresholds(wanted, found, given, lambda: simulated(**silent))
     made = simulated()
     return found, {
         "recordings": float(real.num),
         "quiet_pixels": float(num_quiet),
+        "hot_pixels": float(len(found["hot_pixels"])),
         "noise_p0_hz": float(noise_hz[0]),
         "noise_p1_hz": float(noise_hz[1]),
         "events_per_recording": float(real.counts.sum() / real.num),
@@ -187,13 +197,18 @@ def _quiet(counts: np.ndarray) -> np.ndarray:
     return ~np.any([active[y : y + height, x : x + width] for y in reach for x in reach], axis=0)
 
 
-def _noise(real: Sums, quiet: np.ndarray) -> tuple[np.ndarray, int]:
-    """Events a second [2] of p = 0 and 1 of a quiet pixel that is not hot, and how many such pixels there are."""
+def _take_hot(real: Sums) -> tuple[tuple[int, int, float], ...]:
+    """Pixels that outdo all their neighbours, (x, y, Hz); their events are taken off the sums of pixels."""
     total = real.counts.sum(axis=0)
-    if quiet.any():
-        quiet = quiet & (total <= HOT_FACTOR * max(float(np.median(total[quiet])), 1.0))
-    num = int(np.count_nonzero(quiet))
-    return real.counts[:, quiet].sum(axis=1) / max(num * real.seconds, 1e-9), num
+    padded = np.pad(total, 1)
+    height, width = total.shape
+    around = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3) if (x, y) != (1, 1)]
+    highest = np.max(around, axis=0)
+    found = []
+    for y, x in np.argwhere((total > HOT_FACTOR * highest) & (total >= HOT_EVENTS)).tolist():
+        real.counts[:, y, x] *= highest[y, x] / total[y, x]
+        found.append((x, y, float((total[y, x] - highest[y, x]) / real.seconds)))
+    return tuple(found)
 
 
 def _agreement(real: Sums, made: Sums) -> float:
@@ -209,22 +224,24 @@ def _dipoles(sums: Sums) -> np.ndarray:
     return (middle[1] - middle[0]) * number.min(axis=0)
 
 
-def _moved(centre_px: tuple[float, float], real: Sums, made: Sums, noise: np.ndarray) -> tuple[float, float]:
-    """The centre by which simulated events move to where real ones are; `noise` [2, 1, 1] events a pixel."""
-    shift = _middle((real.counts - noise).sum(axis=0)) - _middle(made.counts.sum(axis=0))
+def _moved(centre_px: tuple[float, float], signal: np.ndarray, made: Sums) -> tuple[float, float]:
+    """The centre by which simulated events move to where those of `signal` [H, W] are."""
+    shift = _middle(signal) - _middle(made.counts.sum(axis=0))
     return float(centre_px[0] + shift[0]), float(centre_px[1] + shift[1])
 
 
 def _middle(counts: np.ndarray) -> np.ndarray:
     """(x, y) px."""
-    counts = np.maximum(counts, 0)
-    total = max(float(counts.sum()), 1e-9)
-    return np.array(
-        [
-            (counts.sum(axis=axis) * np.arange(counts.shape[1 - axis])).sum() / total
-            for axis in (0, 1)
-        ]
-    )
+    y, x = np.indices(counts.shape)
+    return np.array([(counts * x).sum(), (counts * y).sum()]) / max(float(counts.sum()), 1e-9)
+
+
+def _spread(counts: np.ndarray) -> float:
+    """Standard deviation of events from their middle, px."""
+    y, x = np.indices(counts.shape)
+    middle = _middle(counts)
+    squares = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
+    return float(np.sqrt((counts * squares).sum() / max(float(counts.sum()), 1e-9)))
 
 
 def _fit_thresholds(wanted: np.ndarray, found: dict[str, Any], given: set[str], run: Callable[[], Sums]) -> None:

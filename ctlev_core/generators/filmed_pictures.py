@@ -3,8 +3,9 @@
 Source: N-MNIST and N-Caltech101 (Orchard et al., Converting Static Image Datasets to Spiking Neuromorphic Datasets
 Using Saccades, Frontiers in Neuroscience 2015) were recorded so: a pan-tilt unit moves an ATIS along a closed triangle,
 three saccades of about 100 ms, before a monitor that shows one picture. Pixels are those of `ctlev_core.sensor`.
-Nothing is learnt from real frames, but `calibrate` fits to recordings what their makers could have measured: thresholds,
-noise, refractory time, where the picture rests and whether it is brighter or darker than its ground.
+Nothing is learnt from real frames, but `calibrate` fits to recordings what their makers could have measured:
+thresholds, noise, hot pixels, refractory time, size and place of the picture, and whether it is brighter or darker than
+its ground.
 
 The default path was measured on 276 recordings of N-MNIST, as that which leaves their events least blurred when it is
 taken off them. The two motors do not run together: the tilt ends a saccade when the pan has hardly begun. In these
@@ -19,6 +20,7 @@ flicker; a pixel is silent for its refractory time by ESIM's rule (`ctlev_core.s
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -31,12 +33,10 @@ from data_contracts.events import Events, SensorSize
 from data_contracts.labels import Conditions
 
 if TYPE_CHECKING:
-    from ctlev_core.sensor_options import SensorOptions
+    from ctlev_core.sensor_options import PixelMaps, SensorOptions
 
 VERSION = 1
 WHERE = "generator 'filmed_pictures'"
-PICTURE_SHARE = 28 / 34
-"""Of the sensor's shorter side, N-MNIST's pictures."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 MAX_INTERVAL_US = 10_000
 PATH_STEP_US = 250
@@ -108,8 +108,8 @@ class SampleOptions(Frozen):
         default=None, description="where the picture's middle is at the start, against the sensor's middle"
     )
     centre_jitter_px: float = Field(default=0.2, ge=0, description="standard deviation of that between recordings")
-    picture_px: float | None = Field(
-        default=None, gt=0, description="side of the picture on the sensor; null = 28/34 of the sensor's shorter side"
+    picture_share: float | None = Field(
+        default=None, gt=0, description="side of the picture as a share of the sensor's shorter side"
     )
     negative: bool | None = Field(default=None, description="the monitor shows the picture's negative")
     flipped: bool | None = Field(default=None, description="p = 1 where light falls instead of rises")
@@ -124,6 +124,9 @@ class SampleOptions(Frozen):
     refractory_us: int | None = Field(default=None, ge=0, description="silence of a pixel after an event")
     leak_rate_hz: float | None = Field(default=None, ge=0, description="noise events a second of one polarity")
     shot_rate_hz: float | None = Field(default=None, ge=0, description="noise events a second of either polarity")
+    hot_pixels: tuple[tuple[int, int, float], ...] | None = Field(
+        default=None, description="(x, y, Hz) of pixels that fire on their own, as leaks do; those outside are left out"
+    )
     rate_spread: float = Field(default=0.5, ge=0, description="log-normal spread of these rates over pixels")
     cutoff_dark_hz: float | None = Field(
         default=None, gt=0, description="bandwidth of a pixel in the dark; null = no low-pass"
@@ -143,20 +146,22 @@ class SampleOptions(Frozen):
         times = self.path_us
         if len(times) < 2 or len(self.path_px) != len(times):
             raise ValueError(f"path_us and path_px must be two or more alike, got {len(times)} and {len(self.path_px)}")
-        if times[0] != 0 or any(after <= before for before, after in zip(times, times[1:], strict=False)):
+        if times[0] != 0 or any(after <= before for before, after in itertools.pairwise(times)):
             raise ValueError(f"path_us must ascend from 0, got {list(times)}")
         return self
 
 
 UNCALIBRATED = {
     "centre_px": (-2.7, -1.3),
+    "picture_share": 28 / 34,
     "negative": False,
     "flipped": False,
     "threshold": 0.42,
     "threshold_off": 0.42,
     "refractory_us": 1780,
-    "leak_rate_hz": 0.3,
+    "leak_rate_hz": 0.6,
     "shot_rate_hz": 0.0,
+    "hot_pixels": (),
 }
 """In place of what neither the user nor a recording says."""
 
@@ -239,13 +244,15 @@ def _film(image: np.ndarray, row: int, sensor_size: SensorSize, options: SampleO
 
     times_us, moved_px = _frames(options.path_us, options.path_px, options.max_displacement_px)
     rng = np.random.default_rng(seed)
-    assert options.centre_px is not None
+    assert options.centre_px is not None and options.picture_share is not None
     start_px = np.array(options.centre_px) + np.array(sensor_size) / 2 + rng.normal(0, options.centre_jitter_px, 2)
-    side_px = options.picture_px or PICTURE_SHARE * min(sensor_size)
+    side_px = options.picture_share * min(sensor_size)
     light, background = _light(image, options)
+    kind, maps = _sensor(sensor_size, options)
     sensor = Sensor(
         sensor_size,
-        _sensor_options(options),
+        kind,
+        maps=maps,
         sensor_seed=options.sensor_seed,
         seed=[int(rng.integers(2**63))],
         max_events=options.max_events,
@@ -271,16 +278,17 @@ def _light(image: np.ndarray, options: SampleOptions) -> tuple[np.ndarray, float
     return light, float(np.median(np.concatenate([light[0], light[-1], light[:, 0], light[:, -1]])))
 
 
-def _sensor_options(options: SampleOptions) -> SensorOptions:
-    from ctlev_core.sensor_options import SensorOptions
+@functools.lru_cache(maxsize=4)
+def _sensor(sensor_size: SensorSize, options: SampleOptions) -> tuple[SensorOptions, PixelMaps]:
+    """The kind of sensor, and the pixels of the one among them that all recordings are made with."""
+    from ctlev_core.sensor_options import SensorOptions, sample_pixel_maps
 
     assert options.threshold is not None and options.threshold_off is not None
-    low = min(options.threshold, options.threshold_off)
-    return SensorOptions(
+    kind = SensorOptions(
         threshold=options.threshold,
         threshold_off=options.threshold_off,
         threshold_sigma=options.threshold_spread * (options.threshold * options.threshold_off) ** 0.5,
-        threshold_minimum=low / 4,
+        threshold_minimum=min(options.threshold, options.threshold_off) / 4,
         log_floor=1e-3,
         cutoff_dark_hz=options.cutoff_dark_hz,
         cutoff_bright_hz=options.cutoff_bright_hz,
@@ -291,6 +299,11 @@ def _sensor_options(options: SampleOptions) -> SensorOptions:
         rate_spread=options.rate_spread,
         starts_settled=options.starts_settled,
     )
+    maps = sample_pixel_maps(sensor_size, kind, options.sensor_seed)
+    for x, y, rate_hz in options.hot_pixels or ():
+        if 0 <= x < sensor_size[0] and 0 <= y < sensor_size[1]:
+            maps.hot_rate_hz[y, x] = rate_hz
+    return kind, maps
 
 
 @functools.lru_cache(maxsize=4)

@@ -1,7 +1,7 @@
 """A still picture before a camera that pans and tilts, as frames of linear light.
 
-A picture's pixel is a square of constant light, a sensor's pixel takes the mean over its area, and optics blur by a
-Gaussian. Of squares that is a product of one matrix for the rows and one for the columns, both in closed form, so a
+A picture's pixel is a square of constant light, a sensor's pixel takes the mean over its area, and optics blur evenly
+over a square. Of squares that is a product of one matrix for the rows and one for the columns, both in closed form, so a
 picture at any subpixel place is exact, without texels.
 """
 
@@ -28,7 +28,7 @@ def pan(
         side_px: side of the picture on the sensor, px.
         sensor_size: (width, height) px.
         middles_px: [T, 2] where the middle of the picture is, px from the sensor's left upper corner, x right, y down.
-        blur_px: standard deviation of the blur; 0 = none.
+        blur_px: standard deviation of the blur along an axis; 0 = none.
     Returns:
         [T, H, W] float32 linear light.
     """
@@ -49,10 +49,9 @@ def _shares(middles_px: np.ndarray, count: int, side_px: float, length: int, blu
 
 
 def _twice_integrated(distance: np.ndarray, blur_px: float) -> np.ndarray:
-    """The integral of the integral of a normal density of standard deviation `blur_px`."""
+    """The integral of the integral of an even density of standard deviation `blur_px` around 0."""
     if blur_px == 0:
         return np.maximum(distance, 0)
-    from scipy.special import ndtr
-
-    z = distance / np.float32(blur_px)
-    return distance * ndtr(z) + np.float32(blur_px / np.sqrt(2 * np.pi)) * np.exp(-0.5 * z * z)
+    half = np.float32(np.sqrt(3) * blur_px)
+    rising = np.clip(distance + half, 0, 2 * half)
+    return rising * rising / (4 * half) + np.maximum(distance - half, 0)
