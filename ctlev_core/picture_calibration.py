@@ -33,10 +33,12 @@ NUM_BINS = 12
 MAX_SIMULATED = 40
 QUIET_MARGIN_PX = 3
 MIN_QUIET_PX = 16
-HOT_FACTOR, HOT_EVENTS = 5.0, 20
+HOT_FACTOR, HOT_EVENTS = 3.0, 20
 INTERVAL_SHARE = 0.01
 MIN_INTERVALS = 200
 ROUNDS, TRIES, TOLERANCE = 3, 5, 0.005
+SIZE_POWER = 1.2
+"""Spread grows less than size, for the path has its share of it."""
 MIN_THRESHOLD, MAX_THRESHOLD = 0.02, 3.0
 LEAK_SIGMAS = 3.0
 
@@ -110,7 +112,8 @@ def fit(
         set_open(flipped=bool(noise_hz[0] > noise_hz[1] and excess_hz > LEAK_SIGMAS * error_hz))
         early = excess_hz * real.seconds / real.num < 0.5
         set_open(leak_rate_hz=float(excess_hz * (2 if early else 1)), shot_rate_hz=float(2 * noise_hz.min()))
-    signal = np.maximum(real.counts - (noise_hz * real.seconds)[:, None, None], 0)
+    # Where there is noise alone, the sums of what is left of it would blur place and size.
+    signal = np.where(quiet, 0.0, real.counts - (noise_hz * real.seconds)[:, None, None])
     set_open(negative=bool(found["negative"]) ^ (_agreement(real, simulated(**silent)) < 0))
     wanted = signal.sum(axis=(1, 2)) / real.num
     if found["flipped"]:
@@ -120,7 +123,7 @@ def fit(
         made = simulated(**silent)
         larger = _spread(signal.sum(axis=0)) / max(_spread(made.counts.sum(axis=0)), 1e-9)
         set_open(centre_px=_moved(found["centre_px"], signal.sum(axis=0), made))
-        set_open(picture_share=float(found["picture_share"] * np.clip(larger, 0.8, 1.25)))
+        set_open(picture_share=float(found["picture_share"] * np.clip(larger**SIZE_POWER, 0.8, 1.25)))
     _fit_thresholds(wanted, found, given, lambda: simulated(**silent))
     made = simulated()
     return found, {

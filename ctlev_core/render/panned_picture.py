@@ -1,8 +1,8 @@
 """A still picture before a camera that pans and tilts, as frames of linear light.
 
 A picture's pixel is a square of constant light, a sensor's pixel takes the mean over its area, and optics blur evenly
-over a square. Of squares that is a product of one matrix for the rows and one for the columns, both in closed form, so a
-picture at any subpixel place is exact, without texels.
+over a square. Of squares that is a product of one matrix for the rows and one for the columns, both in closed form, so
+a picture at any subpixel place is exact, without texels.
 """
 
 from __future__ import annotations
