@@ -7,7 +7,7 @@ inside functions, because the plan of an experiment loads every plug-in's option
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -170,6 +170,14 @@ class Condition(Protocol):
         ...
 
 
+class ConditionOfClasses(Condition, Protocol):
+    """A condition that has something to show of certain classes only."""
+
+    def check_classes(self, class_names: Iterable[str], options: Any) -> None:
+        """Raise `DataError` for a class that cannot be shown, before an experiment starts."""
+        ...
+
+
 class ConditionOfPairs(Protocol):
     """A condition made of the grey pictures taken at a window's start and end: `NEEDS = "intensity"`."""
 
@@ -243,6 +251,20 @@ class EventGenerator(Protocol):
         """The events of each row in turn, from its first key pose to its last.
 
         Those of row i depend on row i of `conditions` and seeds[i] alone. A row may have no events.
+        """
+        ...
+
+
+class CalibratedEventGenerator(EventGenerator, Protocol):
+    """A simulator that can be fitted to the training recordings of an experiment."""
+
+    def calibrate(
+        self, recordings: Iterable[Events], class_names: Sequence[str], conditions: Conditions, options: Any
+    ) -> tuple[Any, dict[str, float]]:
+        """`SampleOptions` in which nothing is left open, and what they were made of, by name with units.
+
+        `recordings` are read one by one and `class_names` are theirs; `conditions` are those that will be simulated,
+        with their class names. What the user has set stays. Deterministic.
         """
         ...
 

@@ -63,6 +63,7 @@ class Sensor:
         sensor_seed: which one of that kind: thresholds, rates, hot pixels.
         seed: of this recording: noise and reference levels.
         max_events: budget of the whole recording; None = as many as there are. May be changed at any time.
+        maps: the pixels, where they are known already; None = those of `sensor_seed`.
     """
 
     def __init__(
@@ -73,10 +74,11 @@ class Sensor:
         sensor_seed: int | list[int],
         seed: int | list[int],
         max_events: int | None = None,
+        maps: PixelMaps | None = None,
     ) -> None:
         self.sensor_size = sensor_size
         self.options = options
-        self.maps = sample_pixel_maps(sensor_size, options, sensor_seed)
+        self.maps = sample_pixel_maps(sensor_size, options, sensor_seed) if maps is None else maps
         self.max_events = max_events
         self.num_events = 0
         """Events sent so far."""

@@ -8,7 +8,7 @@ from typing import Any
 from ctlev_core import plugins
 from ctlev_core.plugins import PluginError
 from ctlev_core.score_requirements import check_dataset
-from data_contracts.config import Choice, DatasetChoice
+from data_contracts.config import Choice, ConditionChoice, DatasetChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
 from data_contracts.study import Study
@@ -40,9 +40,8 @@ def check_inputs(asked: Experiment | Study, *, thoroughly: bool = False) -> None
         for experiment in experiments.values():
             for choice in experiment.choices:
                 plugins.load_options(choice)
-            _check_intensity(experiment)
-            _check_labels(experiment)
-            _check_counts(experiment)
+            for check in CHECKS:
+                check(experiment)
     except (PluginError, DataError) as error:
         # What is found by looking again need not be what was found first: folders change.
         raise InputsMissing(_problems(experiments) or [str(error)], asked) from error
@@ -59,7 +58,7 @@ def _problems(experiments: Mapping[str, Experiment]) -> list[str]:
                 _look_for(choice)
             except (PluginError, DataError, OSError) as error:
                 found.setdefault(str(error), []).append(name)
-        for check in (_check_intensity, _check_labels, _check_counts):
+        for check in CHECKS:
             try:
                 check(experiment)
             except (PluginError, DataError, OSError) as error:
@@ -119,11 +118,7 @@ def check_whole_counts(experiment: Experiment, what: str) -> None:
 
 def _check_intensity(experiment: Experiment) -> None:
     """Raise `PluginError` where a condition needs intensity frames and a dataset has none, before anything is read."""
-    asked = experiment.poses or experiment.target
-    conditions = {"condition": (experiment.condition, asked)}
-    for name, baseline in experiment.baselines.items():
-        conditions[f"baselines.{name}.condition"] = baseline.condition, baseline.poses or asked
-    for name, (condition, poses) in conditions.items():
+    for name, (condition, poses) in _conditions(experiment).items():
         if getattr(plugins.load("conditions", condition.name), "NEEDS", "") != "intensity":
             continue
         for dataset in (experiment.dataset, poses):
@@ -133,6 +128,29 @@ def _check_intensity(experiment: Experiment) -> None:
                 )
 
 
+def _check_classes(experiment: Experiment) -> None:
+    """Raise `DataError` where a condition has nothing to show of a class that is to be sampled."""
+    for condition, poses in _conditions(experiment).values():
+        plugin = plugins.load_options(condition)
+        check = getattr(plugin.module, "check_classes", None)
+        if check is not None:
+            dataset = plugins.load_options(poses or experiment.dataset)
+            recordings = dataset.module.list_recordings(dataset.options)
+            check({recording.class_name for recording in recordings if recording.class_name}, plugin.options)
+
+
+def _conditions(experiment: Experiment) -> dict[str, tuple[ConditionChoice, DatasetChoice | None]]:
+    """The conditions of an experiment by their settings, and what else than its own dataset labels are taken from."""
+    asked = experiment.poses or experiment.target
+    found = {"condition": (experiment.condition, asked)}
+    for name, baseline in experiment.baselines.items():
+        found[f"baselines.{name}.condition"] = baseline.condition, baseline.poses or asked
+    return found
+
+
 def _has_intensity(dataset: DatasetChoice) -> bool:
     plugin = plugins.load_options(dataset)
     return any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options))
+
+
+CHECKS = (_check_intensity, _check_labels, _check_counts, _check_classes)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from tqdm import tqdm
 
-from ctlev_core import plugins
+from ctlev_core import event_files, plugins
 from ctlev_core.condition_sources import sensor_size_of
 from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling_shards import SHARD
@@ -28,13 +29,16 @@ from data_contracts.config import EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 from data_contracts.labels import Conditions
-from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef, conditions_of, read_manifest
+from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef, by_recording, conditions_of, read_manifest
 from tasks.stage import Output, input_files_of, stage
 from tasks.workers import map_shards
 
 SHARD_ROWS = 64
 BLOCK_BYTES = 1 << 30
 """Frames held at a time. For each block the generator reads its checkpoint again, so it is no smaller."""
+CALIBRATION_FILE = "calibration.json"
+MAX_CALIBRATION, MAX_CALIBRATION_EVENTS = 64, 1 << 22
+"""Training recordings that a simulator is fitted to, evenly spread over all, and events that are read of each."""
 MAX_GATE_FRAMES = 2_000
 """Training frames the gate is fitted to, evenly spread: the quantiles of more hardly move."""
 
@@ -142,15 +146,16 @@ def simulate(
 ) -> pa.Table:
     """The events of each condition row on a sensor like that of `recordings`, encoded as those are.
 
-    A frame is the window around the labelled moment; a row without events becomes an empty frame. What the gate of
-    `sample` would refuse says so, but is not simulated again: a body that keeps still would send no events then either.
+    A frame is the window around the labelled moment, or, where conditions have no motions and so no moment, around the
+    middle of the recording that is simulated: all of it with the method `whole`. A row without events becomes an empty
+    frame. What the gate of `sample` would refuse says so, but is not simulated again: a body that keeps still would
+    send no events then either.
+
+    A generator that can be calibrated is, on the training recordings; `calibration.json` says with what result.
     """
-    plugin = plugins.load_options(sampling)
-    if conditions_of(conditions).motions is None:
-        raise DataError(
-            f"{conditions.ref.path}: generator {plugin.name!r} needs body motions; use condition 'body_motion'"
-        )
-    asked = _Simulation(conditions.ref, sensor_size_of(recordings), sampling, encoding, windows, out.work)
+    plugin = _calibrated(plugins.load_options(sampling), recordings, conditions, out)
+    size = sensor_size_of(recordings)
+    asked = _Simulation(conditions.ref, size, sampling, plugin.options, encoding, windows, out.work)
     gate, count = gate_of(frames), len(conditions)
     seeds, causes = row_seeds(seed, count), []
     shards = [_Shard(start, seeds[start : start + SHARD_ROWS]) for start in range(0, count, SHARD_ROWS)]
@@ -167,13 +172,42 @@ def simulate(
     return _table(conditions, plugin, "", _Told(seeds, [1] * count, causes))
 
 
+def _calibrated(plugin: plugins.Plugin, recordings: Manifest, conditions: Manifest, out: Output) -> plugins.Plugin:
+    """The simulator with its options fitted to training recordings, where it has something to fit."""
+    if not hasattr(plugin.module, "calibrate"):
+        return plugin
+    ranges = _training_ranges(recordings)
+    if not ranges:
+        raise DataError(f"{recordings.ref.path}: no training recording with events, which {plugin.name!r} is fitted to")
+    chosen = [ranges[number] for number in spread(len(ranges), MAX_CALIBRATION)]
+    read = (event_files.read_events_range(path, start, stop) for _, path, start, stop in chosen)
+    names = [class_name for class_name, *_ in chosen]
+    options, measured = plugin.module.calibrate(read, names, conditions_of(conditions), plugin.options)
+    found = {"options": options.model_dump(mode="json"), "measured": measured}
+    (out.folder / CALIBRATION_FILE).write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return replace(plugin, options=options)
+
+
+def _training_ranges(recordings: Manifest) -> list[tuple[str, Path, int, int]]:
+    """Class, file, first event and one past the last of what each recording has for training, if not too long."""
+    parts = by_recording(recordings.attached(tables.PARTS))
+    found = []
+    for row in recordings.table.to_pylist():
+        for part in parts[row["recording_id"]].to_pylist() if row["events_file"] else []:
+            start, stop = part["event_start"], min(part["event_stop"], part["event_start"] + MAX_CALIBRATION_EVENTS)
+            if part["split"] == "train" and stop > start:
+                found.append((row["class_name"], recordings.path(row["events_file"]), start, stop))
+    return found
+
+
 @dataclass(frozen=True)
 class _Simulation:
-    """What a shard of `simulate` needs, small enough to travel with every shard."""
+    """What a shard of `simulate` needs, small enough to travel with every shard; `options` are the calibrated ones."""
 
     conditions: ManifestRef
     sensor_size: SensorSize
     sampling: SamplingChoice
+    options: Any
     encoding: EncodingChoice
     windows: Windows
     work: Path
@@ -195,9 +229,12 @@ def _simulate_shard(asked: _Simulation, shard: _Shard) -> Path:
     conditions, durations_us = _conditions_with_durations(asked.conditions.path, asked.conditions.digest)
     rows = slice(shard.start, shard.start + len(shard.seeds))
     part = conditions.take(rows)
-    assert part.motions is not None
-    simulated = plugin.module.sample_events(part, asked.sensor_size, plugin.options, seeds=shard.seeds)
-    frames = _encode(simulated, part.motions.moment_us, durations_us[rows], asked.windows, encoder)
+    try:
+        simulated = plugin.module.sample_events(part, asked.sensor_size, asked.options, seeds=shard.seeds)
+    except ValueError as error:
+        raise DataError(f"{asked.conditions.path}: {error}") from error
+    moments_us = None if part.motions is None else part.motions.moment_us
+    frames = _encode(simulated, moments_us, durations_us[rows], asked.windows, encoder)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
         np.save(file, frames, allow_pickle=False)
@@ -214,18 +251,25 @@ def _conditions_with_durations(folder: Path, digest: str) -> tuple[Conditions, n
 
 def _encode(
     simulated: Iterator[Events],
-    moments_us: np.ndarray,
+    moments_us: np.ndarray | None,
     durations_us: np.ndarray,
     windows: Windows,
     encoder: plugins.Plugin,
 ) -> np.ndarray:
-    """The frames [N, H, W, 3] of N simulations, each of the window around its moment."""
+    """The frames [N, H, W, 3] of N simulations, each of the window around its moment, else around its middle."""
     frames = []
-    for events, moment_us, duration_us in zip(simulated, moments_us, durations_us, strict=True):
-        window = np.array([window_around(events.t, int(moment_us), int(duration_us), windows)])
+    for row, (events, duration_us) in enumerate(zip(simulated, durations_us, strict=True)):
+        moment_us = _middle_us(events) if moments_us is None else int(moments_us[row])
+        whole = moments_us is None and windows.method == "whole"
+        window = (0, len(events)) if whole else window_around(events.t, moment_us, int(duration_us), windows)
+        window = np.array([window])
         counts = encoder.module.encode(events, window, encoder.options)
         frames.append(encoder.module.render_image(counts, encoder.options)[0])
     return np.stack(frames)
+
+
+def _middle_us(events: Events) -> int:
+    return int(events.t[0] + events.t[-1]) // 2 if len(events) else 0
 
 
 def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str, made: _Told) -> pa.Table:

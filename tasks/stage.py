@@ -285,12 +285,15 @@ def _files_within(folder: Path) -> Iterator[Path]:
 
 
 def input_files_of(argument: str) -> RawFiles:
-    """For `raw_files`: the files from outside the store that the plug-in chosen by an argument reads, if any."""
+    """For `raw_files`: the files from outside the store that the plug-in chosen by an argument reads, if any.
+
+    Of a folder that is every file in it, named by its path inside.
+    """
 
     def find(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
         plugin = plugins.load_options(arguments[argument])
         files = plugin.module.input_files(plugin.options) if hasattr(plugin.module, "input_files") else []
-        return [(path.name, path) for path in files]
+        return [pair for path in files for pair in (files_of([path]) if path.is_dir() else [(path.name, path)])]
 
     return find
 

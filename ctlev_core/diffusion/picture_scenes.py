@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.diffusion import labelled_pictures
-from ctlev_core.diffusion.labelled_pictures import LabelledPictures, PictureOptions
+from ctlev_core import labelled_pictures
 from ctlev_core.diffusion.procedural_images import Diet, Scene, apply_style
+from ctlev_core.labelled_pictures import LabelledPictures, PictureOptions
 
 
 def picture_diet(options: PictureOptions) -> Diet:

@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
-from ctlev_core.diffusion import labelled_pictures, procedural_images
+from ctlev_core import labelled_pictures
+from ctlev_core.diffusion import procedural_images
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
-from ctlev_core.diffusion.labelled_pictures import PictureOptions
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.picture_scenes import picture_diet, scene_of
 from ctlev_core.diffusion.prior import (
@@ -39,6 +39,7 @@ from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
 from ctlev_core.diffusion.training import run_training, sample_rows
 from ctlev_core.diffusion.training_options import TrainingOptions
 from ctlev_core.diffusion.training_processes import run_rank, train_in_processes
+from ctlev_core.labelled_pictures import PictureOptions
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
 from data_contracts.labels import History

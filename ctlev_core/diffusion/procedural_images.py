@@ -27,7 +27,7 @@ from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.body_views import labels_in_camera
 from ctlev_core.camera import is_inside, project
 from ctlev_core.conditions import normals
-from ctlev_core.diffusion.labelled_pictures import Style
+from ctlev_core.labelled_pictures import Style
 from ctlev_core.render.compositions import RELATIONS, all_compositions
 from ctlev_core.render.object_drawing import draw_composition, draw_object
 from ctlev_core.render.objects import COLOURS, NAMES, OBJECTS

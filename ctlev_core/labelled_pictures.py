@@ -1,4 +1,4 @@
-"""Ordinary labelled pictures that a base model learns from: what things look like and are called. Never events.
+"""Ordinary labelled pictures: what things look like and are called. A base model learns from them, or they are filmed.
 
 Three layouts are read:
 
@@ -26,7 +26,7 @@ from pydantic import Field, field_validator
 
 from ctlev_core.dataset_files.trees import check_inside, list_folder
 from ctlev_core.image_moves import Moves, move_image
-from data_contracts.config import RUN_SETTING
+from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 
 Style = Literal["photo", "grey", "lines", "coloured lines"]
@@ -41,8 +41,8 @@ EXPECTED = f"""expected one of
   ROOT/{IDX_IMAGES} and ROOT/{IDX_LABELS} (MNIST), plain or .gz"""
 
 
-class PictureOptions(Moves):
-    """Which pictures, and how much each is moved about whenever it is shown."""
+class PictureSource(Frozen):
+    """Which pictures."""
 
     root: Path | None = Field(
         default=None,
@@ -52,6 +52,18 @@ class PictureOptions(Moves):
     class_names: tuple[str, ...] = Field(
         default=(), description="names of the labels 0, 1, 2, ... where labels are numbers; empty = the numbers"
     )
+
+    @field_validator("class_names")
+    @classmethod
+    def _names_are_names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if any(not name.strip() for name in names) or len(set(names)) < len(names):
+            raise ValueError(f"class_names must be different and not empty, got {list(names)}")
+        return names
+
+
+class PictureOptions(PictureSource, Moves):
+    """Which pictures, in what styles, and how much each is moved about whenever it is shown."""
+
     synonyms: dict[str, list[str]] = Field(
         default_factory=dict, description="further names of a class, of which captions take one at random"
     )
@@ -72,13 +84,6 @@ class PictureOptions(Moves):
         if min(styles.values(), default=0) < 0 or abs(sum(styles.values()) - 1) > 1e-6:
             raise ValueError(f"the shares of styles must not be negative and sum to 1, got {styles}")
         return styles
-
-    @field_validator("class_names")
-    @classmethod
-    def _names_are_names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if any(not name.strip() for name in names) or len(set(names)) < len(names):
-            raise ValueError(f"class_names must be different and not empty, got {list(names)}")
-        return names
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +120,7 @@ class LabelledPictures:
         return _fit(picture, size)
 
 
-def open_pictures(options: PictureOptions) -> LabelledPictures:
+def open_pictures(options: PictureSource) -> LabelledPictures:
     """Look through the pictures that `options.root` names; those of a folder are listed, not read.
 
     Raises:
@@ -125,13 +130,14 @@ def open_pictures(options: PictureOptions) -> LabelledPictures:
     assert root is not None
     # What does not change between calls is read once: by every stage of a plan, and every block of pictures.
     found = _open(root, options.class_names, _modified(root))
-    unknown = sorted(set(options.synonyms) - set(found.names))
+    synonyms = options.synonyms if isinstance(options, PictureOptions) else {}
+    unknown = sorted(set(synonyms) - set(found.names))
     if unknown:
         raise DataError(f"{root}: synonyms of {unknown[0]!r}, which no picture shows; {_known(found.classes)}")
     return found
 
 
-def picture_files(options: PictureOptions) -> list[Path]:
+def picture_files(options: PictureSource) -> list[Path]:
     """What the content of the pictures is: the folder or file, for a cache key."""
     return [] if options.root is None else [options.root]
 
