@@ -19,7 +19,7 @@ def pooled(draws, generators=5, **arguments):
 
 
 def with_spread(values, deviation):
-    """The same numbers, moved to mean zero and scaled to this standard deviation (n - 1), so that luck plays no part."""
+    """The same numbers moved to mean zero and scaled to this standard deviation (n - 1): nothing is left to luck."""
     values = values - values.mean()
     return values * (deviation / values.std(ddof=1))
 
