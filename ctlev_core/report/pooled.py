@@ -122,9 +122,11 @@ def pooled_chart(groups: Sequence[Group]) -> list[Curves]:
     places = [float(match[1].replace(",", "")) for match in found]
     series: dict[str, tuple[list[float], list[float]]] = {}
     spans: dict[str, tuple[list[float], list[float]]] = {}
-    for setting in _LINES:
+    apart = 0.02 if min(places) > 0 else 0.0
+    for number, setting in enumerate(_LINES):
+        # A little beside one another, so that no bar hides another.
         points = [
-            (place, group.scores.score(setting))
+            (place * (1 + apart) ** (number - len(_LINES) // 2), group.scores.score(setting))
             for place, group in sorted(zip(places, groups, strict=True), key=lambda pair: pair[0])
             if setting in group.scores.settings
         ]
@@ -133,11 +135,9 @@ def pooled_chart(groups: Sequence[Group]) -> list[Curves]:
             series[name] = [place for place, _ in points], [score.value for _, score in points]
             spans[name] = [score.low for _, score in points], [score.high for _, score in points]
     metric = groups[0].metric
-    caption = f"{_counts(groups)} Bars are 95 % intervals."
-    x_label = f"real recordings: {found[0][2]}" if found[0][2] else "real recordings"
-    if "recording" in found[0][2]:
-        x_label = found[0][2]
-    title = f"{metric} by the number of real recordings"
+    caption = f"{_counts(groups)} Bars are 95 % intervals; lines stand a little apart, so that all can be seen."
+    x_label = found[0][2] or "real recordings"
+    title = f"Scores (`{metric}`) by the number of real recordings"
     return [Curves(title, series, x_label, metric, log_x=min(places) > 0, caption=caption, spans=spans)]
 
 
@@ -232,11 +232,11 @@ def _score_table(groups: Sequence[Group]) -> Table:
         )
     sense = "lower" if lower_is_better(metric) else "higher"
     caption = (
-        f"{metric} on real test recordings that nothing was trained on; {sense} is better. {_counts(groups)} In "
-        "brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: better than real frames "
-        "alone, by a difference whose interval excludes 0."
+        f"Scores (`{metric}`) on real test recordings that nothing was trained on; {sense} is better. "
+        f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: better "
+        "than real frames alone, by a difference whose interval excludes 0."
     )
-    title = f"{metric} by training frames and real recordings"
+    title = "Scores by training frames and number of real recordings"
     return Table(title, ["trained on", *_names(groups)], body, caption=caption, bold=bold, footnotes=notes)
 
 
@@ -250,7 +250,7 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
         if not any(found):
             continue
         bold |= {(len(body), n) for n, one in enumerate(found, 1) if one is not None and one.is_certain}
-        body.append([f"{told} (`{after}` minus `{before}`)", *("" if one is None else one.text() for one in found)])
+        body.append([told, *("" if one is None else one.text() for one in found)])
         probable.append([told, *(_probability(group, before, after) for group in groups)])
     shares = [_share(group) for group in groups]
     if any(shares):
@@ -259,8 +259,8 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
         return []
     sense = "Lower" if lower_is_better(metric) else "Higher"
     caption = (
-        f"Differences in {metric}, paired by test recording and by draw. {sense} is better. In brackets 95 % "
-        "intervals; bold: the interval excludes 0."
+        f"Differences in `{metric}`, the first of the two minus the second, paired by test recording and by draw. "
+        f"{sense} is better. In brackets 95 % intervals; bold: the interval excludes 0."
     )
     notes = []
     if any(shares):
@@ -269,7 +269,7 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
             "is certain."
         )
     chances = (
-        f"Share of resampled studies in which the first of the two has the better {metric}; 50 % is a tie. Resampled "
+        f"Share of resampled studies in which the first of the two has the better `{metric}`; 50 % is a tie. Resampled "
         "studies are spread as widely as the intervals are."
     )
     return [
