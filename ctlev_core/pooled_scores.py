@@ -20,8 +20,9 @@ draws, the larger of the variance found between draws and that explained by the 
 
 Three draws say little about their own spread. Percentiles of replicates, or 1.96 standard deviations of them, cover the
 truth in only 82 % of studies where draws vary most. The interval is therefore the score and t standard deviations of
-the replicates, with Satterthwaite's degrees of freedom (Biometrics Bulletin 1946). In simulated studies of three draws
-such intervals cover the truth in 92 to 97 %.
+the replicates: half widths of what recordings and of what draws add, each by the t quantile of its own degrees of
+freedom, add up in squares. Those of a sum over settings are Satterthwaite's (Biometrics Bulletin 1946). In simulated
+studies of three draws such intervals cover the truth in 93 to 98 %.
 """
 
 from __future__ import annotations
@@ -406,11 +407,22 @@ def _satterthwaite(parts: Sequence[tuple[float, float]]) -> float:
 def _interval(
     value: float, deviations: np.ndarray, parts: Sequence[tuple[float, float]]
 ) -> tuple[Difference, np.ndarray]:
-    """The interval of replicates' deviations [B] around a value, and replicates that are as widely spread."""
-    freedom = _satterthwaite(parts)
-    quantile = float(student.ppf(_LEVEL, freedom)) if math.isfinite(freedom) else _NORMAL
+    """The interval of replicates' deviations [B] around a value, and replicates that are as widely spread.
+
+    Args:
+        value: the score or difference.
+        deviations: of replicates.
+        parts: (variance, degrees of freedom) of what recordings and draws add.
+    """
+    total = sum(variance for variance, _ in parts)
+    squares = sum(variance * _quantile(freedom) ** 2 for variance, freedom in parts)
+    quantile = math.sqrt(squares / total) if total else _NORMAL
     half = quantile * float(deviations.std())
     return Difference(value, value - half, value + half), value + deviations * (quantile / _NORMAL)
+
+
+def _quantile(freedom: float) -> float:
+    return float(student.ppf(_LEVEL, freedom)) if math.isfinite(freedom) else _NORMAL
 
 
 def _minus(after: str, before: str) -> dict[str, float]:

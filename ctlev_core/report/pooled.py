@@ -233,8 +233,8 @@ def _score_table(groups: Sequence[Group]) -> Table:
     sense = "lower" if lower_is_better(metric) else "higher"
     caption = (
         f"Scores (`{metric}`) on real test recordings that nothing was trained on; {sense} is better. "
-        f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: better "
-        "than real frames alone, by a difference whose interval excludes 0."
+        f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: "
+        "better than real frames alone, by a difference whose interval excludes 0."
     )
     title = "Scores by training frames and number of real recordings"
     return Table(title, ["trained on", *_names(groups)], body, caption=caption, bold=bold, footnotes=notes)
