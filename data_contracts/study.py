@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from data_contracts.config import Frozen
 from data_contracts.experiment import NAME_PATTERN, Experiment
@@ -23,6 +23,11 @@ class Study(Frozen):
     speed_vs_error: SpeedVsErrorOptions | None = Field(
         None, description="also sample with several solvers and numbers of steps from the generator of an experiment"
     )
+    pooled: dict[str, tuple[str, ...]] = Field(
+        default_factory=dict,
+        description="groups of experiments that differ in their draw of training recordings alone, by what the tables "
+        "call them, such as `5 recordings a class`; each group is one column",
+    )
 
     @field_validator("experiments")
     @classmethod
@@ -36,3 +41,44 @@ class Study(Frozen):
         if len(set(names)) < len(names):
             raise ValueError(f"the experiments of a study need different names, got {names}")
         return experiments
+
+    @model_validator(mode="after")
+    def _groups_can_be_pooled(self) -> Study:
+        members = [name for group in self.pooled.values() for name in group]
+        unknown = [name for name in members if name not in self.experiments]
+        if unknown:
+            raise ValueError(f"pooled names experiments of the study, {', '.join(self.experiments)}; got {unknown}")
+        if twice := sorted({name for name in members if members.count(name) > 1}):
+            raise ValueError(f"pooled names each experiment once, got {twice} more than once")
+        for group, names in self.pooled.items():
+            if len(names) < 2:
+                raise ValueError(f"pooled, {group!r}: expected at least two experiments, got {list(names)}")
+            _check_alike(group, {name: self.experiments[name] for name in names})
+        scored = {tuple(metric.model_dump_json() for metric in self.experiments[name].metrics) for name in members}
+        if len(scored) > 1:
+            raise ValueError("pooled: the groups share a table, and must have the same metrics")
+        return self
+
+
+def _check_alike(group: str, members: dict[str, Experiment]) -> None:
+    """Raises ValueError where experiments cannot be told as draws of one."""
+    for what, of in (
+        ("settings", lambda one: one.trained_settings),
+        ("metrics", lambda one: [metric.model_dump() for metric in one.metrics]),
+        ("num_generators", lambda one: one.num_generators),
+        ("number of downstream_seeds", lambda one: len(one.downstream_seeds)),
+    ):
+        found = {name: of(member) for name, member in members.items()}
+        first = next(iter(found))
+        other = next((name for name in found if found[name] != found[first]), None)
+        if other is not None:
+            raise ValueError(
+                f"pooled, {group!r}: experiments must have the same {what}, got {found[first]} of {first} and "
+                f"{found[other]} of {other}"
+            )
+    member = next(iter(members.values()))
+    if len(member.downstream_seeds) % member.num_generators:
+        raise ValueError(
+            f"pooled, {group!r}: the number of downstream_seeds must be a multiple of num_generators, "
+            f"{member.num_generators}, got {len(member.downstream_seeds)}"
+        )

@@ -122,6 +122,8 @@ def _study(study: Study) -> ManifestRef:
         names=list(parts),
         settings=[part.trained_settings for part in parts.values()],
         generator_names=[part.generator_names for part in parts.values()],
+        pooled=list(study.pooled.items()),
+        num_generators=[part.num_generators for part in parts.values()],
         label=study.name,
     )
 

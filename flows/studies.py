@@ -19,7 +19,8 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
 
     Each of a study's `experiments` `extends` a preset, changes whole options, and single ones under `set`, as
     `key=value`. There `{NAME}` stands for what the study's `paths` say of NAME, so that a folder that several
-    experiments need is named once; one that is not given is looked for as `paths.NAME`.
+    experiments need is named once; one that is not given is looked for as `paths.NAME`. `{NAME?}` stands for a folder
+    that may be missing: it is null where that path is not given.
 
     Args:
         preset: as `load_preset` takes it.
@@ -69,6 +70,8 @@ def _filled(change: str, paths: dict[str, Any], where: str) -> str:
         if match[1] not in paths:
             raise PluginError(f"{where}: {change!r} names no path of this preset; it has {', '.join(paths) or 'none'}")
         given = paths[match[1]]
+        if given is None and match[2]:
+            return "null"
         return f"'{f'paths.{match[1]}' if given is None else given}'"  # nothing lies there, and errors say its name
 
-    return re.sub(r"\{(\w+)\}", place, change)
+    return re.sub(r"\{(\w+)(\??)\}", place, change)

@@ -10,11 +10,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.report.html import Folded, Links, Text, render_report
+from ctlev_core.report.pooled import Group, pool_parts, pooled_sections, pooled_tables, pooled_verdict
 from ctlev_core.report.report_files import LATEX, MARKDOWN, PAGE, published_files
 from ctlev_core.report.score_tables import PairedScores
 from ctlev_core.report.speed_summary import read_speed_summary
 from ctlev_core.report.study import (
     Part,
+    distances_table,
     speed_sections,
     speed_table,
     study_overview,
@@ -41,6 +43,8 @@ def study_report(
     names: Sequence[str],
     settings: Sequence[Sequence[str]],
     generator_names: Sequence[Sequence[str]],
+    pooled: Sequence[tuple[str, Sequence[str]]] = (),
+    num_generators: Sequence[int] = (),
 ) -> pa.Table:
     """Write `report.html`, `tables.tex` and `tables.md` over all experiments, and into a folder each what they report.
 
@@ -52,6 +56,11 @@ def study_report(
         names: of the experiments, likewise the following.
         settings: what was trained on.
         generator_names: whose frames were compared, the experiment's own first.
+        pooled: groups of experiments that differ in their draw of training recordings: names of the group and of these.
+        num_generators: fine-tunings in each experiment; needed where some are pooled.
+
+    Raises:
+        DrawsDiffer: experiments of a group were tested on different samples.
     """
     parts = [
         _part(report.ref.path, name, trained, generators)
@@ -61,18 +70,27 @@ def study_report(
     ]
     measured = [read_speed_summary(report.ref.path) for report in reports[len(names) :]]
     folders = [*names, *(SPEED_VS_ERROR for _ in measured)]
-    shown, overview = study_tables(parts), study_overview(parts)
-    verdict, words = study_verdict(parts), study_words(parts)
+    groups = _groups(reports, parts, pooled, num_generators)
+    inside = {part.name for group in groups for part in group.parts}
+    # Of a group, the page shows the samples of one experiment, and links to all.
+    alone = [part for part in parts if part.name not in inside]
+    shown, overview = study_tables(alone), study_overview(alone)
+    verdict, words = study_verdict(alone), study_words(alone)
+    scores = pooled_tables(groups) if groups else []
+    if groups:
+        shown[-1] = [distances_table([*(group.parts[0] for group in groups), *alone])]
     links = [(part.heading, f"{title}/{part.name}/{PAGE}") for part in parts]
     links += [(f"Speed against error (`{speed.experiment}`)", f"{title}/{SPEED_VS_ERROR}/{PAGE}") for speed in measured]
     page = render_report(
         title=title,
         lead=notice,
-        verdict=verdict or words,
-        overview=overview,
+        verdict="\n\n".join(filter(None, (pooled_verdict(groups), verdict or words))),
+        overview=scores[0] if scores else overview,
         steps=parts[0].summary.steps,
         sections=[
-            *study_sections(parts, shown),
+            *pooled_sections(groups, scores),
+            *([overview] if groups and overview.rows else []),
+            *study_sections(alone, shown),
             *(section for speed in measured for section in speed_sections(parts, speed)),
             *([Folded("The same in words", [Text("", words)])] if verdict else []),
             Links("Everything else, experiment by experiment", links),
@@ -80,12 +98,13 @@ def study_report(
     )
     (out.folder / PAGE).write_text(page, encoding="utf-8")
     kept = (
-        [overview]
+        scores
+        + ([overview] if overview.rows or not groups else [])
         + [table for of_part in shown for table in of_part]
         + [speed_table(parts, speed) for speed in measured]
     )
     (out.folder / LATEX).write_text(render_latex(kept, title=title, lead=notice), encoding="utf-8")
-    told = "\n\n".join(filter(None, (verdict, words)))
+    told = "\n\n".join(filter(None, (pooled_verdict(groups), verdict, words)))
     (out.folder / MARKDOWN).write_text(render_markdown(kept, title=title, lead=notice, verdict=told), encoding="utf-8")
     files = []
     for name, report in zip(folders, reports, strict=True):
@@ -95,6 +114,22 @@ def study_report(
             shutil.copyfile(path, out.folder / files[-1])
     found = [file for file in files if file.endswith(".parquet")]
     return pa.table({"table": [file.removesuffix(".parquet") for file in found], "file": found})
+
+
+def _groups(
+    reports: Sequence[Manifest],
+    parts: Sequence[Part],
+    pooled: Sequence[tuple[str, Sequence[str]]],
+    num_generators: Sequence[int],
+) -> list[Group]:
+    """The groups, with the scores of single samples of their experiments."""
+    places = {part.name: number for number, part in enumerate(parts)}
+    found = []
+    for name, members in pooled:
+        numbers = [places[member] for member in members]
+        samples = [pq.read_table(reports[number].ref.path / "samples.parquet") for number in numbers]
+        found.append(pool_parts(name, [parts[number] for number in numbers], samples, num_generators[numbers[0]]))
+    return found
 
 
 def _part(folder: Path, name: str, settings: Sequence[str], generators: Sequence[str]) -> Part:

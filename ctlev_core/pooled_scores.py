@@ -1,0 +1,437 @@
+"""Scores of settings over several draws of the training recordings, and how sure they are.
+
+A group of experiments differs in its draw alone: which few recordings each class learnt from. All are tested on the
+same samples. A score is the mean over draws, trainings and samples. What varies is drawn with replacement:
+
+- test recordings, the same for all draws, settings and trainings;
+- draws, the same for all settings: differences of settings are paired by draw;
+- within each draw fine-tunings of the generator, and within these classifier seeds, for each setting independently.
+  Training t learnt from the frames of fine-tuning t % G. Every training has a classifier seed of its own, so that no
+  seed meets two fine-tunings: seeds are drawn within the fine-tuning. Settings without a generator have seeds only.
+
+Deviations of R repetitions are stretched by sqrt(R/(R - 1)), for drawing R with replacement makes the variance of their
+mean (R - 1)/R of what it is (Rao & Wu, Resampling Inference with Complex Survey Data, JASA 1988).
+
+The means of draws already vary with what was trained within them. Drawing again within draws would count that spread
+twice, so that deviations of each level are shrunk to the variance that the levels below do not explain (Davison &
+Hinkley, Bootstrap Methods and their Application, 1997, section 3.8; Carpenter, Goldstein & Rasbash, A Novel Bootstrap
+Procedure for Assessing the Relationship between Class Size and Achievement, JRSS C 2003). Together they have, for
+draws, the larger of the variance found between draws and that explained by the trainings within.
+
+Three draws say little about their own spread. Percentiles of replicates, or 1.96 standard deviations of them, cover the
+truth in only 82 % of studies where draws vary most. The interval is therefore the score and t standard deviations of
+the replicates: half widths of what recordings and of what draws add, each by the t quantile of its own degrees of
+freedom, add up in squares. Those of a sum over settings are Satterthwaite's (Biometrics Bulletin 1946). In simulated
+studies of three draws such intervals cover the truth in 93 to 98 %.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from scipy.stats import t as student
+
+from ctlev_core.intervals import MIN_RECORDINGS
+from ctlev_core.paired_differences import NUM_RESAMPLES, Difference
+from data_contracts.errors import DataError
+from data_contracts.experiment import LABELS_OF, SHUFFLED
+
+WITHOUT_GENERATOR = ("real", "more_real")
+"""Settings made of these alone learnt from no generator's frames."""
+_LEVEL = 0.975
+_NORMAL = 1.959964
+_HALVINGS = 20
+_KEY = ("setting", "training", "sample_id", "recording_id", "value", "weight", "samples_digest")
+
+
+class DrawsDiffer(DataError):
+    """The experiments of a group were not tested on the same samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Tested:
+    """The samples of an experiment, sorted by name.
+
+    Attributes:
+        ids: [N].
+        recordings: [N] the recording of each.
+        weights: [N] in the mean.
+        digest: of images and labels.
+    """
+
+    ids: tuple[str, ...]
+    recordings: tuple[str, ...]
+    weights: np.ndarray
+    digest: str
+
+    def differs_from(self, other: _Tested) -> str:
+        """What differs, in words; empty where nothing does."""
+        if self.ids != other.ids:
+            missing = len(set(self.ids) ^ set(other.ids))
+            return f"{len(self.ids)} and {len(other.ids)} samples, {missing} of them in one alone"
+        if self.recordings != other.recordings:
+            return "the same names of samples, of other recordings"
+        if not np.array_equal(self.weights, other.weights):
+            return "the same samples with other weights"
+        return "" if self.digest == other.digest else "the same names of samples, with other images or labels"
+
+
+@dataclass(frozen=True, eq=False)
+class _Varied:
+    """What is known of one setting.
+
+    Attributes:
+        value: its score.
+        draws: [D] score of each draw.
+        recordings: [B] score of replicates of the test recordings.
+        within: [B] deviations of replicates of fine-tunings and seeds.
+        variance: of the mean of one draw, as trainings within explain it; NaN = one training, nothing known.
+        freedom: degrees of freedom of that variance.
+    """
+
+    value: float
+    draws: np.ndarray
+    recordings: np.ndarray
+    within: np.ndarray
+    variance: float
+    freedom: float
+
+
+class PooledScores:
+    """Scores of one metric over the experiments of a group; results are those of equal seeds whatever the row order.
+
+    Attributes:
+        settings: those that every experiment has, in the order of the first.
+        num_draws: experiments.
+        num_generators: fine-tunings in each.
+        num_trainings: by setting, in each experiment.
+        num_samples: test samples that every training has a score of.
+        num_recordings: their recordings. With fewer than `MIN_RECORDINGS` there are no intervals.
+    """
+
+    def __init__(self, draws: Sequence[pa.Table], metric: str, num_generators: int, seed: int = 0) -> None:
+        """Args:
+            draws: of each experiment the table of the schema `PAIRED_SAMPLES`.
+            metric: which score.
+            num_generators: fine-tunings of the generator in each experiment; training t used number t % G.
+            seed: of the resampling.
+
+        Raises:
+            DrawsDiffer: experiments were tested on different samples.
+            ValueError: fewer than two experiments, none scored by this metric, settings with other numbers of trainings
+                in other draws, numbers that are no multiple of `num_generators`, or no sample scored by all.
+        """
+        if len(draws) < 2:
+            raise ValueError(f"scores are pooled over at least two draws, got {len(draws)}")
+        read = [_read(table, metric, number) for number, table in enumerate(draws)]
+        tested = read[0][0]
+        for number, (other, _) in enumerate(read[1:], 1):
+            if difference := other.differs_from(tested):
+                raise DrawsDiffer(f"draws 0 and {number} must be tested on the same samples, got {difference}")
+        self.num_draws, self.num_generators = len(draws), num_generators
+        self.settings = tuple(name for name in read[0][1] if all(name in found for _, found in read))
+        values = {name: _stacked(name, [found[name] for _, found in read]) for name in self.settings}
+        self.num_trainings = {name: of_setting.shape[1] for name, of_setting in values.items()}
+        scored = ~np.any([np.isnan(of_setting).any(axis=(0, 1)) for of_setting in values.values()], axis=0)
+        scored &= tested.weights > 0
+        if not scored.any():
+            raise ValueError(f"none of the {len(scored)} samples is scored by every training of every draw")
+        names, index = np.unique(np.asarray(tested.recordings)[scored], return_inverse=True)
+        self.num_samples, self.num_recordings = int(scored.sum()), len(names)
+        random = np.random.default_rng(seed)
+        self._times = random.multinomial(len(names), np.full(len(names), 1 / len(names)), size=NUM_RESAMPLES)
+        self._draw_weights = _stretched(random, self.num_draws, (NUM_RESAMPLES,))
+        weights = tested.weights[scored]
+        self._of: dict[str, _Varied] = {}
+        # In the order of names, so that the order of rows changes nothing.
+        for name in sorted(self.settings):
+            sums = _add_up(values[name][..., scored] * weights, index, len(names))
+            groups = num_generators if _has_generator(name) else 1
+            self._of[name] = _vary(name, sums, np.bincount(index, weights), self._times, groups, random)
+
+    def score(self, setting: str) -> Difference:
+        """Mean score of a setting, with its 95 % interval.
+
+        Raises:
+            KeyError: not every experiment has this setting; so do the other methods.
+        """
+        return self._contrast({setting: 1.0})[0]
+
+    def difference(self, before: str, after: str) -> Difference:
+        """Mean score after minus mean score before, paired by test recording and by draw."""
+        return self._contrast(_minus(after, before))[0]
+
+    def probability(self, setting: str, other: str, *, lower_is_better: bool = False) -> float:
+        """How probable it is that the setting beats the other: the share of replicates in which it does.
+
+        Replicates are spread as widely as the interval is, so that both say the same. Equal scores count as half.
+        NaN with too few recordings. Source: Bouthillier et al., Accounting for Variance in Machine Learning Benchmarks,
+        MLSys 2021.
+        """
+        replicates = self._contrast(_minus(setting, other))[1] * (-1 if lower_is_better else 1)
+        if np.isnan(replicates).any():
+            return float("nan")
+        return float((replicates > 0).mean() + (replicates == 0).mean() / 2)
+
+    def share_of_gain(self, start: str, reached: str, ceiling: str) -> Difference | None:
+        """How much of the way from the start to the ceiling was gone: 1 = all of it.
+
+        Returns:
+            The share and its interval: all shares s of which `reached - start - s (ceiling - start)` may be 0 (Fieller,
+            Some Problems in Interval Estimation, JRSS B 1954). None where it is not certain that there is a gain.
+        """
+        gain, advance = self.difference(start, ceiling), self.difference(start, reached)
+        if not gain.is_certain:
+            return None
+        share = advance.value / gain.value
+        ends = [self._end_of_share(share, step, (start, reached, ceiling)) for step in (-1.0, 1.0)]
+        return Difference(share, *ends)
+
+    def _end_of_share(self, share: float, step: float, names: tuple[str, str, str]) -> float:
+        start, reached, ceiling = names
+
+        def inside(s: float) -> float:
+            weights = _added((reached, 1.0), (start, s - 1.0), (ceiling, -s))
+            found = self._contrast(weights)[0]
+            return (found.high - found.low) / 2 - abs(found.value)
+
+        if inside(share) <= 0:
+            return share
+        while inside(share + step) > 0:
+            step *= 2
+            if abs(step) > 1e6:
+                return math.copysign(math.inf, step)
+        near, far = share, share + step
+        for _ in range(_HALVINGS):
+            middle = (near + far) / 2
+            near, far = (middle, far) if inside(middle) > 0 else (near, middle)
+        return (near + far) / 2
+
+    def _contrast(self, weights: Mapping[str, float]) -> tuple[Difference, np.ndarray]:
+        """A weighted sum of scores with its interval, and the replicates of it [B], as wide as the interval."""
+        parts = [(weight, self._of[name]) for name, weight in weights.items()]
+        value = sum(weight * part.value for weight, part in parts)
+        if self.num_recordings < MIN_RECORDINGS:
+            return Difference(value, float("nan"), float("nan")), np.full(1, np.nan)
+        zeros = np.zeros(NUM_RESAMPLES)
+        replicates = sum((weight * (part.recordings - part.value) for weight, part in parts), zeros)
+        sampled = float(replicates.var()), float(self.num_recordings - 1)
+        draws = sum((weight * part.draws for weight, part in parts), np.zeros(self.num_draws))
+        within = [(weight**2 * part.variance, part.freedom) for weight, part in parts]
+        deviations = sum((weight * part.within for weight, part in parts), zeros)
+        more, repeated = _vary_draws(draws, self._draw_weights, deviations, within)
+        return _interval(value, replicates + more, [sampled, repeated])
+
+
+def pool_values(values: np.ndarray, num_generators: int, seed: int = 0) -> Difference:
+    """Mean of scores that have samples of their own, as those of synthetic frames against their labels have.
+
+    What samples add to the spread is then part of that between fine-tunings, and nothing is drawn but these, seeds and
+    draws.
+
+    Args:
+        values: [D, R] score of each training of each draw; training t used the frames of fine-tuning t % G.
+        num_generators: G.
+        seed: of the resampling.
+
+    Raises:
+        ValueError: fewer than two draws, or R is no multiple of G.
+    """
+    values = np.asarray(values, np.float64)
+    if values.ndim != 2 or len(values) < 2:
+        raise ValueError(f"scores are pooled over at least two draws, got values of shape {values.shape}")
+    random = np.random.default_rng(seed)
+    draw_weights = _stretched(random, len(values), (NUM_RESAMPLES,))
+    part = _vary("scores", values[..., None], np.ones(1), np.ones((NUM_RESAMPLES, 1)), num_generators, random)
+    more, repeated = _vary_draws(part.draws, draw_weights, part.within, [(part.variance, part.freedom)])
+    return _interval(part.value, more, [repeated])[0]
+
+
+def _read(table: pa.Table, metric: str, number: int) -> tuple[_Tested, dict[str, np.ndarray]]:
+    """The tested samples, and of each setting the values [R, N], both in the order of the samples' names."""
+    metrics, of_metric = _encoded(table["metric"])
+    settings, of_setting = _encoded(table["setting"])
+    chosen = np.array([name == metric for name in metrics], bool)[of_metric]
+    chosen &= ~np.array([name.startswith((LABELS_OF, SHUFFLED)) for name in settings], bool)[of_setting]
+    table = table.filter(pa.array(chosen)).select(list(_KEY))
+    if not len(table):
+        raise ValueError(f"draw {number} has no samples scored by {metric!r}")
+    codes, names = {}, {}
+    for column in ("setting", "sample_id", "recording_id", "samples_digest"):
+        names[column], codes[column] = _encoded(table[column])
+    training, value, weight = (table[name].to_numpy() for name in ("training", "value", "weight"))
+    count = len(names["sample_id"])
+    first = np.full(count, -1)
+    first[codes["sample_id"][::-1]] = np.arange(len(table))[::-1]
+    recordings = codes["recording_id"][first]
+    same = (recordings[codes["sample_id"]] == codes["recording_id"]) & (weight[first][codes["sample_id"]] == weight)
+    if len(names["samples_digest"]) > 1 or not same.all():
+        raise DrawsDiffer(f"the trainings of draw {number} must be tested on the same samples, got different ones")
+    found = {}
+    # In the order of the table's rows.
+    for code in dict.fromkeys(codes["setting"].tolist()):
+        of_setting = codes["setting"] == code
+        trainings, rows = np.unique(training[of_setting], return_inverse=True)
+        values, times = np.full((len(trainings), count), np.nan), np.zeros((len(trainings), count), int)
+        place = rows, codes["sample_id"][of_setting]
+        values[place] = value[of_setting]
+        np.add.at(times, place, 1)
+        if (times != 1).any():
+            raise DrawsDiffer(
+                f"setting {names['setting'][code]!r} of draw {number}: each training must score each of the {count} "
+                f"samples once, got {times.min()} to {times.max()} times"
+            )
+        found[names["setting"][code]] = values
+    of_samples = tuple(names["recording_id"][code] for code in recordings)
+    return _Tested(tuple(names["sample_id"]), of_samples, weight[first], names["samples_digest"][0]), found
+
+
+def _encoded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
+    """The different texts, sorted, and the number of each row's among them."""
+    encoded = column.combine_chunks().dictionary_encode()
+    names = np.asarray(encoded.dictionary.to_pylist())
+    order = np.argsort(names)
+    return names[order].tolist(), np.argsort(order)[encoded.indices.to_numpy(zero_copy_only=False)]
+
+
+def _stacked(name: str, draws: Sequence[np.ndarray]) -> np.ndarray:
+    counts = [len(values) for values in draws]
+    if len(set(counts)) > 1:
+        raise ValueError(f"setting {name!r} must have as many trainings in every draw, got {counts}")
+    return np.stack(draws)
+
+
+def _add_up(values: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
+    """Values of samples [D, R, N] added up by recording: [D, R, `count`]."""
+    order = np.argsort(index, kind="stable")
+    starts = np.searchsorted(index[order], np.arange(count))
+    return np.add.reduceat(values[..., order], starts, axis=-1)
+
+
+def _has_generator(setting: str) -> bool:
+    return not all(part in WITHOUT_GENERATOR for part in setting.split("+"))
+
+
+def _stretched(random: np.random.Generator, count: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Weights [*shape, count] of deviations from a mean: of a drawing of `count`, stretched; zeros for one alone."""
+    if count < 2:
+        return np.zeros((*shape, count))
+    times = random.multinomial(count, np.full(count, 1 / count), size=shape)
+    return times * (math.sqrt(count / (count - 1)) / count)
+
+
+def _vary(
+    name: str, sums: np.ndarray, counts: np.ndarray, times: np.ndarray, groups: int, random: np.random.Generator
+) -> _Varied:
+    """Replicates of one setting.
+
+    Args:
+        name: of the setting, for errors.
+        sums: [D, R, n] weighted values of each recording.
+        counts: [n] weights of each recording.
+        times: [B, n] how often each recording is drawn.
+        groups: fine-tunings that its trainings take turns with.
+        random: draws fine-tunings and seeds.
+    """
+    num_draws, num_trainings, _ = sums.shape
+    if num_trainings % groups:
+        raise ValueError(
+            f"setting {name!r}: the number of trainings must be a multiple of the {groups} fine-tunings, "
+            f"got {num_trainings}"
+        )
+    sampled = (times @ sums.mean(axis=(0, 1))) / (times @ counts)
+    seeds = num_trainings // groups
+    # Training t = seed number t // G of fine-tuning t % G.
+    scores = (sums.sum(axis=-1) / counts.sum()).reshape(num_draws, seeds, groups)
+    tuned = _mean(scores)
+    means = _mean(tuned)
+    of_seeds = float(scores.var(axis=1, ddof=1).mean()) / seeds if seeds > 1 else 0.0
+    of_tuned = float(tuned.var(axis=1, ddof=1).mean()) if groups > 1 else 0.0
+    by_seed = seeds > 1 and of_seeds >= of_tuned
+    within = np.zeros(len(times))
+    for draw in range(num_draws):
+        # One draw after the other: memory for one is enough.
+        shrunk = math.sqrt(max(0.0, 1 - of_seeds / of_tuned)) if of_tuned else 0.0
+        drawn = _stretched(random, groups, (len(times),))
+        within += drawn @ (tuned[draw] - means[draw]) * shrunk
+        for group in range(groups):
+            drawn = _stretched(random, seeds, (len(times),))
+            within += drawn @ (scores[draw, :, group] - tuned[draw, group]) / groups
+    if num_trainings == 1:
+        variance, freedom = float("nan"), 0.0
+    elif by_seed:
+        variance, freedom = of_seeds / groups, float(num_draws * groups * (seeds - 1))
+    else:
+        variance, freedom = of_tuned / groups, float(num_draws * (groups - 1))
+    return _Varied(float(means.mean()), means, sampled, within / num_draws, variance, freedom)
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Mean over the second axis; that of equal numbers is exactly this number, so that they deviate by exactly 0."""
+    first = values[:, 0]
+    return first + (values - first[:, None]).mean(axis=1)
+
+
+def _vary_draws(
+    means: np.ndarray, weights: np.ndarray, within: np.ndarray, explained: Sequence[tuple[float, float]]
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """Deviations of replicates [B] of draws and of what was trained within them; their variance and its freedom.
+
+    Args:
+        means: [D] of each draw.
+        weights: [B, D] of their deviations.
+        within: [B] deviations of what was trained within draws.
+        explained: (variance of the mean of a draw, degrees of freedom) of each setting.
+    """
+    count = len(means)
+    found = float(means.var(ddof=1))
+    known = [(variance, freedom) for variance, freedom in explained if not math.isnan(variance)]
+    expected = sum(variance for variance, _ in known)
+    if found > expected:
+        deviations = weights @ (means - means.mean()) * math.sqrt(1 - expected / found)
+        return deviations + within, (found / count, count - 1.0)
+    return within, (expected / count, _satterthwaite(known))
+
+
+def _satterthwaite(parts: Sequence[tuple[float, float]]) -> float:
+    """Degrees of freedom of a sum of variances, each with its own."""
+    total = sum(variance for variance, _ in parts)
+    below = sum(variance**2 / freedom for variance, freedom in parts if variance)
+    return total**2 / below if below else math.inf
+
+
+def _interval(
+    value: float, deviations: np.ndarray, parts: Sequence[tuple[float, float]]
+) -> tuple[Difference, np.ndarray]:
+    """The interval of replicates' deviations [B] around a value, and replicates that are as widely spread.
+
+    Args:
+        value: the score or difference.
+        deviations: of replicates.
+        parts: (variance, degrees of freedom) of what recordings and draws add.
+    """
+    total = sum(variance for variance, _ in parts)
+    squares = sum(variance * _quantile(freedom) ** 2 for variance, freedom in parts)
+    quantile = math.sqrt(squares / total) if total else _NORMAL
+    half = quantile * float(deviations.std())
+    return Difference(value, value - half, value + half), value + deviations * (quantile / _NORMAL)
+
+
+def _quantile(freedom: float) -> float:
+    return float(student.ppf(_LEVEL, freedom)) if math.isfinite(freedom) else _NORMAL
+
+
+def _minus(after: str, before: str) -> dict[str, float]:
+    return _added((after, 1.0), (before, -1.0))
+
+
+def _added(*terms: tuple[str, float]) -> dict[str, float]:
+    """Weights by setting; those of one that is named twice are added."""
+    weights: dict[str, float] = {}
+    for name, weight in terms:
+        weights[name] = weights.get(name, 0.0) + weight
+    return weights

@@ -1,0 +1,327 @@
+"""Groups of experiments that differ in their draw of training recordings alone, told as one column each.
+
+The page of a study with groups begins with them: whether synthetic frames helped, every setting's score, the
+differences that matter, and accuracy over the number of real recordings.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core.intervals import score_text
+from ctlev_core.paired_differences import Difference
+from ctlev_core.pooled_scores import PooledScores, pool_values
+from ctlev_core.report.html import Curves, Folded, Section
+from ctlev_core.report.study import Part
+from ctlev_core.report.tables import Cell, Table
+from ctlev_core.report.verdict import in_words, lower_is_better, made_better
+from data_contracts.experiment import LABELS_OF
+
+REAL, OWN, BOTH = "real", "synthetic", "real+synthetic"
+LABELS = f"{LABELS_OF} {OWN}"
+_FRAMES = {
+    REAL: "real frames",
+    OWN: "synthetic frames",
+    "augmentation": "augmented copies of real frames",
+    "random_weights": "synthetic frames of a generator from random weights",
+    "simulator": "simulated frames",
+    "more_real": "more real frames",
+    "faithful": "the synthetic frames with the clearest labels",
+}
+"""What the parts of a setting's name stand for, in reading order."""
+_COMPARED = (
+    (REAL, BOTH, "real and synthetic frames, against real frames alone"),
+    ("real+augmentation", BOTH, "real and synthetic frames, against real frames and augmented copies"),
+    (REAL, OWN, "synthetic frames alone, against real frames alone"),
+    ("random_weights", OWN, "synthetic frames: pre-trained weights against random weights"),
+    ("real+simulator", BOTH, "real and synthetic frames, against real and simulated frames"),
+)
+"""Before, after, and what the row is called."""
+_CEILING = "real+more_real"
+_LINES = (REAL, "real+augmentation", BOTH, OWN, "real+simulator")
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Experiments that differ in their draw alone.
+
+    Attributes:
+        name: of the column.
+        parts: the experiments.
+        scores: theirs, pooled.
+    """
+
+    name: str
+    parts: Sequence[Part]
+    scores: PooledScores
+
+    @property
+    def metric(self) -> str:
+        """The score it is about: the first of its experiments."""
+        return self.parts[0].metric
+
+    @cached_property
+    def label_agreement(self) -> Difference | None:
+        """Score of synthetic frames against the labels asked for, as models trained on real frames see them."""
+        draws = [
+            [
+                row["value"]
+                for row in part.rows
+                if (row["setting"], row["metric"], row["group"]) == (LABELS, self.metric, "all")
+            ]
+            for part in self.parts
+        ]
+        counts = {len(values) for values in draws}
+        if len(counts) > 1 or counts == {0} or max(counts) % self.scores.num_generators:
+            return None
+        return pool_values(np.array(draws), self.scores.num_generators)
+
+    def difference(self, before: str, after: str) -> Difference | None:
+        """The second setting minus the first; None where it has not both."""
+        return self.scores.difference(before, after) if {before, after} <= set(self.scores.settings) else None
+
+
+def pool_parts(name: str, parts: Sequence[Part], samples: Sequence[pa.Table], num_generators: int) -> Group:
+    """The group of some experiments.
+
+    Args:
+        name: of the group.
+        parts: the experiments.
+        samples: of each the table of the schema `PAIRED_SAMPLES`.
+        num_generators: fine-tunings in each.
+
+    Raises:
+        DrawsDiffer, ValueError: as `PooledScores`.
+    """
+    return Group(name, parts, PooledScores(samples, parts[0].metric, num_generators))
+
+
+def pooled_verdict(groups: Sequence[Group]) -> str:
+    """A paragraph a group: did synthetic frames help?"""
+    return "\n\n".join(_sentence(group) for group in groups)
+
+
+def pooled_tables(groups: Sequence[Group]) -> list[Table]:
+    """Scores of all settings; differences; how probable it is that one setting beats another."""
+    return [_score_table(groups), *_difference_tables(groups)]
+
+
+def pooled_chart(groups: Sequence[Group]) -> list[Curves]:
+    """The score over the number that the groups' names begin with; nothing where they begin with none."""
+    matches = [re.match(r"([\d.,]*\d)\s*(.*)", group.name) for group in groups]
+    found = [match for match in matches if match]
+    if len(found) < max(2, len(groups)) or len({match[2] for match in found}) > 1:
+        return []
+    places = [float(match[1].replace(",", "")) for match in found]
+    series: dict[str, tuple[list[float], list[float]]] = {}
+    spans: dict[str, tuple[list[float], list[float]]] = {}
+    apart = 0.02 if min(places) > 0 else 0.0
+    for number, setting in enumerate(_LINES):
+        # A little beside one another, so that no bar hides another.
+        points = [
+            (place * (1 + apart) ** (number - len(_LINES) // 2), group.scores.score(setting))
+            for place, group in sorted(zip(places, groups, strict=True), key=lambda pair: pair[0])
+            if setting in group.scores.settings
+        ]
+        if points:
+            name = _in_words(setting)
+            series[name] = [place for place, _ in points], [score.value for _, score in points]
+            spans[name] = [score.low for _, score in points], [score.high for _, score in points]
+    metric = groups[0].metric
+    caption = f"{_counts(groups)} Bars are 95 % intervals; lines stand a little apart, so that all can be seen."
+    x_label = found[0][2] or "real recordings"
+    title = f"Scores (`{metric}`) by the number of real recordings"
+    return [Curves(title, series, x_label, metric, log_x=min(places) > 0, caption=caption, spans=spans)]
+
+
+def pooled_sections(groups: Sequence[Group], tables: Sequence[Table]) -> list[Section | Folded]:
+    """What follows the first of the tables: differences, the chart, probabilities, and samples of each group.
+
+    Args:
+        groups: in reading order.
+        tables: as `pooled_tables` gives them.
+    """
+    differences, probabilities = tables[1:2], tables[2:]
+    sections: list[Section | Folded] = [*differences, *pooled_chart(groups)]
+    sections += [Folded(table.title, [table]) for table in probabilities]
+    for group in groups:
+        first = group.parts[0]
+        title = f"{group.name} (`{first.name}`): asked for, and sampled"
+        sections.append(replace(first.summary.grid, title=title))
+    return sections
+
+
+def _sentence(group: Group) -> str:
+    added = group.difference(REAL, BOTH)
+    if added is None:
+        return f"{group.name}: nothing was trained on real and synthetic frames together."
+    before, after = (score_text(group.scores.score(setting).value) for setting in (REAL, BOTH))
+    what = "adding synthetic frames to the real ones"
+    numbers = f"{group.metric} went from {before} to {after}, a difference of {added.text()}"
+    told = f"{group.name}: {_told(added, group.metric, what)}; {numbers}"
+    beside = group.difference("real+augmentation", BOTH)
+    if beside is None:
+        return f"{told}."
+    better = made_better(beside, group.metric)
+    compared = {
+        True: "it did more than augmented copies of the real frames do",
+        False: "it did less than augmented copies of the real frames do",
+        None: "whether it did more than augmented copies of the real frames do is undecided",
+    }[better]
+    return f"{told}; {compared} ({beside.text()})."
+
+
+def _told(difference: Difference, metric: str, what: str) -> str:
+    if math.isnan(difference.low):
+        return f"there are too few test recordings to say whether {what} helped"
+    better = made_better(difference, metric)
+    return {True: f"{what} helped", False: f"{what} did harm", None: f"whether {what} helped is undecided"}[better]
+
+
+def _in_words(setting: str) -> str:
+    """A setting in plain words: `real and synthetic frames`."""
+    if setting == BOTH:
+        return "real and synthetic frames"
+    parts = [_FRAMES.get(part, f"frames of {part.replace('_', ' ')}") for part in setting.split("+")]
+    if len(parts) == 1:
+        return f"{parts[0]} alone"
+    return f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def _reading_order(settings: Sequence[str]) -> list[str]:
+    """Real frames alone, real frames with others, then others alone; within these as `_FRAMES` names them."""
+    known = list(_FRAMES)
+
+    def place(setting: str) -> tuple:
+        parts = setting.split("+")
+        kind = 0 if parts == [REAL] else 1 if REAL in parts else 2
+        others = [known.index(part) if part in known else len(known) for part in parts]
+        return kind, len(parts), others
+
+    return sorted(settings, key=place)
+
+
+def _score_table(groups: Sequence[Group]) -> Table:
+    metric = groups[0].metric
+    settings = _reading_order(list(dict.fromkeys(name for group in groups for name in group.scores.settings)))
+    body: list[list[Cell]] = []
+    bold: set[tuple[int, int]] = set()
+    for setting in settings:
+        row: list[Cell] = [f"{_in_words(setting)} (`{setting}`)"]
+        for column, group in enumerate(groups, 1):
+            known = setting in group.scores.settings
+            row.append(_score(group.scores.score(setting)) if known else "")
+            difference = group.difference(REAL, setting)
+            if difference is not None and made_better(difference, metric):
+                bold.add((len(body), column))
+        body.append(row)
+    notes = [f"`{metric}`: {in_words(metric)}"] if in_words(metric) else []
+    agreed = [group.label_agreement for group in groups]
+    if any(agreed):
+        body.append([f"label agreement (`{LABELS}`)", *("" if one is None else _score(one) for one in agreed)])
+        notes.append(
+            f"Label agreement: {metric} of classifiers trained on real frames when they are shown synthetic frames and "
+            "the labels asked for. It says nothing of real test recordings."
+        )
+    sense = "lower" if lower_is_better(metric) else "higher"
+    caption = (
+        f"Scores (`{metric}`) on real test recordings that nothing was trained on; {sense} is better. "
+        f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: "
+        "better than real frames alone, by a difference whose interval excludes 0."
+    )
+    title = "Scores by training frames and number of real recordings"
+    return Table(title, ["trained on", *_names(groups)], body, caption=caption, bold=bold, footnotes=notes)
+
+
+def _difference_tables(groups: Sequence[Group]) -> list[Table]:
+    metric = groups[0].metric
+    body: list[list[Cell]] = []
+    probable: list[list[Cell]] = []
+    bold: set[tuple[int, int]] = set()
+    for before, after, told in _COMPARED:
+        found = [group.difference(before, after) for group in groups]
+        if not any(found):
+            continue
+        bold |= {(len(body), n) for n, one in enumerate(found, 1) if one is not None and one.is_certain}
+        body.append([told, *("" if one is None else one.text() for one in found)])
+        probable.append([told, *(_probability(group, before, after) for group in groups)])
+    shares = [_share(group) for group in groups]
+    if any(shares):
+        body.append(["share of the gain of more real frames that synthetic frames give", *shares])
+    if not body:
+        return []
+    sense = "Lower" if lower_is_better(metric) else "Higher"
+    caption = (
+        f"Differences in `{metric}`, the first of the two minus the second, paired by test recording and by draw. "
+        f"{sense} is better. In brackets 95 % intervals; bold: the interval excludes 0."
+    )
+    notes = []
+    if any(shares):
+        notes.append(
+            "The share is that of the gain from adding more real frames to the real ones. It is given where this gain "
+            "is certain."
+        )
+    chances = (
+        f"Share of resampled studies in which the first of the two has the better `{metric}`; 50 % is a tie. Resampled "
+        "studies are spread as widely as the intervals are."
+    )
+    return [
+        Table(
+            "Differences that matter", ["compared", *_names(groups)], body, caption=caption, bold=bold, footnotes=notes
+        ),
+        Table("How probable is it that the first is better?", ["compared", *_names(groups)], probable, caption=chances),
+    ]
+
+
+def _probability(group: Group, before: str, after: str) -> str:
+    if group.difference(before, after) is None:
+        return ""
+    found = group.scores.probability(after, before, lower_is_better=lower_is_better(group.metric))
+    if math.isnan(found):
+        return ""
+    # Replicates are too few to tell more.
+    return f"{min(max(found, 0.001), 0.999):.1%}".replace("%", " %")
+
+
+def _share(group: Group) -> str:
+    if not {REAL, BOTH, _CEILING} <= set(group.scores.settings):
+        return ""
+    share = group.scores.share_of_gain(REAL, BOTH, _CEILING)
+    return "" if share is None else f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]".replace("%", " %")
+
+
+def _score(score: Difference) -> str:
+    return score_text(score.value, score.low, score.high)
+
+
+def _names(groups: Sequence[Group]) -> list[str]:
+    return [group.name for group in groups]
+
+
+def _counts(groups: Sequence[Group]) -> str:
+    """What every number is the mean of."""
+    told = [_count(group) for group in groups]
+    if len(set(told)) == 1:
+        return f"Each score is the mean over {told[0]}."
+    return " ".join(f"{group.name}: the mean over {text}." for group, text in zip(groups, told, strict=True))
+
+
+def _count(group: Group) -> str:
+    scores = group.scores
+    trainings = max(scores.num_trainings.values())
+    frames = f" ({scores.num_samples:,} frames)" if scores.num_samples != scores.num_recordings else ""
+    tunings = "fine-tuning" if scores.num_generators == 1 else "fine-tunings"
+    seeds = trainings // scores.num_generators
+    of_each = f"{scores.num_generators} {tunings} of the generator in each draw, and {seeds} classifier "
+    of_each += "seed for each of them" if seeds == 1 else "seeds for each of them"
+    return (
+        f"{scores.num_recordings:,} test recordings{frames}, {scores.num_draws} random draws of the training "
+        f"recordings, {of_each} ({trainings} classifiers for each draw and row)"
+    )
