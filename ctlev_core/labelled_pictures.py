@@ -248,13 +248,10 @@ def _open_npz(path: Path, class_names: Sequence[str]) -> LabelledPictures:
 
 
 def _open_idx(root: Path, class_names: Sequence[str]) -> LabelledPictures:
-    arrays: list[np.ndarray] = []
-    for name, magic in ((IDX_IMAGES, 0x803), (IDX_LABELS, 0x801)):
-        path = _idx_file(root, name)
-        if path is None:
-            raise DataError(f"{root}: expected {name} beside the other file; {EXPECTED}")
-        arrays.append(_read_idx(path, magic))
-    images, labels = arrays
+    paths = [_idx_file(root, name) for name in (IDX_IMAGES, IDX_LABELS)]
+    if paths[1] is None or paths[0] is None:
+        raise DataError(f"{root}: expected {IDX_LABELS} beside {IDX_IMAGES}; {EXPECTED}")
+    images, labels = _read_idx(paths[0], 0x803), _read_idx(paths[1], 0x801)
     return _checked(images, labels, class_names, str(root))
 
 
