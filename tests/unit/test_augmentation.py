@@ -64,7 +64,7 @@ def test_a_class_without_frames_and_no_frames_at_all(tmp_path):
 def trained(tmp_path):
     frames, names = training_frames()
     labels = Labels(names, np.zeros(6, np.int64))
-    options = classifier.Options(architecture="small-cnn", num_steps=40, batch_size=6, by_recording=True)
+    options = classifier.Options(architecture="small-cnn", num_steps=150, batch_size=6, by_recording=True)
     classifier.train(frames, labels, options, seed=0, out=tmp_path / "m", work=tmp_path / "w")
     return tmp_path / "m"
 
