@@ -149,8 +149,8 @@ class Encoding(Protocol):
     def encode(self, events: Events, windows: np.ndarray, options: Any) -> np.ndarray:
         """[N, C, H, W] of the event index ranges `windows` [N, 2] int64: uint16 counts, or float32.
 
-        At `image_geometry.count_size`: in pixels of the sensor, or with resampling `events` in those of the image. N = 0
-        must do: it tells how many windows fit into memory.
+        At `image_geometry.count_size`: in pixels of the sensor, or with resampling `events` in those of the image. N
+        may be 0, which tells how many windows fit into memory.
         """
         ...
 
