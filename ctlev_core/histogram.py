@@ -307,5 +307,5 @@ def grey_levels(histogram: np.ndarray, scales: np.ndarray, levels: np.ndarray) -
 
 
 @njit(cache=True, nogil=True)
-def _grey_level(count: int, scale: float) -> int:
+def _grey_level(count: int, scale: float) -> np.uint8:
     return np.uint8(min(255.0, np.floor(255.0 * count / scale)))

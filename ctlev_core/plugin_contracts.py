@@ -147,11 +147,15 @@ class Encoding(Protocol):
     Options: type[Frozen]
 
     def encode(self, events: Events, windows: np.ndarray, options: Any) -> np.ndarray:
-        """[N, C, H, W] of the event index ranges `windows` [N, 2] int64: uint16 counts, or float32."""
+        """[N, C, H, W] of the event index ranges `windows` [N, 2] int64: uint16 counts, or float32.
+
+        At `image_geometry.count_size`: in pixels of the sensor, or with resampling `events` in those of the image. N
+        may be 0, which tells how many windows fit into memory.
+        """
         ...
 
     def render_image(self, histogram: np.ndarray, options: Any) -> np.ndarray:
-        """Images [N, H, W, 3] uint8 of the counts."""
+        """Images [N, image height, image width, 3] uint8 of the counts."""
         ...
 
     def map_points(self, points: np.ndarray, sensor_size: SensorSize, options: Any) -> np.ndarray:

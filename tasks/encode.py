@@ -276,8 +276,8 @@ def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iter
 
 def _windows_at_once(plugin: plugins.Plugin, sensor_size: tuple[int, int]) -> int:
     """How many windows are encoded together: few of a large sensor."""
-    columns = (np.zeros(0, dtype) for dtype in (np.int64, np.uint16, np.uint16, np.uint8))
-    none = plugin.module.encode(Events(*columns, sensor_size), np.zeros((0, 2), np.int64), plugin.options)
+    t, x, p = (np.zeros(0, dtype) for dtype in (np.int64, np.uint16, np.uint8))
+    none = plugin.module.encode(Events(t, x, x, p, sensor_size), np.zeros((0, 2), np.int64), plugin.options)
     window_bytes = math.prod(none.shape[1:]) * none.itemsize
     return min(max(BLOCK_BYTES // max(window_bytes, 1), 1), MAX_WINDOWS)
 

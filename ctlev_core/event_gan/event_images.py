@@ -74,7 +74,8 @@ def check_event_images(frames: np.ndarray, pairs: np.ndarray, where: str) -> Pal
 def one_event_value(frames: np.ndarray) -> float:
     """The value in (0, 1] that one event has in event images: the median over images of the smallest value above 0.
 
-    The encodings scale every window by itself, so that there is no one value for all.
+    The encodings scale every window by itself, so that there is no one value for all. Images that are averages over
+    areas have values far below that of an event; so may those that are made, and hardly any is drawn by lot then.
     """
     smallest = [int(image[image > 0].min()) for image in frames if image.any()]
     return float(np.median(smallest)) / 255

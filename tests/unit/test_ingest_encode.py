@@ -33,8 +33,9 @@ def make_events(seed):
     )
 
 
-def make_dataset(*, images=False, windows=None):
-    """A dataset module of two recordings; finished event images in the place of events on demand."""
+def make_dataset(*, images=False, windows=None, release=None):
+    """A dataset module of two recordings; finished event images, or those of `release`, in the place of events."""
+    images = images or release is not None
 
     class Options(Frozen):
         """None."""
@@ -71,7 +72,7 @@ def make_dataset(*, images=False, windows=None):
         list_recordings=list_recordings,
         read_events=lambda recording, options: make_events(len(recording.recording_id)),
         read_labels=read_labels,
-        read_event_images=read_track,
+        read_event_images=read_track if release is None else lambda recording, options: release,
         read_intensity_frames=read_track,
     )
     if windows is not None:
@@ -125,6 +126,37 @@ def test_finished_event_images_become_frames_with_the_labels_of_their_moment(fra
     assert (frames.array("frames")[:3, 6:8, 4:6] == 255).all(), "averaging must not leave sparse images dim"
     assert frames.labels.joints2d is not None
     np.testing.assert_allclose(frames.labels.joints2d[:3, 0], [[4.0, 6.0], [4.5, 6.5], [5.0, 7.0]])
+
+
+@pytest.mark.parametrize("side", [16, 64, 100])
+def test_the_raw_and_the_released_layout_of_a_recording_give_the_same_frames(frames_of, side):
+    """As DHP19: the release holds the counts of each window, three standard deviations of them being white."""
+    windows = Windows(num_events=25)
+    _, at_sensor = frames_of(make_dataset(), windows=windows, polarity=False)
+    rows = at_sensor.rows_where(split="train")
+    release = ImageTrack(at_sensor.array("frames")[rows][..., 0].copy(), np.arange(len(rows), dtype=np.int64))
+    options = {"polarity": False, "image_size": (side, side)}
+    _, raw = frames_of(make_dataset(), windows=windows, **options)
+    _, released = frames_of(make_dataset(release=release), windows=windows, **options)
+    found = released.array("frames")[released.rows_where(split="train")]
+    np.testing.assert_array_equal(found, raw.array("frames")[raw.rows_where(split="train")])
+    assert found.any(axis=(1, 2, 3)).all() and raw.array("histograms").shape[2:] == (24, 32)
+
+
+def test_counts_of_sensors_of_different_sizes_lie_in_the_corner_of_the_largest(frames_of):
+    module, smaller = make_dataset(), make_events(3)
+    inside = (smaller.x < 20) & (smaller.y < 10)
+    columns = (getattr(smaller, name)[inside] for name in ("t", "x", "y", "p"))
+    small = Events(*columns, (20, 10))
+    module.read_events = lambda recording, options: small if recording.parts[0].split == "test" else make_events(1)
+    with pytest.raises(DataError, match="sensors differ in size"):
+        frames_of(module, windows=Windows(num_events=5))
+    _, frames = frames_of(module, windows=Windows(num_events=5), image_size=(16, 16))
+    histograms = frames.array("histograms")
+    tested = frames.rows_where(split="test")
+    assert histograms.shape[2:] == (24, 32) and frames.array("frames").shape[1:] == (16, 16, 3)
+    assert not histograms[tested][:, :, 10:].any() and not histograms[tested][..., 20:].any()
+    assert histograms.sum(axis=(1, 2, 3)).tolist() == [5] * len(frames)
 
 
 def test_finished_event_images_have_no_polarity(frames_of):

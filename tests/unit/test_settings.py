@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from ctlev_core import plugins
 from ctlev_core.encodings import event_histogram
 from ctlev_core.image_gate import GatedImages
+from ctlev_core.plugins import PluginError
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
 from data_contracts.errors import DataError
@@ -19,8 +20,9 @@ from data_contracts.experiment import Experiment
 from data_contracts.labels import Labels
 from flows.command_line import PRESETS, load_preset
 from flows.full_experiment import full_experiment
+from flows.inputs import check_inputs
 from tasks.evaluate import _groups_by_origin, _others
-from tasks.sample import _rounded
+from tasks.sample import _check_rounding, _rounded
 from tasks.stage import Output, call_flow, planning
 from tasks.subset import take_faithful, take_share
 
@@ -173,6 +175,34 @@ def test_rounded_frames_show_whole_counts():
 def test_only_event_histograms_can_be_rounded_to_counts():
     with pytest.raises((DataError, ValidationError, ValueError), match="round_to_counts needs encoding"):
         smoke("round_to_counts=true", "encoding={name: voxel_grid}")
+
+
+AREA = "encoding={name: event_histogram, options: {polarity: false, image_size: [32, 32]}}"
+EVENTS = "encoding={name: event_histogram, options: {polarity: false, image_size: [32, 32], resampling: events}}"
+
+
+@pytest.mark.parametrize("asked", ["round_to_counts=true", "export={}"])
+def test_images_without_whole_counts_are_refused_before_anything_runs(asked):
+    what = asked.partition("=")[0]
+    with pytest.raises(
+        PluginError, match=rf"{what} needs whole counts .* 32 x 32 px .* 64 x 64 px: .*resampling=events"
+    ):
+        check_inputs(smoke(asked, AREA))
+    check_inputs(smoke(asked, EVENTS))
+    check_inputs(smoke(asked))
+    check_inputs(smoke(asked, AREA.replace("32", "64")))
+    check_inputs(smoke(AREA))
+
+
+def test_frames_without_whole_counts_are_refused_before_they_are_sampled():
+    arrays = {"histograms": np.zeros((2, 1, 24, 24), np.uint16), "frames": np.zeros((2, 16, 16, 3), np.uint8)}
+    ref = SimpleNamespace(path="frames")
+    manifest = SimpleNamespace(array=arrays.__getitem__, column=lambda name: [3, 0], ref=ref)
+    with pytest.raises(DataError, match="round_to_counts needs whole counts"):
+        _check_rounding(manifest)
+    arrays["frames"] = np.zeros((2, 24, 24, 3), np.uint8)
+    with pytest.raises(DataError, match="round_to_counts needs event counts"):
+        _check_rounding(manifest)
 
 
 def test_groups_by_origin_part_the_test_rows():
