@@ -161,7 +161,7 @@ def read_picture(path: Path) -> np.ndarray:
     if picture is None or picture.size == 0:
         raise DataError(f"{path}: cannot be read as a picture")
     if picture.dtype == np.uint16:
-        picture = (picture >> 8).astype(np.uint8)
+        picture = np.right_shift(picture, 8).astype(np.uint8)
     if picture.dtype != np.uint8:
         raise DataError(f"{path}: expected 8 or 16 bits a channel, got {picture.dtype}")
     if picture.ndim == 2:
@@ -242,13 +242,13 @@ def _open_npz(path: Path, class_names: Sequence[str]) -> LabelledPictures:
 
 
 def _open_idx(root: Path, class_names: Sequence[str]) -> LabelledPictures:
-    arrays = []
+    arrays: list[np.ndarray] = []
     for name, magic in ((IDX_IMAGES, 0x803), (IDX_LABELS, 0x801)):
         path = _idx_file(root, name)
         if path is None:
             raise DataError(f"{root}: expected {name} beside the other file; {EXPECTED}")
         arrays.append(_read_idx(path, magic))
-    return _checked(*arrays, class_names, str(root))
+    return _checked(arrays[0], arrays[1], class_names, str(root))
 
 
 def _idx_file(root: Path, name: str) -> Path | None:
@@ -290,7 +290,8 @@ def _checked(images: np.ndarray, labels: np.ndarray, class_names: Sequence[str],
         raise DataError(f"{where}: labels must be names, or numbers from 0 on, got {labels.dtype}")
     if class_names and len(labels) and labels.max() >= len(class_names):
         raise DataError(f"{where}: label {labels.max()} has no name; class_names has {len(class_names)}")
-    return LabelledPictures(tuple(class_names[n] if class_names else str(n) for n in labels.tolist()), images)
+    numbers: list[int] = labels.tolist()
+    return LabelledPictures(tuple(class_names[number] if class_names else str(number) for number in numbers), images)
 
 
 def _known(classes: Sequence[str]) -> str:
