@@ -153,8 +153,12 @@ def simulate(
 
     A generator that can be calibrated is, on the training recordings; `calibration.json` says with what result.
     """
-    plugin = _calibrated(plugins.load_options(sampling), recordings, conditions, out)
-    size = sensor_size_of(recordings)
+    plugin, size = plugins.load_options(sampling), sensor_size_of(recordings)
+    try:
+        plugin.module.sample_events(conditions_of(conditions).take(slice(0, 1)), size, plugin.options, seeds=[0])
+    except ValueError as error:  # the conditions are of another kind: said before anything is simulated
+        raise DataError(f"{conditions.ref.path}: {error}") from error
+    plugin = _calibrated(plugin, recordings, conditions, out)
     asked = _Simulation(conditions.ref, size, sampling, plugin.options, encoding, windows, out.work)
     gate, count = gate_of(frames), len(conditions)
     seeds, causes = row_seeds(seed, count), []
@@ -229,10 +233,7 @@ def _simulate_shard(asked: _Simulation, shard: _Shard) -> Path:
     conditions, durations_us = _conditions_with_durations(asked.conditions.path, asked.conditions.digest)
     rows = slice(shard.start, shard.start + len(shard.seeds))
     part = conditions.take(rows)
-    try:
-        simulated = plugin.module.sample_events(part, asked.sensor_size, asked.options, seeds=shard.seeds)
-    except ValueError as error:
-        raise DataError(f"{asked.conditions.path}: {error}") from error
+    simulated = plugin.module.sample_events(part, asked.sensor_size, asked.options, seeds=shard.seeds)
     moments_us = None if part.motions is None else part.motions.moment_us
     frames = _encode(simulated, moments_us, durations_us[rows], asked.windows, encoder)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")

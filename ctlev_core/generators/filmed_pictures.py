@@ -248,7 +248,7 @@ def _film(image: np.ndarray, row: int, sensor_size: SensorSize, options: SampleO
     start_px = np.array(options.centre_px) + np.array(sensor_size) / 2 + rng.normal(0, options.centre_jitter_px, 2)
     side_px = options.picture_share * min(sensor_size)
     light, background = _light(image, options)
-    kind, maps = _sensor(sensor_size, options)
+    kind, maps = _sensor(sensor_size, options)  # pyright: ignore[reportArgumentType]  # frozen models have a hash
     sensor = Sensor(
         sensor_size,
         kind,
