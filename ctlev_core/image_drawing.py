@@ -6,8 +6,8 @@
     -> contrast, where the image is smaller
     -> grey levels of the image
 
-The first step is what authors did who release finished event images: those begin at the second, so that a recording and
-the release made of it give the same images. Averages over several pixels dim sparse images; the normalisation, once
+Event images that come finished begin at the second step: a recording, and a release that its authors made with the same
+normalisation, give the same images. Averages over several pixels dim sparse images; the normalisation, once
 more, makes them visible again. In an image of the sensor's size the levels are those of the first step; in a larger one
 they are spread, not changed.
 """
