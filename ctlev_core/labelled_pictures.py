@@ -29,7 +29,7 @@ from ctlev_core.image_moves import Moves, move_image
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 
-Style = Literal["photo", "grey", "lines", "coloured lines"]
+Style = Literal["photo", "grey", "lines", "coloured lines", "motion"]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 IDX_IMAGES, IDX_LABELS = "train-images-idx3-ubyte", "train-labels-idx1-ubyte"
 MAX_BYTES = 4 * 2**30
@@ -68,8 +68,9 @@ class PictureOptions(PictureSource, Moves):
         default_factory=dict, description="further names of a class, of which captions take one at random"
     )
     styles: dict[Style, float] = Field(
-        default={"photo": 0.3, "lines": 0.7},
-        description="shares of the styles that pictures are shown in; an event camera sees outlines",
+        default={"photo": 0.2, "lines": 0.2, "motion": 0.6},
+        description="shares of the styles that pictures are shown in: as they are, as outlines, or as what changes "
+        "while they move in three random directions one after the other (red, green, blue); an event camera sees that",
     )
     bare_caption_share: float = Field(
         default=0.5, ge=0, le=1, description="captions that say the name and not the style"
