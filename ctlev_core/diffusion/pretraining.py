@@ -24,6 +24,7 @@ from ctlev_core.diffusion import procedural_images
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.picture_scenes import picture_diet, scene_of
+from ctlev_core.diffusion.picture_styles import DEFAULT_DIET, Diet, Scene, apply_style
 from ctlev_core.diffusion.prior import (
     Prior,
     conditions_to_tensor,
@@ -48,7 +49,7 @@ FIT_IMAGES = 384
 VALIDATION_IMAGES = 128
 VALIDATION_OFFSET = 2**31
 VALIDATION_STREAM, STYLE_STREAM, PICTURE_STREAM = 1, 2, 3  # entropy that keeps the random streams apart
-DrawScene = Callable[[np.random.Generator, int], procedural_images.Scene]
+DrawScene = Callable[[np.random.Generator, int], Scene]
 
 logger = logging.getLogger(__name__)
 
@@ -84,8 +85,8 @@ class PretrainingOptions(Frozen):
         description="U-Net and ControlNet together, a ControlNet for the U-Net of `start` alone, or a U-Net without "
         "ControlNet",
     )
-    diet: procedural_images.Diet = Field(
-        default=procedural_images.DEFAULT_DIET,
+    diet: Diet = Field(
+        default=DEFAULT_DIET,
         description="what procedural pictures are of",
     )
     pictures: PictureOptions = Field(
@@ -147,7 +148,7 @@ class ImageStream:
             ProcessPoolExecutor(options.workers, get_context("spawn"), die_with_parent) if options.workers else None
         )
         self._ahead: dict[int, Future] = {}
-        self._block: tuple[int, list[procedural_images.Scene]] = (-1, [])
+        self._block: tuple[int, list[Scene]] = (-1, [])
 
     def close(self) -> None:
         """Stop drawing."""
@@ -164,14 +165,14 @@ class ImageStream:
         rng = np.random.default_rng([options.seed, STYLE_STREAM, number])
         batch = []
         for row in rows:
-            image, caption = procedural_images.apply_style(scenes[row], rng, diet_of(options))
+            image, caption = apply_style(scenes[row], rng, diet_of(options))
             condition = scenes[row].condition
             steered = condition is not None and rng.random() >= options.condition_dropout
             caption = "" if rng.random() < options.text_dropout else caption
             batch.append(Row(image, caption, condition if steered else None))
         return make_batch(self._prior, batch)
 
-    def _scenes(self, block: int) -> list[procedural_images.Scene]:
+    def _scenes(self, block: int) -> list[Scene]:
         if self._block[0] != block:
             options = self._options
             if self._pool is None:
@@ -184,7 +185,7 @@ class ImageStream:
         return self._block[1]
 
 
-def draw_block(options: PretrainingOptions, block: int) -> list[procedural_images.Scene]:
+def draw_block(options: PretrainingOptions, block: int) -> list[Scene]:
     """The scenes of a block: procedural ones, or pictures of the user's, each moved about anew."""
     if options.pictures.root is None:
         return procedural_images.draw_block(
@@ -199,7 +200,7 @@ def draw_block(options: PretrainingOptions, block: int) -> list[procedural_image
     return [scene_of(pictures, int(row), *wanted, rng) for row, rng in zip(rows, streams, strict=True)]
 
 
-def diet_of(options: PretrainingOptions) -> procedural_images.Diet:
+def diet_of(options: PretrainingOptions) -> Diet:
     """Styles and captions: those of the user's pictures where there are any."""
     return options.diet if options.pictures.root is None else picture_diet(options.pictures)
 
@@ -229,7 +230,7 @@ def draw_picture_rows(options: PretrainingOptions) -> list[Row]:
     for number, row in enumerate(split_pictures(len(pictures), options.seed)[1]):
         rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + number])
         scene = scene_of(pictures, int(row), options.pictures, options.image_size, rng)
-        image, caption = procedural_images.apply_style(scene, rng, diet_of(options))
+        image, caption = apply_style(scene, rng, diet_of(options))
         rows.append(Row(image, caption, None))
     return rows
 
@@ -240,7 +241,7 @@ def draw_validation_rows(options: PretrainingOptions, draw: DrawScene) -> list[R
     for index in range(VALIDATION_IMAGES):
         rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + index])
         scene = draw(rng, options.image_size)
-        image, caption = procedural_images.apply_style(scene, rng, options.diet)
+        image, caption = apply_style(scene, rng, options.diet)
         rows.append(Row(image, caption, scene.condition))
     return rows
 
@@ -259,10 +260,10 @@ def new_prior(options: PretrainingOptions) -> Prior:
     corpus = procedural_images.caption_corpus()
     if options.pictures.root is None:
         scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
-        images = np.stack([procedural_images.apply_style(scene, rng)[0] for scene in scenes])
+        images = np.stack([apply_style(scene, rng)[0] for scene in scenes])
     else:
         scenes = draw_block(options.model_copy(update={"block_scenes": FIT_IMAGES}), 0)
-        images = np.stack([procedural_images.apply_style(scene, rng, diet_of(options))[0] for scene in scenes])
+        images = np.stack([apply_style(scene, rng, diet_of(options))[0] for scene in scenes])
         classes = labelled_pictures.open_pictures(options.pictures).classes
         # Often enough that every name becomes a word of its own.
         corpus = corpus + 40 * [name.replace("_", " ") for name in classes] + 40 * _synonyms(options)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core.diffusion import procedural_images
+from ctlev_core.diffusion import picture_styles, procedural_images
 from ctlev_core.diffusion.denoising import NoiseSchedule, generator_for
 from ctlev_core.diffusion.pretraining import Row, make_batch
 from ctlev_core.diffusion.prior import load_prior
@@ -13,7 +13,7 @@ from ctlev_core.generators import stable_diffusion
 from ctlev_core.render.object_drawing import draw_object
 from ctlev_core.render.objects import NAMES, OBJECTS
 
-LINES = procedural_images.Diet(styles={"lines": 1.0})
+LINES = picture_styles.Diet(styles={"lines": 1.0})
 NOUNS = tuple(NAMES)
 
 
@@ -28,8 +28,8 @@ def drawings(seed):
     for index, noun in enumerate(2 * NOUNS):
         rng = np.random.default_rng([seed, index])
         picture = draw_object(noun, "white", np.full((64, 64, 3), 8, np.uint8), rng, procedural_images.THING_SIZE)
-        scene = procedural_images.Scene(picture, None, noun, f"white {noun}")
-        rows.append(procedural_images.apply_style(scene, rng, LINES)[0])
+        scene = picture_styles.Scene(picture, None, noun, f"white {noun}")
+        rows.append(picture_styles.apply_style(scene, rng, LINES)[0])
     return rows
 
 

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from ctlev_core.body.motions import HELD_OUT
-from ctlev_core.diffusion import pretraining, procedural_images
+from ctlev_core.diffusion import picture_styles, pretraining, procedural_images
+from ctlev_core.diffusion.picture_styles import Diet
 from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
 from ctlev_core.diffusion.prior import encode_prompts, load_prior
-from ctlev_core.diffusion.procedural_images import Diet
 from ctlev_core.diffusion.small_prior import WORD_GAIN, learn_merges, train_tokenizer
 from ctlev_core.diffusion.training_options import TrainingOptions
 from ctlev_core.render.compositions import RELATIONS, parse_composition
@@ -102,7 +102,7 @@ def test_captions_name_what_is_seen_and_the_tokenizer_knows_their_words():
     tokenizer = new_prior(TINY).tokenizer
     rng = np.random.default_rng(0)
     for scene in procedural_images.draw_block(0, 0, 40, 16):
-        image, caption = procedural_images.apply_style(scene, rng)
+        image, caption = picture_styles.apply_style(scene, rng)
         assert image.dtype == np.uint8 and image.shape == (16, 16, 3)
         if scene.condition is None:
             assert scene.plain in caption or scene.coloured in caption
@@ -185,7 +185,7 @@ def test_captions_call_things_by_their_other_names_and_pictures_stay_the_same():
 
     def styled(share):
         return [
-            procedural_images.apply_style(
+            picture_styles.apply_style(
                 scene, np.random.default_rng(index), Diet(styles={"lines": 1.0}, other_names_share=share)
             )
             for index, scene in enumerate(scenes)

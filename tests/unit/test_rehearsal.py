@@ -8,7 +8,7 @@ import torch
 from pydantic import ValidationError
 from tiny_prior import SIDE, make_data, make_prior
 
-from ctlev_core.diffusion import finetuning, pretraining, procedural_images
+from ctlev_core.diffusion import finetuning, picture_styles, pretraining
 from ctlev_core.diffusion.finetuning import fine_tune, move_frames
 from ctlev_core.diffusion.picture_scenes import Rehearsal
 from ctlev_core.diffusion.pretraining import PretrainingOptions, draw_block, pretrain, split_pictures
@@ -113,7 +113,7 @@ def test_pictures_held_back_are_never_learnt_from(pictures):
     assert len(held_back) == 4 and sorted([*learnt, *held_back]) == list(range(40))
     options = TINY.model_copy(update={"pictures": pictures})
     block = draw_block(options, 1)
-    assert len(block) == 8 and all(isinstance(scene, procedural_images.Scene) for scene in block)
+    assert len(block) == 8 and all(isinstance(scene, picture_styles.Scene) for scene in block)
     assert np.array_equal(block[2].image, draw_block(options, 1)[2].image)
     assert not np.array_equal(block[2].image, draw_block(options, 2)[2].image)
 
