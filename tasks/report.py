@@ -19,6 +19,7 @@ from ctlev_core.report import pictures
 from ctlev_core.report.contact_sheet import contact_sheet_sections
 from ctlev_core.report.copies import copy_sections
 from ctlev_core.report.costs import cost_table, options_table, versions_table
+from ctlev_core.report.data_split import told_split
 from ctlev_core.report.distances import floor_tables
 from ctlev_core.report.html import Curves, Folded, Section, render_report
 from ctlev_core.report.nearest_classes import nearest_sections
@@ -48,7 +49,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=14, schema=tables.REPORT)
+@stage(version=15, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -78,6 +79,8 @@ def report(
     several sets of one name the first is shown. `more_real` are other real frames of the moments asked for, `target`
     those of another dataset that was tested on, `nearest` what of the training set is most like its classes.
     """
+    if target is None:  # whose recordings are others
+        notice = f"{notice} {told_split(recordings.column('splits'))}".strip()
     shown = dict(reversed(list(zip(generator_names, generated, strict=True))))
     shown = {name: shown[name] for name in dict.fromkeys(generator_names)}
     records = read_records(
