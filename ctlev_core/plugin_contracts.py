@@ -342,6 +342,16 @@ class DownstreamOfSequences(Downstream, Protocol):
         ...
 
 
+class DownstreamOfRecordings(Downstream, Protocol):
+    """A model that learns from single frames, and whose answers about the frames of a recording may be joined."""
+
+    def predict_recordings(
+        self, model: Path, frames: np.ndarray, recordings: Sequence[str]
+    ) -> Mapping[str, np.ndarray]:
+        """As `predict`, with the recording of each row; still one row a frame."""
+        ...
+
+
 class DownstreamWithFiles(Downstream, Protocol):
     """A model that starts from weights of its own from outside the store."""
 

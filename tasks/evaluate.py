@@ -80,9 +80,7 @@ def score_model(
     if len(rows) == 0:
         raise DataError(f"{data.ref.path}: no rows in split {split!r} to score on")
     _refuse_overlap(data, rows, training_sets, split)
-    predict = plugin.module.predict
-    if hasattr(plugin.module, "predict_sequences"):
-        predict = partial(plugin.module.predict_sequences, recordings=name_recordings(data, rows))
+    predict = _predict_of(plugin.module, data, rows)
     prediction = predict(model.ref.path / "model", np.asarray(data.array("frames")[rows]))
     labels = data.labels.take(rows)
     if setting.startswith(SHUFFLED):
@@ -128,6 +126,15 @@ def score_model(
     if sample_scores:
         out.write_table(pa.concat_tables(sample_scores), tables.SAMPLE_SCORES)
     return pa.Table.from_pylist(found, schema=tables.SCORES.arrow())
+
+
+def _predict_of(module: Any, data: Manifest, rows: np.ndarray) -> Any:
+    """The function that predicts for frames: told which of them follow one another, or belong together, if it asks."""
+    if hasattr(module, "predict_sequences"):
+        return partial(module.predict_sequences, recordings=name_recordings(data, rows))
+    if hasattr(module, "predict_recordings"):
+        return partial(module.predict_recordings, recordings=np.array(data.column("recording_id"))[rows].tolist())
+    return module.predict
 
 
 def _of_samples(

@@ -151,7 +151,7 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
     return {"probability": probability.reshape(len(frames), len(classes)), "classes": classes}
 
 
-def predict_sequences(model: Path, frames: np.ndarray, *, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+def predict_recordings(model: Path, frames: np.ndarray, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
     """As `predict`; a classifier trained with `by_recording` gives all N frames of a recording their mean.
 
     Args:

@@ -79,7 +79,7 @@ def test_small_classifier_learns_and_gives_features(trained):
 def test_frames_of_a_recording_share_their_mean_probability(trained):
     frames, _ = training_frames()
     alone = classifier.predict(trained, frames)["probability"]
-    together = classifier.predict_sequences(trained, frames, recordings=["r", "r", "s", "r", "s", "t"])["probability"]
+    together = classifier.predict_recordings(trained, frames, recordings=["r", "r", "s", "r", "s", "t"])["probability"]
     for rows in ([0, 1, 3], [2, 4], [5]):
         np.testing.assert_allclose(together[rows], np.repeat(alone[rows].mean(axis=0)[None], len(rows), 0), atol=1e-6)
 
