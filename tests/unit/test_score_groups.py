@@ -63,6 +63,7 @@ def score(tmp_path, monkeypatch):
         return {"classes": np.array(["a", "b"]), "probability": np.eye(2)[np.arange(len(frames)) % 2]}
 
     monkeypatch.setattr(classifier, "predict", predict)
+    monkeypatch.delattr(classifier, "predict_recordings")
 
     def run(data, *training_sets):
         table = score_model.function(
