@@ -19,10 +19,10 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
 from ctlev_core.dataset_files.trees import check_inside, list_folder
 from ctlev_core.image_moves import Moves, move_image
@@ -30,6 +30,16 @@ from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 
 Style = Literal["photo", "grey", "lines", "coloured lines", "motion"]
+
+
+def _check_sum(styles: dict[Style, float]) -> dict[Style, float]:
+    if abs(sum(styles.values()) - 1) > 1e-6:
+        raise ValueError(f"the shares of styles must sum to 1, got {sum(styles.values()):g}")
+    return styles
+
+
+StyleShares = Annotated[dict[Style, Annotated[float, Field(ge=0)]], AfterValidator(_check_sum)]
+"""How often pictures are shown in each style."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 IDX_IMAGES, IDX_LABELS = "train-images-idx3-ubyte", "train-labels-idx1-ubyte"
 MAX_BYTES = 4 * 2**30
@@ -67,7 +77,7 @@ class PictureOptions(PictureSource, Moves):
     synonyms: dict[str, list[str]] = Field(
         default_factory=dict, description="further names of a class, of which captions take one at random"
     )
-    styles: dict[Style, float] = Field(
+    styles: StyleShares = Field(
         default={"photo": 0.2, "lines": 0.2, "motion": 0.6},
         description="shares of the styles that pictures are shown in: as they are, as outlines, or as what changes "
         "while they move in three random directions one after the other (red, green, blue); an event camera sees that",
@@ -78,13 +88,6 @@ class PictureOptions(PictureSource, Moves):
     shift: float = Field(default=0.08, ge=0, le=0.5, description="as a share of the side, along each axis")
     turn_deg: float = Field(default=8.0, ge=0, le=180, description="either way, about the centre")
     scale: float = Field(default=0.1, ge=0, lt=1, description="so much larger or smaller")
-
-    @field_validator("styles")
-    @classmethod
-    def _shares_sum_to_one(cls, styles: dict[Style, float]) -> dict[Style, float]:
-        if min(styles.values(), default=0) < 0 or abs(sum(styles.values()) - 1) > 1e-6:
-            raise ValueError(f"the shares of styles must not be negative and sum to 1, got {styles}")
-        return styles
 
 
 @dataclass(frozen=True, eq=False)
