@@ -2,9 +2,9 @@
 
 Event images are mostly isolated single pixels on a flat background. Autoencoders trained for minutes blur them away
 (with 8 channels a learned one kept 14 % of a single pixel's brightness), and what the code loses no generator can put
-back. This code loses nothing: each 4 x 4 block of pixels goes through an orthonormal colour transform and an
-orthonormal two-dimensional DCT, which gives 48 latent channels at a quarter of the resolution. All channels have one
-scale, so that errors and noise weigh as much in latents as in pixels. Channels whitened half-way over the pre-training
+back. This code loses nothing: each block of 4 x 4 pixels (or 2 x 2, or 1) goes through an orthonormal colour transform
+and an orthonormal two-dimensional DCT, which gives 48 latent channels at a quarter of the resolution (12 at half of it,
+3 at the whole). All channels have one scale, so that errors and noise weigh as much in latents as in pixels. Channels whitened half-way over the pre-training
 images were worse: event images are sharper than pictures, and in grey ones the highest frequency then had five times
 the variance of the mean brightness, which left the U-Net with noise to learn before shapes.
 """
@@ -12,6 +12,7 @@ the variance of the mean brightness, which left the U-Net with noise to learn be
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from diffusers.configuration_utils import ConfigMixin, register_to_config
@@ -20,6 +21,7 @@ from diffusers.models.modeling_outputs import AutoencoderKLOutput
 from diffusers.models.modeling_utils import ModelMixin
 
 PATCH_PX = 4
+"""Edge of a block of the bundled models."""
 LATENT_CHANNELS = 3 * PATCH_PX**2
 
 # Rows: luminance, red - blue, (red + blue) - 2 green. Red and blue are the two polarities of an event image.
@@ -39,13 +41,13 @@ def dct_matrix(size: int) -> torch.Tensor:
     return matrix
 
 
-def patch_basis() -> torch.Tensor:
-    """Orthonormal analysis matrix [48, 48] float64.
+def patch_basis(patch_px: int = PATCH_PX) -> torch.Tensor:
+    """Orthonormal analysis matrix [3 p^2, 3 p^2] float64 of blocks of p x p pixels.
 
     Input order is that of `pixel_unshuffle` (colour, row, column); output order is (opponent colour, vertical
     frequency, horizontal frequency).
     """
-    dct = dct_matrix(PATCH_PX)
+    dct = dct_matrix(patch_px)
     colour = torch.tensor(_OPPONENT, dtype=torch.float64)
     return torch.kron(colour, torch.kron(dct, dct))
 
@@ -57,7 +59,7 @@ class DeltaDistribution:
         self.mean = mean
 
     def mode(self) -> torch.Tensor:
-        """The mean, [N, 48, H / 4, W / 4]."""
+        """The mean, [N, C, h, w]."""
         return self.mean
 
     def sample(self, generator: torch.Generator | None = None) -> torch.Tensor:
@@ -66,13 +68,14 @@ class DeltaDistribution:
 
 
 class PatchAutoencoder(ModelMixin, ConfigMixin):
-    """Orthonormal 4 x 4 DCT of opponent colours; nothing is trained, nothing is lost.
+    """Orthonormal DCT of blocks of p x p pixels in opponent colours; nothing is trained, nothing is lost.
 
     Args:
-        channel_mean: 48 means of the coefficients over the pre-training images; empty = zeros.
+        channel_mean: 3 p^2 means of the coefficients over the pre-training images; empty = zeros.
         scaling_factor: multiplies the latents in the pipeline so that their overall standard deviation is 1.
-        latent_channels: fixed at 48; in the config because pipelines and checks read it there.
-        block_out_channels: only the length matters: pipelines take 2 ** (length - 1) = 4 as the down-sampling factor.
+        latent_channels: 3 p^2; in the config because pipelines and checks read it there.
+        block_out_channels: only the length matters: pipelines take 2 ** (length - 1), here p, as the down-sampling
+            factor.
     """
 
     @register_to_config
@@ -86,15 +89,16 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
         force_upcast: bool = False,
     ) -> None:
         super().__init__()
-        mean = torch.tensor(channel_mean or (0.0,) * LATENT_CHANNELS, dtype=torch.float64)
-        if mean.shape != (LATENT_CHANNELS,) or not bool(torch.isfinite(mean).all()):
-            raise ValueError(f"channel_mean must hold {LATENT_CHANNELS} finite numbers, got {mean.tolist()}")
-        if latent_channels != LATENT_CHANNELS or 2 ** (len(block_out_channels) - 1) != PATCH_PX:
+        self.patch_px = 2 ** max(len(block_out_channels) - 1, 0)
+        if latent_channels != 3 * self.patch_px**2:
             raise ValueError(
-                f"the patch code has {LATENT_CHANNELS} channels and factor {PATCH_PX}, "
-                f"got latent_channels {latent_channels} and block_out_channels {block_out_channels}"
+                f"a patch code of factor {self.patch_px}, as {len(block_out_channels)} block_out_channels say, has "
+                f"{3 * self.patch_px**2} channels, got latent_channels {latent_channels}"
             )
-        basis = patch_basis()
+        mean = torch.tensor(channel_mean or (0.0,) * latent_channels, dtype=torch.float64)
+        if mean.shape != (latent_channels,) or not bool(torch.isfinite(mean).all()):
+            raise ValueError(f"channel_mean must hold {latent_channels} finite numbers, got {mean.tolist()}")
+        basis = patch_basis(self.patch_px)
         # Persistent, although derived from the config: a weights file without tensors cannot be loaded.
         self.register_buffer("analysis", basis.float())
         self.register_buffer("offset", mean.float())
@@ -103,16 +107,18 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
         """Latents of images.
 
         Args:
-            x: [N, 3, H, W] in [-1, 1]; H and W multiples of 4.
+            x: [N, 3, H, W] in [-1, 1]; H and W multiples of p.
             return_dict: False returns a tuple, as in diffusers.
         Returns:
-            An object whose `latent_dist.mean` is [N, 48, H / 4, W / 4], not yet multiplied by `scaling_factor`.
+            An object whose `latent_dist.mean` is [N, 3 p^2, H / p, W / p], not yet multiplied by `scaling_factor`.
         Raises:
             ValueError: wrong shape.
         """
-        if x.ndim != 4 or x.shape[1] != 3 or x.shape[2] % PATCH_PX or x.shape[3] % PATCH_PX:
-            raise ValueError(f"images must be [N, 3, H, W] with H and W multiples of {PATCH_PX}, got {tuple(x.shape)}")
-        patches = torch.nn.functional.pixel_unshuffle(x, PATCH_PX)
+        if x.ndim != 4 or x.shape[1] != 3 or x.shape[2] % self.patch_px or x.shape[3] % self.patch_px:
+            raise ValueError(
+                f"images must be [N, 3, H, W] with H and W multiples of {self.patch_px}, got {tuple(x.shape)}"
+            )
+        patches = torch.nn.functional.pixel_unshuffle(x, self.patch_px)
         mean = torch.einsum("kc,nchw->nkhw", self.analysis, patches) - self.offset[:, None, None]
         posterior = DeltaDistribution(mean)
         return AutoencoderKLOutput(latent_dist=posterior) if return_dict else (posterior,)  # pyright: ignore[reportArgumentType]
@@ -120,9 +126,9 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
     def decode(
         self, z: torch.Tensor, return_dict: bool = True, generator: torch.Generator | None = None
     ) -> DecoderOutput | tuple[torch.Tensor]:
-        """Images [N, 3, H, W] of latents [N, 48, H / 4, W / 4]; the exact inverse of `encode`, not clipped."""
+        """Images [N, 3, H, W] of latents [N, 3 p^2, H / p, W / p]; the exact inverse of `encode`, not clipped."""
         patches = torch.einsum("kc,nkhw->nchw", self.analysis, z + self.offset[:, None, None])
-        sample = torch.nn.functional.pixel_shuffle(patches, PATCH_PX)
+        sample = torch.nn.functional.pixel_shuffle(patches, self.patch_px)
         return DecoderOutput(sample=sample) if return_dict else (sample,)
 
     def forward(self, sample: torch.Tensor) -> torch.Tensor:
@@ -135,11 +141,12 @@ class PatchAutoencoder(ModelMixin, ConfigMixin):
         return self.analysis.dtype
 
 
-def fit_patch_autoencoder(images: torch.Tensor) -> PatchAutoencoder:
+def fit_patch_autoencoder(images: torch.Tensor, patch_px: int = PATCH_PX) -> PatchAutoencoder:
     """Measure mean and spread of the coefficients of images and return the code.
 
     Args:
         images: [N, 3, H, W] in [-1, 1], a few hundred of the images the prior will be trained on.
+        patch_px: edge of a block: 1, 2, 4, ...
     Returns:
         A code whose latents have standard deviation 1 after `scaling_factor`.
     Raises:
@@ -147,8 +154,13 @@ def fit_patch_autoencoder(images: torch.Tensor) -> PatchAutoencoder:
     """
     if len(images) == 0:
         raise ValueError("the patch code needs at least one image to measure its scale, got none")
-    raw = PatchAutoencoder().encode(images)[0].mode().double()
+    channels = 3 * patch_px**2
+    shape: dict[str, Any] = {
+        "latent_channels": channels,
+        "block_out_channels": (channels,) * patch_px.bit_length(),
+    }
+    raw = PatchAutoencoder(**shape).encode(images)[0].mode().double()
     variance, mean = torch.var_mean(raw, dim=(0, 2, 3))
     # Images all alike need a finite scale: no quieter than a tenth of a grey level of one pixel.
     spread = max(float(variance.mean().sqrt()), 0.1 * 2 / 255)
-    return PatchAutoencoder(tuple(mean.tolist()), 1 / spread)
+    return PatchAutoencoder(tuple(mean.tolist()), 1 / spread, **shape)

@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 from ctlev_core import labelled_pictures
 from ctlev_core.diffusion import procedural_images
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
-from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder
+from ctlev_core.diffusion.patch_autoencoder import PATCH_PX, PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.picture_scenes import picture_diet, scene_of
 from ctlev_core.diffusion.picture_styles import DEFAULT_DIET, Diet, Scene, apply_style
 from ctlev_core.diffusion.prior import (
@@ -95,6 +95,9 @@ class PretrainingOptions(Frozen):
     condition_dropout: float = Field(default=0.2, ge=0, le=1, description="share of people without their condition")
     image_size: int = Field(default=IMAGE_SIZE, gt=0, multiple_of=16, description="px")
     widths: tuple[int, ...] = Field(default=WIDTHS, description="channels of the U-Net, from the top resolution down")
+    patch_px: Literal[1, 2, 4] = Field(
+        default=PATCH_PX, description="edge of the blocks of pixels that are the latents; 1 = the pixels themselves"
+    )
     prediction_type: PredictionType = Field(
         default="v_prediction", description="what a U-Net that starts at random predicts; sample = the latents"
     )
@@ -267,7 +270,7 @@ def new_prior(options: PretrainingOptions) -> Prior:
         classes = labelled_pictures.open_pictures(options.pictures).classes
         # Often enough that every name becomes a word of its own.
         corpus = corpus + 40 * [name.replace("_", " ") for name in classes] + 40 * _synonyms(options)
-    vae: PatchAutoencoder = fit_patch_autoencoder(images_to_tensor(images))
+    vae: PatchAutoencoder = fit_patch_autoencoder(images_to_tensor(images), options.patch_px)
     prior = build_prior(
         corpus,
         vae,

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import torch
 
-from ctlev_core.diffusion.patch_autoencoder import LATENT_CHANNELS, PATCH_PX, PatchAutoencoder
+from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 from ctlev_core.diffusion.prior import Prior
 
 IMAGE_SIZE = 64
@@ -27,7 +27,7 @@ HEAD_CHANNELS = 32
 TEXT_CHANNELS = 64
 MAX_TOKENS = 24
 VOCABULARY = 1536
-CONDITION_WIDTHS = (16, 32, 64)  # two strided stages: 64 px conditions to 16 x 16 latents
+CONDITION_WIDTHS = (16, 32, 64)  # the last of them, one more than conditions are halved on their way to latents
 
 # The noise schedule of Stable Diffusion v1.4, but with beta_end 0.02 instead of 0.012. There the last step keeps 7 % of
 # the signal's amplitude, enough to read the brightness of the whole picture from 48 x 256 latents; sampling, which
@@ -171,9 +171,9 @@ def build_prior(
         fix_text_encoder(text_encoder, tokenizer)
         upper = len(widths) - 1  # a condition image says where; attention is needed at the lowest resolution only
         unet = UNet2DConditionModel(
-            sample_size=image_size // PATCH_PX,
-            in_channels=LATENT_CHANNELS,
-            out_channels=LATENT_CHANNELS,
+            sample_size=image_size // vae.patch_px,
+            in_channels=vae.config["latent_channels"],
+            out_channels=vae.config["latent_channels"],
             block_out_channels=widths,
             layers_per_block=1,
             down_block_types=(*("DownBlock2D",) * upper, "CrossAttnDownBlock2D"),
@@ -187,7 +187,7 @@ def build_prior(
             addition_embed_type="text",
             addition_embed_type_num_heads=TEXT_CHANNELS // HEAD_CHANNELS,
         )
-        controlnet = ControlNetModel.from_unet(unet, conditioning_embedding_out_channels=CONDITION_WIDTHS)
+        controlnet = ControlNetModel.from_unet(unet, conditioning_embedding_out_channels=CONDITION_WIDTHS[-vae.patch_px.bit_length() :])
         break_zeros(controlnet)
     scheduler_config = {**SCHEDULER_CONFIG, "prediction_type": prediction_type}
     return Prior(tokenizer, text_encoder, vae, unet, controlnet, scheduler_config, (image_size, image_size))
