@@ -20,7 +20,8 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     Each of a study's `experiments` `extends` a preset, changes whole options, and single ones under `set`, as
     `key=value`. There `{NAME}` stands for what the study's `paths` say of NAME, so that a folder that several
     experiments need is named once; one that is not given is looked for as `paths.NAME`. `{NAME?}` stands for a folder
-    that may be missing: it is null where that path is not given.
+    that may be missing: it is null where that path is not given. An experiment that says `only_with` some of the paths
+    is left out where one of them is not given, and `data_notice` says so.
 
     Args:
         preset: as `load_preset` takes it.
@@ -42,16 +43,40 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
         if name not in paths:
             raise PluginError(f"--set paths.{name}: this preset has no such path; it has {', '.join(paths) or 'none'}")
         apply_override(paths, override.removeprefix("paths."))
+    wanted = {name: part.get("only_with", []) for name, part in parts.items()}
+    left_out = _leave_out(parts, paths, where)
+    if left_out:
+        values["data_notice"] = " ".join([str(values.get("data_notice", "")), *left_out.values()]).strip()
     # Copies: what YAML's anchors repeat is one object, and `set` changes it in place.
     values["experiments"] = {
         name: _part(deepcopy(part), paths, f"{where}, experiments.{name}") for name, part in parts.items()
     }
     for override in others:
+        if name := next((name for name in left_out if override.startswith(f"experiments.{name}.")), None):
+            raise PluginError(f"--set {override}: {left_out[name]}")
         apply_override(values, override)
     study = validate_options(Study, values, where)
-    check_inputs(study, thoroughly=None in paths.values())
+    done_without = {path for name in left_out for path in wanted[name]}
+    check_inputs(study, thoroughly=any(given is None for path, given in paths.items() if path not in done_without))
     speed_vs_error_of(study)
     return study
+
+
+def _leave_out(parts: dict[str, Any], paths: dict[str, Any], where: str) -> dict[str, str]:
+    """Take out the experiments whose `only_with` names a path that is not given; a sentence about each."""
+    left_out = {}
+    for name, part in list(parts.items()):
+        needed = part.pop("only_with", [])
+        if not isinstance(needed, list) or not set(needed) <= set(paths):
+            raise PluginError(
+                f"{where}, experiments.{name}: only_with must be a list of the preset's paths, "
+                f"{', '.join(paths) or 'none'}; got {needed!r}"
+            )
+        if any(paths[path] is None for path in needed):
+            needs = " ".join(f"--set paths.{path}=..." for path in needed)
+            left_out[name] = f"Left out: `{name}`, which needs {needs}."
+            del parts[name]
+    return left_out
 
 
 def _part(part: dict[str, Any], paths: dict[str, Any], where: str) -> dict[str, Any]:

@@ -4,9 +4,10 @@ Event images are mostly isolated single pixels on a flat background. Autoencoder
 (with 8 channels a learned one kept 14 % of a single pixel's brightness), and what the code loses no generator can put
 back. This code loses nothing: each block of 4 x 4 pixels (or 2 x 2, or 1) goes through an orthonormal colour transform
 and an orthonormal two-dimensional DCT, which gives 48 latent channels at a quarter of the resolution (12 at half of it,
-3 at the whole). All channels have one scale, so that errors and noise weigh as much in latents as in pixels. Channels whitened half-way over the pre-training
-images were worse: event images are sharper than pictures, and in grey ones the highest frequency then had five times
-the variance of the mean brightness, which left the U-Net with noise to learn before shapes.
+3 at the whole). All channels have one scale, so that errors and noise weigh as much in latents as in pixels. Channels
+whitened half-way over the pre-training images were worse: event images are sharper than pictures, and in grey ones the
+highest frequency then had five times the variance of the mean brightness, which left the U-Net with noise to learn
+before shapes.
 """
 
 from __future__ import annotations

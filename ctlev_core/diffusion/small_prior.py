@@ -187,7 +187,9 @@ def build_prior(
             addition_embed_type="text",
             addition_embed_type_num_heads=TEXT_CHANNELS // HEAD_CHANNELS,
         )
-        controlnet = ControlNetModel.from_unet(unet, conditioning_embedding_out_channels=CONDITION_WIDTHS[-vae.patch_px.bit_length() :])
+        controlnet = ControlNetModel.from_unet(
+            unet, conditioning_embedding_out_channels=CONDITION_WIDTHS[-vae.patch_px.bit_length() :]
+        )
         break_zeros(controlnet)
     scheduler_config = {**SCHEDULER_CONFIG, "prediction_type": prediction_type}
     return Prior(tokenizer, text_encoder, vae, unet, controlnet, scheduler_config, (image_size, image_size))

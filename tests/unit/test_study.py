@@ -449,3 +449,35 @@ def test_only_the_full_experiment_takes_a_study():
         match=r"'all_routes' is a study .* name one of its parts instead: pose, pose_cdehp, body, ",
     ):
         load_experiment("all_routes", [])
+
+
+def test_an_experiment_is_left_out_without_the_folder_it_needs(tmp_path):
+    preset = tmp_path / "two.yaml"
+    preset.write_text(
+        "name: two\ndata_notice: Simulated.\npaths: {images: null}\nexperiments:\n"
+        "  always: {extends: smoke, name: a}\n"
+        "  filmed: {extends: smoke, name: b, only_with: [images], set: ['data_notice={images}']}\n"
+    )
+    study = load_study(str(preset), [])
+    assert list(study.experiments) == ["always"]
+    assert study.data_notice == "Simulated. Left out: `filmed`, which needs --set paths.images=...."
+    assert load_study(str(preset), ["paths.images=x"]).experiments["filmed"].data_notice == "x"
+    with pytest.raises(PluginError, match=r"experiments.filmed.seed=1: Left out: `filmed`, which needs"):
+        load_study(str(preset), ["experiments.filmed.seed=1"])
+
+
+@pytest.mark.parametrize("wanted", ["images", "[pictures]", "[1]"])
+def test_only_with_names_paths_of_the_preset(tmp_path, wanted):
+    preset = tmp_path / "one.yaml"
+    preset.write_text(
+        f"name: one\npaths: {{images: null}}\nexperiments:\n  a: {{extends: smoke, only_with: {wanted}}}\n"
+    )
+    with pytest.raises(PluginError, match=r"experiments.a: only_with must be a list of the preset's paths, images"):
+        load_study(str(preset), [])
+
+
+def test_demo_has_real_recordings_where_they_are_given():
+    assert "real_digits" not in load_study("demo", []).experiments
+    given = ["paths.nmnist=/nowhere", "paths.images=/nowhere"]
+    with pytest.raises(InputsMissing, match="/nowhere"):
+        load_study("demo", given)
