@@ -168,3 +168,33 @@ def test_real_recordings():
     events = nmnist.read_events(first, options)
     assert events.sensor_size == (34, 34) and 1000 < len(events) < 12_000
     assert all(stop > start for start, stop in nmnist.read_windows(first, options))
+
+
+def test_polarity_against_the_direction_of_the_saccades():
+    """A bright digit on a dark screen darkens pixels where it has been: p = 1 are the events on that side.
+
+    Other ATIS files call brighter events 1 (Orchard et al. say ON); in N-MNIST's released files, which are of a
+    stabilised image, it is the other way about. The simulator's calibration relies on it.
+    """
+    if not REAL.is_dir():
+        pytest.skip("the real N-MNIST recordings are not beside this checkout")
+    options = nmnist.Options(root=REAL)
+    offsets_px = []
+    for recording in listed(REAL)[::14]:
+        events = nmnist.read_events(recording, options)
+        for start, stop in nmnist.read_windows(recording, options):
+            rows = slice(start, stop)
+            place, polarity = np.stack([events.x[rows], events.y[rows]], 1).astype(float), events.p[rows] > 0
+            time = events.t[rows] - events.t[rows].mean()
+            direction = time @ (place - place.mean(axis=0))
+            direction /= np.linalg.norm(direction)
+            # In slices of time, so that the motion itself does not part the polarities.
+            of_slices = [
+                place[part][polarity[part]].mean(axis=0) - place[part][~polarity[part]].mean(axis=0)
+                for part in np.array_split(np.arange(len(place)), 8)
+                if 5 < polarity[part].sum() < len(part) - 5
+            ]
+            offsets_px.append(np.mean(of_slices, axis=0) @ direction)
+    assert len(offsets_px) > 100
+    assert (np.array(offsets_px) < 0).all()
+    assert -5 < np.mean(offsets_px) < -3
