@@ -21,7 +21,7 @@ from ctlev_core.pooled_scores import PooledScores, pool_values
 from ctlev_core.report.html import Curves, Folded, Section
 from ctlev_core.report.study import Part
 from ctlev_core.report.tables import Cell, Table
-from ctlev_core.report.verdict import in_words, lower_is_better, made_better
+from ctlev_core.report.verdict import in_range, in_words, lower_is_better, made_better
 from data_contracts.experiment import LABELS_OF
 
 REAL, OWN, BOTH = "real", "synthetic", "real+synthetic"
@@ -81,7 +81,11 @@ class Group:
         counts = {len(values) for values in draws}
         if len(counts) > 1 or counts == {0} or max(counts) % self.scores.num_generators:
             return None
-        return pool_values(np.array(draws), self.scores.num_generators)
+        return in_range(pool_values(np.array(draws), self.scores.num_generators), self.metric)
+
+    def score(self, setting: str) -> Difference:
+        """Of a setting that every experiment has."""
+        return in_range(self.scores.score(setting), self.metric)
 
     def difference(self, before: str, after: str) -> Difference | None:
         """The second setting minus the first; None where it has not both."""
@@ -126,7 +130,7 @@ def pooled_chart(groups: Sequence[Group]) -> list[Curves]:
     for number, setting in enumerate(_LINES):
         # A little beside one another, so that no bar hides another.
         points = [
-            (place * (1 + apart) ** (number - len(_LINES) // 2), group.scores.score(setting))
+            (place * (1 + apart) ** (number - len(_LINES) // 2), group.score(setting))
             for place, group in sorted(zip(places, groups, strict=True), key=lambda pair: pair[0])
             if setting in group.scores.settings
         ]
@@ -162,7 +166,7 @@ def _sentence(group: Group) -> str:
     added = group.difference(REAL, BOTH)
     if added is None:
         return f"{group.name}: nothing was trained on real and synthetic frames together."
-    before, after = (score_text(group.scores.score(setting).value) for setting in (REAL, BOTH))
+    before, after = (score_text(group.score(setting).value) for setting in (REAL, BOTH))
     what = "adding synthetic frames to the real ones"
     numbers = f"{group.metric} went from {before} to {after}, a difference of {added.text()}"
     told = f"{group.name}: {_told(added, group.metric, what)}; {numbers}"
@@ -217,7 +221,7 @@ def _score_table(groups: Sequence[Group]) -> Table:
         row: list[Cell] = [f"{_in_words(setting)} (`{setting}`)"]
         for column, group in enumerate(groups, 1):
             known = setting in group.scores.settings
-            row.append(_score(group.scores.score(setting)) if known else "")
+            row.append(_score(group.score(setting)) if known else "")
             difference = group.difference(REAL, setting)
             if difference is not None and made_better(difference, metric):
                 bold.add((len(body), column))

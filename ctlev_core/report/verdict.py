@@ -37,6 +37,13 @@ def in_words(metric: str) -> str:
     return next((text for start, text in _WORDS.items() if metric.startswith(start)), "")
 
 
+def in_range(score: Difference, metric: str) -> Difference:
+    """The score with its interval cut off where the metric ends: shares lie in 0 to 1."""
+    if not in_words(metric).startswith("share"):
+        return score
+    return Difference(score.value, max(score.low, 0.0), min(score.high, 1.0))
+
+
 def made_better(difference: Difference, metric: str) -> bool | None:
     """Whether a change of a score is one for the better; None where its interval does not say."""
     return (difference.value < 0) == lower_is_better(metric) if difference.is_certain else None

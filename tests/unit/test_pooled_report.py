@@ -1,15 +1,18 @@
 """The page of a study of several numbers of real recordings, each with several draws of them."""
 
 import json
+import math
 import re
 
 import pytest
 from pooled_study import DRAWS, NUM_GENERATORS, pooled_groups, write_pooled_study
 from report_artefacts import SETTINGS, Experiment
 
+from ctlev_core.paired_differences import Difference
 from ctlev_core.plugins import PluginError
 from ctlev_core.pooled_scores import DrawsDiffer
 from ctlev_core.report.tables import split_number
+from ctlev_core.report.verdict import in_range
 from data_contracts.manifest import Manifest, ManifestRef
 from data_contracts.study import Study
 from flows.studies import load_study
@@ -98,6 +101,16 @@ def test_groups_without_numbers_have_no_chart(tmp_path):
         ],
     )
     assert "two-recordings a class" in page and "<svg" not in page
+
+
+@pytest.mark.parametrize(
+    ("metric", "expected"), [("accuracy", (0.9, 1.0)), ("pck2d_10", (0.9, 1.0)), ("mpjpe2d", (0.9, 1.1))]
+)
+def test_intervals_of_shares_end_where_shares_do(metric, expected):
+    found = in_range(Difference(0.98, 0.9, 1.1), metric)
+    assert (found.low, found.high) == expected and found.value == 0.98
+    assert in_range(Difference(0.02, -0.1, 0.2), "accuracy").low == 0.0
+    assert math.isnan(in_range(Difference(0.5, math.nan, math.nan), "accuracy").low)
 
 
 def test_draws_with_other_test_samples_are_named(tmp_path, monkeypatch):
