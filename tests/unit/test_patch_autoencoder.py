@@ -7,7 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.fft import dctn
 
+from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder, patch_basis
+from ctlev_core.diffusion.prior import encode_prompts
+from ctlev_core.diffusion.small_prior import build_prior
 
 
 def random_images(count=4, side=16, seed=0):
@@ -23,9 +26,33 @@ def event_images(count=8, side=16, seed=0):
     return torch.from_numpy(images)
 
 
-def test_basis_is_orthonormal():
-    basis = patch_basis()
-    torch.testing.assert_close(basis @ basis.T, torch.eye(48, dtype=torch.float64), atol=1e-14, rtol=0)
+@pytest.mark.parametrize("patch_px", [1, 2, 4])
+def test_basis_is_orthonormal(patch_px):
+    basis = patch_basis(patch_px)
+    torch.testing.assert_close(basis @ basis.T, torch.eye(3 * patch_px**2, dtype=torch.float64), atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("patch_px", [1, 2, 4])
+def test_blocks_of_any_size_lose_nothing(patch_px, tmp_path):
+    code = fit_patch_autoencoder(random_images(seed=1), patch_px)
+    images = event_images()
+    latents = code.encode(images)[0].mode()
+    assert latents.shape == (8, 3 * patch_px**2, 16 // patch_px, 16 // patch_px)
+    assert (code.decode(latents)[0] - images).abs().max() < 1e-5
+    code.save_pretrained(tmp_path)
+    assert torch.equal(PatchAutoencoder.from_pretrained(tmp_path).encode(images)[0].mode(), latents)
+
+
+@pytest.mark.parametrize("patch_px", [1, 2, 4])
+def test_networks_fit_the_latents(patch_px):
+    code = fit_patch_autoencoder(random_images(seed=1), patch_px)
+    prior = build_prior(["a word"], code, seed=0, widths=(32, 32), image_size=16, prediction_type="v_prediction")
+    latents = code.encode(random_images())[0].mode()
+    embeddings = encode_prompts(prior, ["a word"] * 4)
+    predicted = Denoiser(prior.unet, prior.controlnet).predict(
+        latents, torch.full((4,), 500), embeddings, torch.rand(4, 3, 16, 16)
+    )
+    assert predicted.shape == latents.shape
 
 
 def test_luminance_channels_are_the_dct_of_each_block():
