@@ -13,30 +13,31 @@ Areas clearly below 0.5 are no better than 0.5: frames of one set are near copie
 learnt a copy as one set's takes the original for it.
 
 Source: Lopez-Paz & Oquab, Revisiting Classifier Two-Sample Tests, ICLR 2017, who test the accuracy; the area needs no
-threshold. Area with ties: Mann & Whitney, Annals of Mathematical Statistics 18, 1947.
+threshold.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from ctlev_core.intervals import MIN_RECORDINGS
-from ctlev_core.windows import spread
+from ctlev_core.realism.roc import HeldOut, interval_of_mean_area
 from data_contracts.tables import Column, TableSchema
 
 C2ST = "c2st"
 MAX_FRAMES = 400
-"""Of a larger set so many, evenly spread."""
+"""Of a larger set so many; see `choose_rows`."""
 MIN_FRAMES = 40
 """With fewer in either set the area says too little to be given."""
 MIN_HALF = 10
 """Frames of a set to learn from, at least."""
 NUM_HALVINGS = 2
-_NUM_REPLICATES = 1000
 
 TWO_SAMPLE_TESTS = TableSchema(
     "two_sample_tests",
@@ -78,6 +79,11 @@ class TwoSampleTest:
     num_second: int
     note: str = ""
 
+    def row(self) -> dict[str, Any]:
+        """Columns of the table `two_sample_tests`, without whose test it is; what is not known is None."""
+        row = dataclasses.asdict(self)
+        return row | {name: None for name, value in row.items() if isinstance(value, float) and np.isnan(value)}
+
 
 def compare_frames(
     first: np.ndarray,
@@ -85,6 +91,7 @@ def compare_frames(
     *,
     first_groups: Sequence[str] | np.ndarray,
     second_groups: Sequence[str] | np.ndarray,
+    names: tuple[str, str] = ("first", "second"),
     seed: int = 0,
 ) -> TwoSampleTest:
     """Tell frames of two sets apart; see the head of this file.
@@ -92,36 +99,41 @@ def compare_frames(
     Args:
         first: [N, H, W, 3] uint8.
         second: [M, H, W, 3] uint8.
-        first_groups: [N] recording of each frame. One that both sets name is in the same half for both.
+        first_groups: [N] recording of each frame; one that both sets name is in the same half for both.
         second_groups: [M] recording of each frame.
+        names: of the sets, for the note.
         seed: of halvings, networks and resampling.
     Returns:
-        The area; NaN with the reason where there are too few frames or recordings.
+        The area; NaN with the reason where there are too few frames or recordings, or frames of different sizes.
     Raises:
-        ValueError: shapes or dtypes do not fit.
+        ValueError: a shape or dtype is none of those.
     """
-    sets, names = _checked((first, second), (first_groups, second_groups))
-    count = min(len(sets[0]), len(sets[1]), MAX_FRAMES)
+    sets, recordings = _checked((first, second), (first_groups, second_groups))
+    counts = len(first), len(second)
+    if first.shape[1:] != second.shape[1:]:
+        return _unknown(counts, f"frames of different sizes: {first.shape[1:3]} and {second.shape[1:3]}")
+    count = min(*counts, MAX_FRAMES)
     if count < MIN_FRAMES:
-        return _unknown(sets, f"fewer than {MIN_FRAMES} frames in a set: {len(sets[0])} and {len(sets[1])}")
-    rows = [spread(len(frames), count) for frames in sets]
+        return _unknown(counts, f"fewer than {MIN_FRAMES} frames in a set")
+    rows = [choose_rows(len(frames), count, seed) for frames in sets]
     sets = [frames[chosen] for frames, chosen in zip(sets, rows, strict=True)]
-    names = [of_set[chosen] for of_set, chosen in zip(names, rows, strict=True)]
-    every, index = np.unique(np.concatenate(names), return_inverse=True)
+    recordings = [of_set[chosen] for of_set, chosen in zip(recordings, rows, strict=True)]
+    every, index = np.unique(np.concatenate(recordings), return_inverse=True)
     groups = index[:count], index[count:]
-    if min(len(np.unique(of_set)) for of_set in groups) < 2:
-        return _unknown(sets, "a set is of one recording, which cannot be both learnt from and held out")
+    kinds, fewest = _kinds(groups, len(every)), min(len(np.unique(of_set)) for of_set in groups)
+    if fewest < 2:
+        return _unknown(counts, "a set is of one recording, which cannot be both learnt from and held out")
     trainings = []
     for number in range(NUM_HALVINGS):
-        in_half = _halve(groups, len(every), np.random.default_rng([seed, number]))
+        in_half = _halve(kinds, np.random.default_rng([seed, number]))
         for learnt in (in_half, ~in_half):
-            if min(min(learnt[of_set].sum(), (~learnt[of_set]).sum()) for of_set in groups) < MIN_HALF:
-                return _unknown(sets, f"halves by recording have fewer than {MIN_HALF} frames of a set")
+            if min(np.count_nonzero(learnt[of_set]) for of_set in groups) < MIN_HALF:
+                return _unknown(counts, f"half of the recordings have fewer than {MIN_HALF} frames of a set")
             trainings.append(_train_and_test(sets, groups, learnt, [seed, len(trainings)]))
     areas = np.array([training.area for training in trainings])
     low = high = float("nan")
-    if min(len(np.unique(of_set)) for of_set in groups) >= MIN_RECORDINGS:
-        low, high = _interval(trainings, groups, len(every), seed)
+    if fewest >= MIN_RECORDINGS:
+        low, high = interval_of_mean_area(trainings, kinds, np.random.default_rng([seed, NUM_HALVINGS]))
     return TwoSampleTest(
         value=float(areas.mean()),
         low=low,
@@ -129,7 +141,7 @@ def compare_frames(
         deviation=float(areas.std(ddof=1)),
         num_first=count,
         num_second=count,
-        note=_note(sets, high),
+        note=_note(sets, names, high),
     )
 
 
@@ -144,95 +156,52 @@ def compare_halves(frames: np.ndarray, groups: Sequence[str] | np.ndarray, seed:
     (frames,), (names,) = _checked((frames,), (groups,))
     every, index = np.unique(names, return_inverse=True)
     if len(every) < 4:
-        return TwoSampleTest(*[float("nan")] * 4, 0, 0, f"halves of {len(every)} recordings cannot be halved again")
-    in_half = _halve((index, index), len(every), np.random.default_rng([seed, NUM_HALVINGS]))[index]
+        counts = len(frames) // 2, len(frames) - len(frames) // 2
+        return _unknown(counts, f"{len(every)} recordings, which cannot be halved twice")
+    in_half = _halve(np.zeros(len(every)), np.random.default_rng([seed, NUM_HALVINGS + 1]))[index]
     return compare_frames(
         frames[in_half], frames[~in_half], first_groups=names[in_half], second_groups=names[~in_half], seed=seed
     )
 
 
-def area_under_roc(first: np.ndarray, second: np.ndarray) -> float:
-    """Share of the pairs of scores, one of each set, of which the first's is larger; equal ones count half.
+def choose_rows(count: int, wanted: int, seed: int = 0) -> np.ndarray:
+    """At most `wanted` of `count` rows in order: one at random from each of as many equal stretches.
 
-    Args:
-        first: [N] scores, N > 0.
-        second: [M] scores, M > 0.
+    Rows at equal distances would be of one class where classes take turns.
     """
-    return float(_wins(first, second).mean())
-
-
-def _wins(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """[N, M]: 1 where the first score is larger, 0.5 where both are equal, 0 else."""
-    return (np.sign(first[:, None] - second[None]) + 1) / 2
-
-
-@dataclass(frozen=True, eq=False)
-class _Training:
-    """Area of one network, and its parts: wins [A, B] and pairs [A, B] of held-out recordings of either set."""
-
-    area: float
-    first: np.ndarray
-    second: np.ndarray
-    wins: np.ndarray
-    pairs: np.ndarray
+    if count <= wanted:
+        return np.arange(count)
+    ends = np.arange(wanted + 1, dtype=np.int64) * count // wanted
+    return np.random.default_rng([seed, count, wanted]).integers(ends[:-1], ends[1:])
 
 
 def _train_and_test(
     sets: list[np.ndarray], groups: tuple[np.ndarray, np.ndarray], learnt: np.ndarray, seed: list[int]
-) -> _Training:
+) -> HeldOut:
     from ctlev_core.realism.two_sample_network import learn_and_score
 
     known = [learnt[of_set] for of_set in groups]
-    network_seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
     scores = learn_and_score(
-        *(frames[rows] for frames, rows in zip(sets, known, strict=True)),
+        sets[0][known[0]],
+        sets[1][known[1]],
         held_out=(sets[0][~known[0]], sets[1][~known[1]]),
-        seed=network_seed,
+        seed=int(np.random.SeedSequence(seed).generate_state(1)[0]),
     )
-    (first, of_first), (second, of_second) = (
-        np.unique(of_set[~rows], return_inverse=True) for of_set, rows in zip(groups, known, strict=True)
-    )
-    members = np.eye(len(first))[of_first], np.eye(len(second))[of_second]
-    wins = members[0].T @ _wins(*scores) @ members[1]
-    return _Training(area_under_roc(*scores), first, second, wins, np.outer(*(m.sum(axis=0) for m in members)))
+    return HeldOut.make(scores, [of_set[~rows] for of_set, rows in zip(groups, known, strict=True)])
 
 
-def _halve(groups: tuple[np.ndarray, np.ndarray], count: int, generator: np.random.Generator) -> np.ndarray:
-    """[count] bool, the recordings of a random half: of those of both sets, of the first alone, of the second alone."""
-    kind = np.isin(np.arange(count), groups[0]) + 2 * np.isin(np.arange(count), groups[1])
-    in_half = np.zeros(count, bool)
-    for number in range(1, 4):
-        members = generator.permutation(np.flatnonzero(kind == number))
+def _kinds(groups: tuple[np.ndarray, np.ndarray], count: int) -> np.ndarray:
+    """[count] of each recording: 1 = of the first set alone, 2 = of the second alone, 3 = of both."""
+    return np.isin(np.arange(count), groups[0]) + 2 * np.isin(np.arange(count), groups[1])
+
+
+def _halve(kinds: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """[count] bool, the recordings of a random half: of each kind half."""
+    in_half = np.zeros(len(kinds), bool)
+    for kind in np.unique(kinds):
+        members = generator.permutation(np.flatnonzero(kinds == kind))
         in_half[members[: (len(members) + int(generator.integers(2))) // 2]] = True
     return in_half
-
-
-def _interval(
-    trainings: list[_Training], groups: tuple[np.ndarray, np.ndarray], count: int, seed: int
-) -> tuple[float, float]:
-    generator = np.random.default_rng([seed, NUM_HALVINGS + 1])
-    weights = np.zeros((_NUM_REPLICATES, count))
-    kind = np.isin(np.arange(count), groups[0]) + 2 * np.isin(np.arange(count), groups[1])
-    for number in range(1, 4):
-        members = np.flatnonzero(kind == number)
-        if len(members):
-            weights[:, members] = generator.multinomial(
-                len(members), np.full(len(members), 1 / len(members)), _NUM_REPLICATES
-            )
-    areas = np.empty((_NUM_REPLICATES, len(trainings)))
-    for column, training in zip(areas.T, trainings, strict=True):
-        of_first, of_second = weights[:, training.first], weights[:, training.second]
-        wins, pairs = (((of_first @ part) * of_second).sum(axis=1) for part in (training.wins, training.pairs))
-        column[:] = np.divide(wins, pairs, out=np.full_like(wins, np.nan), where=pairs > 0)
-    areas = areas[np.isfinite(areas).all(axis=1)]
-    if not len(areas):
-        return float("nan"), float("nan")
-    # A mean over so few trainings varies too little when they are drawn from themselves; stretched, it does not.
-    drawn = np.take_along_axis(areas, generator.integers(len(trainings), size=areas.shape), axis=1).mean(axis=1)
-    middle = areas.mean(axis=1)
-    found = middle + np.sqrt(len(trainings) / (len(trainings) - 1)) * (drawn - middle)
-    low, high = np.clip(np.quantile(found, [0.025, 0.975]), 0, 1)
-    return float(low), float(high)
 
 
 def _checked(
@@ -244,23 +213,22 @@ def _checked(
             raise ValueError(f"frames must be [N, H, W, 3] uint8, got {frames.shape} {frames.dtype}")
         if of_set.shape != (len(frames),):
             raise ValueError(f"groups must be [{len(frames)}], one a frame, got {of_set.shape}")
-    if len({frames.shape[1:] for frames in sets}) > 1:
-        raise ValueError(f"sets must have frames of one size, got {[frames.shape[1:3] for frames in sets]}")
     return list(sets), names
 
 
-def _unknown(sets: list[np.ndarray], note: str) -> TwoSampleTest:
-    return TwoSampleTest(*[float("nan")] * 4, len(sets[0]), len(sets[1]), note)
+def _unknown(counts: tuple[int, int], note: str) -> TwoSampleTest:
+    nan = float("nan")
+    return TwoSampleTest(nan, nan, nan, nan, *counts, note)
 
 
-def _note(sets: list[np.ndarray], high: float) -> str:
+def _note(sets: list[np.ndarray], names: tuple[str, str], high: float) -> str:
     notes = []
-    for name, frames in zip(("first", "second"), sets, strict=True):
+    for name, frames in zip(names, sets, strict=True):
         num_empty = int((frames.reshape(len(frames), -1) == 0).all(axis=1).sum())
         if num_empty:
-            notes.append(f"{num_empty} of {len(frames)} frames of the {name} set are empty")
+            notes.append(f"{num_empty} of {len(frames)} {name} frames are empty")
         elif (frames == frames[0]).all():
-            notes.append(f"all frames of the {name} set are equal")
+            notes.append(f"all {name} frames are equal")
     if high < 0.5:
-        notes.append("below 0.5: frames of one set are near copies of the other's")
+        notes.append("below 0.5, as where frames of one set are near copies of the other's")
     return "; ".join(notes)

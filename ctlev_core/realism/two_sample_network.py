@@ -19,6 +19,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.utils import skip_init
 
 WIDTHS = (16, 32, 32)
 FULL_SIDE_PX = 64
@@ -67,10 +68,11 @@ def _build(image_size: tuple[int, ...], generator: np.random.Generator) -> nn.Se
     channels, step = 3, max(1, -(-max(image_size) // FULL_SIDE_PX))
     for number, width in enumerate(WIDTHS):
         stride = step if number == 0 else 1
-        layers.append(nn.Conv2d(channels, width, 2 * stride + 1, stride=stride, padding=stride, bias=False))
+        shape = {"kernel_size": 2 * stride + 1, "stride": stride, "padding": stride, "bias": False}
+        layers.append(skip_init(nn.Conv2d, channels, width, **shape))
         layers += [nn.MaxPool2d(2, ceil_mode=True), nn.BatchNorm2d(width), nn.ReLU()]
         channels = width
-    network = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16 * channels, 1))
+    network = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(4), nn.Flatten(), skip_init(nn.Linear, 16 * channels, 1))
     with torch.no_grad():
         for layer in network:
             if isinstance(layer, nn.Conv2d | nn.Linear):
