@@ -97,8 +97,8 @@ def compare_frames(
     """Tell frames of two sets apart; see the head of this file.
 
     Args:
-        first: [N, H, W, 3] uint8.
-        second: [M, H, W, 3] uint8.
+        first: [N, H, W, C] uint8, C channels of any meaning.
+        second: [M, H, W, C] uint8.
         first_groups: [N] recording of each frame; one that both sets name is in the same half for both.
         second_groups: [M] recording of each frame.
         names: of the sets, for the note.
@@ -149,7 +149,7 @@ def compare_halves(frames: np.ndarray, groups: Sequence[str] | np.ndarray, seed:
     """The floor: two random halves of one set told apart, whole recordings to one or the other.
 
     Args:
-        frames: [N, H, W, 3] uint8.
+        frames: [N, H, W, C] uint8.
         groups: [N] recording of each frame.
         seed: of the halves, and as for `compare_frames`.
     """
@@ -209,8 +209,8 @@ def _checked(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     names = [np.asarray(of_set) for of_set in groups]
     for frames, of_set in zip(sets, names, strict=True):
-        if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
-            raise ValueError(f"frames must be [N, H, W, 3] uint8, got {frames.shape} {frames.dtype}")
+        if frames.ndim != 4 or frames.dtype != np.uint8:
+            raise ValueError(f"frames must be [N, H, W, channels] uint8, got {frames.shape} {frames.dtype}")
         if of_set.shape != (len(frames),):
             raise ValueError(f"groups must be [{len(frames)}], one a frame, got {of_set.shape}")
     return list(sets), names

@@ -34,16 +34,16 @@ def learn_and_score(
     """Train on some frames of two sets, and score others.
 
     Args:
-        first: [N, H, W, 3] uint8, N > 0.
-        second: [M, H, W, 3] uint8, M > 0.
-        held_out: [K, H, W, 3] and [L, H, W, 3] uint8 of the first and the second set.
+        first: [N, H, W, C] uint8, N > 0.
+        second: [M, H, W, C] uint8, M > 0.
+        held_out: [K, H, W, C] and [L, H, W, C] uint8 of the first and the second set.
         seed: of weights, order and shifts.
     Returns:
         [K] and [L] float64: logits that a frame is from the first set.
     """
     with _one_thread():
         generator = np.random.default_rng(seed)
-        network = _train(_build(first.shape[1:3], generator), (_planes(first), _planes(second)), generator)
+        network = _train(_build(first.shape[1:], generator), (_planes(first), _planes(second)), generator)
         known, other = (_score(network, _planes(frames)) for frames in held_out)
     return known, other
 
@@ -59,19 +59,20 @@ def _one_thread() -> Iterator[None]:
 
 
 def _planes(frames: np.ndarray) -> torch.Tensor:
-    """[N, 3, H, W] uint8, the channels of a pixel still side by side in memory: twice as fast."""
+    """[N, C, H, W] uint8, the channels of a pixel still side by side in memory: twice as fast."""
     return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2)
 
 
-def _build(image_size: tuple[int, ...], generator: np.random.Generator) -> nn.Sequential:
+def _build(shape: tuple[int, ...], generator: np.random.Generator) -> nn.Sequential:
     layers: list[nn.Module] = []
-    channels, step = 3, max(1, -(-max(image_size) // FULL_SIDE_PX))
-    for number, width in enumerate(WIDTHS):
+    height, width, channels = shape
+    step = max(1, -(-max(height, width) // FULL_SIDE_PX))
+    for number, features in enumerate(WIDTHS):
         stride = step if number == 0 else 1
-        shape = {"kernel_size": 2 * stride + 1, "stride": stride, "padding": stride, "bias": False}
-        layers.append(skip_init(nn.Conv2d, channels, width, **shape))
-        layers += [nn.MaxPool2d(2, ceil_mode=True), nn.BatchNorm2d(width), nn.ReLU()]
-        channels = width
+        kernel = {"kernel_size": 2 * stride + 1, "stride": stride, "padding": stride, "bias": False}
+        layers.append(skip_init(nn.Conv2d, channels, features, **kernel))
+        layers += [nn.MaxPool2d(2, ceil_mode=True), nn.BatchNorm2d(features), nn.ReLU()]
+        channels = features
     network = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(4), nn.Flatten(), skip_init(nn.Linear, 16 * channels, 1))
     with torch.no_grad():
         for layer in network:

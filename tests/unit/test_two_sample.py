@@ -170,6 +170,7 @@ def test_images_larger_than_64_px_and_of_odd_size_are_taken():
     rng = np.random.default_rng(0)
     second[np.arange(40), rng.integers(21, size=40), rng.integers(70, size=40)] = 255
     assert compare(first, second).value > 0.9
+    assert compare(first[..., :1], second[..., :1]).value > 0.9
 
 
 # What cannot be measured ---------------------------------------------------------------------------------------------
@@ -210,7 +211,7 @@ def test_frames_that_are_all_equal_or_empty_are_told_in_the_note():
 
 
 def test_wrong_shapes_are_refused():
-    with pytest.raises(ValueError, match=r"frames must be \[N, H, W, 3\] uint8"):
+    with pytest.raises(ValueError, match=r"frames must be \[N, H, W, channels\] uint8"):
         compare(np.zeros((50, 8, 8), np.uint8), bars(50, 0))
     with pytest.raises(ValueError, match=r"groups must be \[50\]"):
         compare_frames(bars(50, 0), bars(50, 1), first_groups=names(49), second_groups=names(50))
