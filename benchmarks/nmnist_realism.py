@@ -8,8 +8,8 @@ the next 15 % are compared with; the rest is not looked at.
 
 Three things are printed: a table of numbers; how well a small network tells real from simulated images of events in
 three periods of time (`c2st`, area under the curve on held-out ones; 0.5 = not at all) beside how well it tells two
-halves of the real ones, and two simulated sensors of one kind, whose pixels differ in their thresholds; and the accuracy
-on real recordings of a small network that learnt from 500 simulated ones alone.
+halves of the real ones, and two simulated sensors of one kind, whose pixels differ in their thresholds; and the
+accuracy on real recordings of a small network that learnt from 500 simulated ones alone.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def told_apart(first: np.ndarray, second: np.ndarray, folds: int = 4) -> tuple[f
     splits = StratifiedKFold(folds, shuffle=True, random_state=0)
     regression = LogisticRegression(C=0.01, max_iter=500)
     flat = images.reshape(len(images), -1)
-    linear = cross_val_predict(regression, flat, labels, cv=splits, method="decision_function")
+    linear = np.asarray(cross_val_predict(regression, flat, labels, cv=splits, method="decision_function"))
     return network, area_under_roc(linear[labels == 1], linear[labels == 0])
 
 
