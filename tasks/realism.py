@@ -48,9 +48,9 @@ def realism(
     `A against A` for the floor. Distributions lie beside the table.
 
     How well a network tells frames apart is the metric `c2st`: generated from real training frames (`NAME against
-    real`) and from real test frames (`NAME against test`); its floors are the halves of the training frames (`real
-    against real`) and test from training frames (`test against real`). Where there are too few frames there is no such
-    row; the table `two_sample_tests`, which lies beside, says why.
+    real`) and from real test frames (`NAME against test`); its floors are the halves of either (`real against real`,
+    `test against test`) and test from training frames (`test against real`). Where there are too few frames there is no
+    such row; the table `two_sample_tests`, which lies beside, says why.
     """
     found, tests = [], []
     if recordings is not None:
@@ -61,7 +61,7 @@ def realism(
     real = _summarise_frames(frames)
     recorded = {"real": _read_frames(frames, "train"), "test": _read_frames(frames, "test")}
     floors = {
-        "real against real": two_sample.compare_halves(*recorded["real"]),
+        **{f"{name} against {name}": two_sample.compare_halves(*of_split) for name, of_split in recorded.items()},
         "test against real": _tell_apart("test", recorded["test"], "real", recorded["real"]),
     }
     groups = ["frames", *(f"frames of {name}" for name in names[1:])]

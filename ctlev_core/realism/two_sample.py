@@ -155,8 +155,10 @@ def compare_halves(frames: np.ndarray, groups: Sequence[str] | np.ndarray, seed:
     """
     (frames,), (names,) = _checked((frames,), (groups,))
     every, index = np.unique(names, return_inverse=True)
+    counts = len(frames) // 2, len(frames) - len(frames) // 2
+    if counts[0] < MIN_FRAMES:
+        return _unknown(counts, f"fewer than {MIN_FRAMES} frames in a set")
     if len(every) < 4:
-        counts = len(frames) // 2, len(frames) - len(frames) // 2
         return _unknown(counts, f"{len(every)} recordings, which cannot be halved twice")
     in_half = _halve(np.zeros(len(every)), np.random.default_rng([seed, NUM_HALVINGS + 1]))[index]
     return compare_frames(

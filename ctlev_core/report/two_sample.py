@@ -13,13 +13,14 @@ _CAPTION = (
     "A small network learns from half of the recordings which of two sets a frame is from. Area: under the ROC curve "
     "on the other half, mean over four trainings (two random halvings, each half once to learn from), with its 95 % "
     "interval over recordings and trainings; sd: over the trainings. 0.5 = it cannot tell, 1 = it always can. A "
-    "different mix of classes or poses is told as well as a different look. The rows of recorded frames say what "
-    f"chance and other subjects make alone. With fewer than {MIN_FRAMES} frames in a set no area is given. Bold: told "
-    "apart, the interval lies above 0.5."
+    "different mix of classes or poses is told as well as a different look, and so is a set of few frames over and "
+    "over. The rows of recorded frames say what chance and other subjects make alone. With fewer than "
+    f"{MIN_FRAMES} frames in a set no area is given. Bold: told apart, the interval lies above 0.5."
 )
 _AREA_COLUMN = 1
 _NAMES = {
     "real against real": "recorded training frames: halves",
+    "test against test": "recorded test frames: halves",
     "test against real": "recorded training from recorded test frames",
 }
 

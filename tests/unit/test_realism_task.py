@@ -71,7 +71,8 @@ def test_every_generator_is_told_from_training_and_test_frames_beside_both_floor
     other = synthetic_set(tmp_path / "other", noise(count, 0.6, 2), ["elsewhere"] * count)
     rows, tests = run(real, [alike, other])
     assert set(tests) == {
-        ("frames", "real against real"), ("frames", "test against real"), ("frames", "synthetic against real"),
+        ("frames", "real against real"), ("frames", "test against real"), ("frames", "test against test"),
+        ("frames", "synthetic against real"),
         ("frames", "synthetic against test"), ("frames of gan", "gan against real"),
         ("frames of gan", "gan against test"),
     }  # fmt: skip
@@ -81,7 +82,8 @@ def test_every_generator_is_told_from_training_and_test_frames_beside_both_floor
         else:
             assert test["low"] < 0.5 < test["high"], (group, setting)
     scored = {(row["group"], row["setting"]): row for row in rows if row["metric"] == "c2st"}
-    assert set(scored) == {*tests, ("frames of gan", "real against real"), ("frames of gan", "test against real")}
+    floors = ("real against real", "test against test", "test against real")
+    assert set(scored) == {*tests, *(("frames of gan", setting) for setting in floors)}
     found = scored["frames of gan", "gan against test"]
     assert (found["value"], found["low"]) == tuple(
         tests["frames of gan", "gan against test"][k] for k in ("value", "low")
