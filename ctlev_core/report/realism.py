@@ -97,13 +97,14 @@ def _values(series: Series) -> list[Section]:
 
 
 def _spectra(series: Series) -> list[Section]:
+    """On a logarithmic axis, without the rings in which an image of this size has no frequency."""
+    shown = {}
+    for name, (centres, shares) in series.items():
+        kept = [(centre, share) for centre, share in zip(centres, shares, strict=True) if share > 0]
+        shown[name] = ([centre for centre, _ in kept], [share for _, share in kept])
     caption = "Share of each spatial frequency, whatever its direction, in the power of an image without its mean."
     labels = AXES["power_spectrum"].label, "share of the power"
-    return [Curves("Power spectrum", series, *labels, log_y=_all_positive(series), caption=caption)] if series else []
-
-
-def _all_positive(series: Series) -> bool:
-    return all(share > 0 for _, shares in series.values() for share in shares)
+    return [Curves("Power spectrum", shown, *labels, log_y=True, caption=caption)] if shown else []
 
 
 def _table(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
