@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from ctlev_core.realism.two_sample import C2ST, MIN_FRAMES
 from ctlev_core.report.verdict import lower_is_better
 from data_contracts.errors import DataError
 from data_contracts.published import GateCheck
@@ -23,7 +24,8 @@ def check_gates(
     Args:
         gates: thresholds; those that are None are left out.
         scores: rows of the table `scores`: distances of `HELD_OUT` and `SYNTHETIC` frames, of equally many; scores of
-            the model trained on real frames, setting `REAL`, and of that model on the version's frames; copies.
+            the model trained on real frames, setting `REAL`, and of that model on the version's frames; copies;
+            realism.
         task: of that model; its first score decides.
         labels_of: setting of its scores on the version's frames.
         refused_share: of frames that are no event images.
@@ -52,6 +54,27 @@ def check_gates(
     if gates.max_refused_share is not None:
         score = "share of frames that are no event images"
         checks.append(_check("max_refused_share", score, refused_share, gates.max_refused_share))
+    return checks + _check_realism(gates, scores)
+
+
+def _check_realism(gates: Gates, scores: Sequence[dict[str, Any]]) -> list[GateCheck]:
+    """Gates of the task `realism`."""
+    found = {(row["setting"], row["metric"]): row["value"] for row in scores if row["task"] == "realism"}
+    checks: list[GateCheck] = []
+    if gates.max_c2st is not None:
+        value = found.get((f"{SYNTHETIC} against test", C2ST))
+        if value is None:
+            raise DataError(
+                f"gate max_c2st: needs {MIN_FRAMES} frames of the version and as many held-out real ones, of several "
+                "recordings"
+            )
+        score = "area under the ROC curve, told from held-out real frames"
+        checks.append(_check("max_c2st", score, value, gates.max_c2st))
+    known = {name: value for (setting, name), value in found.items() if setting == f"{SYNTHETIC} against real"}
+    for name, limit in (gates.max_realism_distances or {}).items():
+        if name not in known:
+            raise DataError(f"gate max_realism_distances: expected names of {', '.join(sorted(known))}; got {name!r}")
+        checks.append(_check("max_realism_distances", f"{name} against real", known[name], limit))
     return checks
 
 

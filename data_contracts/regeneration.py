@@ -30,6 +30,22 @@ class Gates(Frozen):
     max_refused_share: float | None = Field(
         default=0.05, ge=0, le=1, description="frames that are no event images after `max_tries`"
     )
+    max_c2st: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="area under the ROC curve of a network that tells the frames from held-out real ones; 0.5 = cannot",
+    )
+    max_realism_distances: dict[str, float] | None = Field(
+        default=None,
+        description="by name, distances of the report's table of realism from the real training frames, such as "
+        "isolated_pixel_share or value_js_bits",
+    )
+
+    @property
+    def need_realism(self) -> bool:
+        """Is any gate of the report's table of realism?"""
+        return self.max_c2st is not None or bool(self.max_realism_distances)
 
 
 class Regeneration(Experiment):

@@ -28,6 +28,7 @@ from tasks.copy_check import copy_check
 from tasks.downstream import train_downstream
 from tasks.evaluate import score_model
 from tasks.publish import claimed, next_number
+from tasks.realism import realism
 from tasks.sample import sample
 from tasks.score_version import score_beside_real
 from tasks.stage import call_flow, call_together
@@ -101,6 +102,8 @@ def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: Mani
     calls = [partial(_score_likeness, regeneration, dataset, synthetic)]
     if regeneration.gates.max_label_error_ratio is not None:
         calls.append(partial(_score_labels, regeneration, dataset, synthetic))
+    if regeneration.gates.need_realism:
+        calls.append(partial(_score_realism, dataset, synthetic))
     scores = [score for found in call_together(*calls) for score in found]
     return MadeVersion(conditions=conditions, synthetic=synthetic, scores=scores)
 
@@ -150,12 +153,17 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
     ]
 
 
+def _score_realism(dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
+    """Statistics of the version's frames beside those of real ones, and whether a network tells them apart."""
+    return [realism(None, dataset.tested_frames, [synthetic], None, names=[NAME], label=NAME)]
+
+
 def _judge(regeneration: Regeneration, checkpoint: ManifestRef, made: MadeVersion, number: int, seed: int) -> Version:
     """The record of a version: what it is, what it was made from, its scores, and how it kept the gates."""
     rows = [row for ref in made.scores for row in read_manifest(ref).table.to_pylist()]
     refusals = count_refusals(read_manifest(made.synthetic))
     # Those of single classes are in the artefacts.
-    told = [row for row in rows if row["group"] == "all" or row["task"] == "copies"]
+    told = [row for row in rows if row["group"] == "all" or row["task"] in ("copies", "realism")]
     scores = {f"{row['setting']}, {row['group']}: {row['metric']}": row["value"] for row in told}
     scores["sampled again"], scores["refused"] = refusals.num_again, refusals.num_refused
     return Version(

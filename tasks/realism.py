@@ -1,4 +1,4 @@
-"""How real do recordings and synthetic frames look? Numbers, and distances beside a real-against-real floor."""
+"""How real do recordings and synthetic frames look? Numbers, distances and a two-sample test, beside their floors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import event_files
-from ctlev_core.realism import distances
+from ctlev_core.realism import distances, two_sample
 from ctlev_core.realism.summary import AXES, Summary, summarise_events, summarise_frames
 from ctlev_core.windows import spread
 from data_contracts import tables
@@ -24,10 +24,14 @@ MAX_FRAMES = 1000
 """Of a larger set of frames so many, evenly spread."""
 
 
-@stage(version=2, schema=tables.SCORES)
+Frames = tuple[np.ndarray, np.ndarray]
+"""Images [N, H, W, 3] uint8, and the recording [N] of each."""
+
+
+@stage(version=3, schema=tables.SCORES)
 def realism(
     out: Output,
-    recordings: Manifest,
+    recordings: Manifest | None,
     frames: Manifest,
     generated: list[Manifest],
     reference: Manifest | None,
@@ -36,25 +40,86 @@ def realism(
 ) -> pa.Table:
     """Events of the test split beside those of the training split, and generated beside real training frames.
 
-    `reference` are other recordings that those of the training split are compared with, `names` those of the
-    generators behind `generated`.
+    `recordings` are those behind `frames`; None leaves events out. `reference` are other recordings that those of the
+    training split are compared with, `names` those of the generators behind `generated`.
 
     Rows have the task `realism` and the group `events`, `frames` (of the first generator), `frames of NAME` or, with
     other recordings as a reference, `reference`. Settings: the two sets, `A against B` for their distances and
     `A against A` for the floor. Distributions lie beside the table.
+
+    How well a network tells frames apart is the metric `c2st`: generated from real training frames (`NAME against
+    real`) and from real test frames (`NAME against test`); its floors are the halves of either (`real against real`,
+    `test against test`) and test from training frames (`test against real`). Where there are too few frames there is no
+    such row; the table `two_sample_tests`, which lies beside, says why.
     """
-    learnt = _summarise_recordings(recordings, "train")
-    found = [_compare("events", "train", "test", learnt, _summarise_recordings(recordings, "test"), recordings)]
-    if reference is not None:
-        found.append(_compare("reference", "reference", "train", _summarise_whole(reference), learnt, recordings))
+    found, tests = [], []
+    if recordings is not None:
+        learnt = _summarise_recordings(recordings, "train")
+        found.append(_compare("events", "train", "test", learnt, _summarise_recordings(recordings, "test"), recordings))
+        if reference is not None:
+            found.append(_compare("reference", "reference", "train", _summarise_whole(reference), learnt, recordings))
     real = _summarise_frames(frames)
+    recorded = {"real": _read_frames(frames, "train"), "test": _read_frames(frames, "test")}
+    floors = {
+        **{f"{name} against {name}": two_sample.compare_halves(*of_split) for name, of_split in recorded.items()},
+        "test against real": _tell_apart("test", recorded["test"], "real", recorded["real"]),
+    }
     groups = ["frames", *(f"frames of {name}" for name in names[1:])]
     for group, name, made in zip(groups, names, generated, strict=True):
         found.append(_compare(group, "real", name, real, _summarise_frames(made), made))
-    schema = distances.DISTRIBUTIONS
-    shares = [row for _, distributions in found for row in distributions]
-    out.write_table(pa.Table.from_pylist(shares, schema.arrow()), schema)
+        own = {
+            f"{name} against {other}": _tell_apart(name, _read_made_frames(made, others[1]), other, others)
+            for other, others in recorded.items()
+        }
+        # The floors are the same for all generators: beside each in the scores, once in the table of tests.
+        found.append((_test_rows(group, own | floors, made), []))
+        tests += [_test_row(group, *item) for item in ((floors | own) if group == groups[0] else own).items()]
+    for schema, rows in (
+        (distances.DISTRIBUTIONS, [row for _, distributions in found for row in distributions]),
+        (two_sample.TWO_SAMPLE_TESTS, tests),
+    ):
+        out.write_table(pa.Table.from_pylist(rows, schema.arrow()), schema)
     return pa.Table.from_pylist([row for rows, _ in found for row in rows], schema=tables.SCORES.arrow())
+
+
+def _read_frames(frames: Manifest, split: str) -> Frames:
+    """Frames of a split: as many as two halves may have that are told apart."""
+    rows = frames.rows_where(split=split)
+    rows = rows[two_sample.choose_rows(len(rows), 2 * two_sample.MAX_FRAMES)]
+    return np.asarray(frames.array("frames")[rows]), np.array(frames.column("recording_id"), str)[rows]
+
+
+def _read_made_frames(made: Manifest, recorded: np.ndarray) -> Frames:
+    """Generated frames; one whose labels are those of a recorded one belongs to that recording.
+
+    What was made from a recording that is held out is then held out as well.
+    """
+    rows = made.rows_where(split="train")
+    rows = rows[two_sample.choose_rows(len(rows), two_sample.MAX_FRAMES)]
+    own = np.array(made.column("recording_id"), str)[rows]
+    sources = np.array([name.partition(":")[0] for name in made.column("source_id")], str)[rows]
+    return np.asarray(made.array("frames")[rows]), np.where(np.isin(sources, recorded), sources, own)
+
+
+def _tell_apart(first: str, of_first: Frames, second: str, of_second: Frames) -> two_sample.TwoSampleTest:
+    return two_sample.compare_frames(
+        of_first[0], of_second[0], first_groups=of_first[1], second_groups=of_second[1], names=(first, second)
+    )
+
+
+def _test_row(group: str, setting: str, test: two_sample.TwoSampleTest) -> dict[str, Any]:
+    return {"group": group, "setting": setting} | test.row()
+
+
+def _test_rows(group: str, tests: dict[str, two_sample.TwoSampleTest], data: Manifest) -> list[dict[str, Any]]:
+    """Rows of the table `scores`, of those tests that have an area."""
+    return [
+        _score(
+            group, setting, two_sample.C2ST, distances.Estimate(test.value, test.low, test.high), test.num_first, data
+        )
+        for setting, test in tests.items()
+        if not np.isnan(test.value)
+    ]
 
 
 def _summarise_recordings(recordings: Manifest, split: str) -> list[Summary]:
@@ -107,20 +172,7 @@ def _compare(
     found[f"{first} against {first}"] = distances.estimate_floor(sets[first])
     sizes = {name: len(summaries) for name, summaries in sets.items()}
     rows = [
-        {
-            "task": "realism",
-            "setting": setting,
-            "seed": 0,
-            "group": group,
-            "metric": metric,
-            "value": estimate.value,
-            "low": None if np.isnan(estimate.low) else estimate.low,
-            "high": None if np.isnan(estimate.high) else estimate.high,
-            "num_samples": sizes[setting.split(" against ")[0]],
-            "num_train": 0,
-            "model_digest": "",
-            "data_digest": data.ref.digest,
-        }
+        _score(group, setting, metric, estimate, sizes[setting.split(" against ")[0]], data)
         for setting, estimates in found.items()
         for metric, estimate in estimates.items()
     ]
@@ -133,3 +185,22 @@ def _distribution_rows(group: str, setting: str, summaries: Sequence[Summary]) -
         for axis, shares in distances.mean_distributions(summaries).items()
         for centre, share in zip(AXES[axis].centres, shares, strict=True)
     ]
+
+
+def _score(
+    group: str, setting: str, metric: str, estimate: distances.Estimate, num_samples: int, data: Manifest
+) -> dict[str, Any]:
+    return {
+        "task": "realism",
+        "setting": setting,
+        "seed": 0,
+        "group": group,
+        "metric": metric,
+        "value": estimate.value,
+        "low": None if np.isnan(estimate.low) else estimate.low,
+        "high": None if np.isnan(estimate.high) else estimate.high,
+        "num_samples": num_samples,
+        "num_train": 0,
+        "model_digest": "",
+        "data_digest": data.ref.digest,
+    }

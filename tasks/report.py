@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from ctlev_core.paired_differences import share_of_gain
 from ctlev_core.provenance import Record, read_records, write_provenance
 from ctlev_core.realism.distances import DISTRIBUTIONS
+from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from ctlev_core.report import pictures
 from ctlev_core.report.contact_sheet import contact_sheet_sections
 from ctlev_core.report.copies import copy_sections
@@ -49,7 +50,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=15, schema=tables.REPORT)
+@stage(version=16, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -106,7 +107,8 @@ def report(
     rows, paired = traced.to_pylist(), PairedScores(samples)
     results = _results(rows, settings, list(shown), paired)
     copied = copy_sections(frames, generated, copies)
-    looks = realism_sections(realism.table.to_pylist(), realism.attached(DISTRIBUTIONS).to_pylist())
+    distributions, tests = (realism.attached(schema).to_pylist() for schema in (DISTRIBUTIONS, TWO_SAMPLE_TESTS))
+    looks = realism_sections(realism.table.to_pylist(), distributions, tests)
     refused = refusal_sections(shown)
     floors = floor_tables(scores)
     sheet = contact_sheet_sections(frames, frame_conditions, conditions)

@@ -20,7 +20,7 @@ from tasks.stage import Output, stage
 TABLE = f"{tables.SPEED_VS_ERROR.name}.parquet"
 
 
-@stage(version=2, schema=tables.REPORT)
+@stage(version=3, schema=tables.REPORT)
 def speed_report(
     out: Output,
     extractor: Manifest,

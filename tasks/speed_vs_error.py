@@ -30,6 +30,7 @@ from ctlev_core.sampling_errors import (
     label_error,
     pixel_error,
 )
+from ctlev_core.sampling_realism import realism_of_real, realism_of_samples
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice, SamplingChoice
@@ -74,7 +75,7 @@ def _asked(conditions: Manifest, num_images: int, seed: int) -> tuple[np.ndarray
     return rows, Conditions(tuple(every.prompts[row] for row in rows), images), [seeds[row] for row in rows]
 
 
-@stage(version=2, schema=tables.SPEED_VS_ERROR)
+@stage(version=3, schema=tables.SPEED_VS_ERROR)
 def sampling_errors(
     out: Output,
     extractor: Manifest,
@@ -114,7 +115,8 @@ def sampling_errors(
 
     held_out = frames.rows_where(split="test")
     recordings = [frames.column("recording_id")[row] for row in held_out]
-    real = features(np.asarray(frames.array("frames")[held_out]), recordings)
+    real_frames = np.asarray(frames.array("frames")[held_out])
+    real = features(real_frames, recordings)
     references = features(*_pooled(reference)[:2])
     solutions = {
         (name, seed): picture
@@ -129,7 +131,8 @@ def sampling_errors(
         pictures, names, table = _pooled(manifests)
         is_reference, is_solution = number == 0, number == 1
         found = feature_errors(features(pictures, names), real, None if is_reference else references)
-        found += floors(references) if is_reference else []
+        found += [*floors(references), *realism_of_real(real_frames, recordings)] if is_reference else []
+        found += realism_of_samples(pictures, names, real_frames, recordings)
         if setting.is_deterministic and not is_solution:
             found += _pixel_errors(pictures, table, solutions)
         if model is not None:

@@ -6,7 +6,8 @@ each recording counts once, however many events it has. Distances:
     NAME                        magnitude of the difference of a number
     NAME_wasserstein_UNIT       Wasserstein-1 distance of a distribution: the area between the cumulative sums
     NAME_js_bits                Jensen-Shannon divergence of a distribution: 0 = equal, 1 = nothing in common; of
-                                `value` over 10 bins of 23 grey levels
+                                `value` over 11 bins of 21 grey levels, of `power_spectrum` over 12 bins of 0.06
+                                cycles per px
 
 Intervals are percentiles (95 %) under resampling of whole recordings; with fewer than `MIN_RECORDINGS` there is none.
 Resampling repeats recordings, which makes divergences a little larger: with few their interval may lie above the value.

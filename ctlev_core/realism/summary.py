@@ -19,13 +19,19 @@ Numbers of a recording (`summarise_events`; T = time between its first and last 
                             an event of a pixel to its next, 1 us and less in the first bin
 
 Numbers of the event images of a recording (`summarise_frames`; a pixel's value is its largest channel, it is active
-from 26 of 255 on, so that the faint rest that a decoder leaves does not count):
+from 25 of 255 on: one event counts where ten are white, the faint rest that a decoder leaves does not):
 
     active_pixel_share      active pixels / pixels
     positive_share          sum of red / (sum of red + sum of blue); only of images with colour
     speckle_share           active pixels in 8-connected pieces of at most 2 pixels / active pixels
+    isolated_pixel_share    active pixels without an active one among their 8 neighbours / active pixels
+    hot_pixel_share         pixels of at least 128 and more than 4 times the second largest value of their neighbours,
+                            / pixels
     value_mean              mean value of the active pixels
-    distributions           `value` of the active pixels
+    rms_contrast            standard deviation of the values of an image / 255, mean over images
+    neighbour_correlation   correlation of the values of neighbouring pixels, mean over images that are not of one value
+    distributions           `value` of the active pixels; `power_spectrum`: share of each spatial frequency, whatever
+                            its direction, in the power of an image without its mean, mean over images
 
 Numbers that are not defined for a recording (no events, no time) are left out there. Sets of recordings are compared in
 `realism.distances`.
@@ -41,11 +47,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ctlev_core.realism import frame_statistics
 from data_contracts.events import Events
 
 RADIUS_US = 10_000
 HOT_FACTOR, HOT_MIN_EVENTS = 10.0, 20
-ACTIVE_VALUE = 26
+ACTIVE_VALUE = 25
 SPECKLE_MAX_PX = 2
 
 
@@ -79,7 +86,8 @@ class Axis:
 AXES = {
     "pixel_rate": Axis(-3.0, 0.1, 80, "decades", "events per second of an active pixel"),
     "interval": Axis(0.0, 0.1, 80, "decades", "microseconds between two events of a pixel"),
-    "value": Axis(ACTIVE_VALUE - 0.5, 1.0, 256 - ACTIVE_VALUE, "grey levels", "value of an active pixel", 23),
+    "value": Axis(ACTIVE_VALUE - 0.5, 1.0, 256 - ACTIVE_VALUE, "grey levels", "value of an active pixel", 21),
+    "power_spectrum": Axis(0.0, 0.03, 24, "cycles per px", "spatial frequency, cycles per px", 2),
 }
 
 
@@ -154,10 +162,12 @@ def summarise_frames(frames: np.ndarray) -> Summary:
 
     if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
         raise ValueError(f"frames must be [N, H, W, 3] uint8, got {frames.shape} {frames.dtype}")
-    num_active = num_speckle = 0
+    num_active = num_speckle = num_isolated = num_hot = 0
     red = blue = 0
     value_counts = np.zeros(256, np.int64)
     has_colour = False
+    contrasts, correlations, spectra = [], [], []
+    ring_of = _bins(frame_statistics.radial_frequencies(frames.shape[1:3]), AXES["power_spectrum"]).reshape(-1)
     for frame in frames:
         values = frame.max(axis=2)
         active = values >= ACTIVE_VALUE
@@ -166,23 +176,43 @@ def summarise_frames(frames: np.ndarray) -> Summary:
         areas = statistics[1:, cv2.CC_STAT_AREA]
         num_active += int(active.sum())
         num_speckle += int(areas[areas <= SPECKLE_MAX_PX].sum())
+        num_isolated += frame_statistics.count_isolated(active)
+        num_hot += frame_statistics.count_hot(values)
         red, blue = red + int(frame[..., 0].sum(dtype=np.int64)), blue + int(frame[..., 2].sum(dtype=np.int64))
         has_colour = has_colour or bool((frame[..., 0] != frame[..., 2]).any())
+        contrasts.append(frame_statistics.rms_contrast(values))
+        correlations.append(frame_statistics.neighbour_correlation(values))
+        shares = frame_statistics.power_shares(values)
+        if shares is not None:
+            spectra.append(np.bincount(ring_of, shares.reshape(-1), AXES["power_spectrum"].num_bins))
     numbers: dict[str, float] = {}
     distributions = {}
-    if frames.size:
-        numbers["active_pixel_share"] = num_active / (frames.size // 3)
+    num_pixels = frames.size // 3
+    if num_pixels:
+        numbers["active_pixel_share"] = num_active / num_pixels
     if has_colour:
         numbers["positive_share"] = red / (red + blue)
     if num_active:
         of_active = value_counts[ACTIVE_VALUE:]
         numbers["speckle_share"] = num_speckle / num_active
+        numbers["isolated_pixel_share"] = num_isolated / num_active
         numbers["value_mean"] = float(of_active @ np.arange(ACTIVE_VALUE, 256)) / num_active
         distributions["value"] = of_active / num_active
+    if num_pixels:
+        numbers["hot_pixel_share"] = num_hot / num_pixels
+        numbers["rms_contrast"] = float(np.mean(contrasts))
+    if not np.isnan(correlations).all():
+        numbers["neighbour_correlation"] = float(np.nanmean(correlations))
+    if spectra:
+        distributions["power_spectrum"] = np.mean(spectra, axis=0)
     return Summary(numbers, distributions)
 
 
 def _histogram(values: np.ndarray, axis: Axis) -> np.ndarray:
-    bins = np.clip(np.floor((values - axis.low) / axis.width), 0, axis.num_bins - 1).astype(np.int64)
-    counts = np.bincount(bins, minlength=axis.num_bins)
+    counts = np.bincount(_bins(values, axis), minlength=axis.num_bins)
     return counts / counts.sum()
+
+
+def _bins(values: np.ndarray, axis: Axis) -> np.ndarray:
+    """The bin of each value, in the shape of the values."""
+    return np.clip(np.floor((values - axis.low) / axis.width), 0, axis.num_bins - 1).astype(np.int64)

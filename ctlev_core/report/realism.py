@@ -9,6 +9,7 @@ import numpy as np
 
 from ctlev_core.realism.summary import AXES
 from ctlev_core.report.html import Curves, Section, Table
+from ctlev_core.report.two_sample import two_sample_tables
 
 _HOW_TO_READ = (
     "Means over recordings, in brackets 95 % intervals under resampling of recordings. Distance: magnitude of the "
@@ -22,7 +23,9 @@ _TITLES = {
     "frames": (
         "How real do the synthetic frames look?",
         "Event images have no time stamps: what compares them is where and how bright their pixels are. Active: value "
-        "of 26 of 255 and more. Speckle: active pixels in pieces of one or two.",
+        "of 25 of 255 and more. Speckle: active pixels in pieces of one or two; isolated: without an active one "
+        "around; hot: 128 and more, and four times those around. Contrast: standard deviation over full scale. c2st: "
+        "how well a network tells the two sets apart, 0.5 = not at all.",
     ),
     "events": (
         "How alike are the real recordings?",
@@ -39,14 +42,19 @@ _OF_BASELINE = "How real do the frames of {} look?"
 _RATIO_COLUMN, _DISTANCE_COLUMN = 3, 4
 
 
-def realism_sections(rows: Sequence[dict[str, Any]], distributions: Sequence[dict[str, Any]]) -> list[Section]:
-    """Tables of numbers and distances, and a chart of the values of active pixels.
+def realism_sections(
+    rows: Sequence[dict[str, Any]],
+    distributions: Sequence[dict[str, Any]],
+    tests: Sequence[dict[str, Any]] = (),
+) -> list[Section]:
+    """Tables of numbers and distances, the two-sample tests, and charts of values and power spectra.
 
     Args:
         rows: of the table `scores` with the task `realism`.
         distributions: of the table `distributions`.
+        tests: of the table `two_sample_tests`.
     Returns:
-        One table a group, frames first; the chart follows the frames of the first generator where they have values.
+        One table a group, frames first; tests and charts follow the frames of the first generator.
     """
     sections: list[Section] = []
     how_to_read = _HOW_TO_READ
@@ -59,23 +67,46 @@ def realism_sections(rows: Sequence[dict[str, Any]], distributions: Sequence[dic
             sections.append(_table(of_group, titled, f"{caption} {how_to_read}".strip()))
             how_to_read = "To be read like the table of frames."
         if group == "frames":
-            sections += _values([row for row in distributions if row["axis"] == "value"])
+            sections += two_sample_tables(tests)
+            sections += _values(_series(distributions, "value"))
+            sections += _spectra(_series(distributions, "power_spectrum"))
     return sections
 
 
-def _values(rows: Sequence[dict[str, Any]]) -> list[Section]:
-    series: dict[str, tuple[Sequence[float], Sequence[float]]] = {}
+Series = dict[str, tuple[list[float], list[float]]]
+
+
+def _series(distributions: Sequence[dict[str, Any]], axis: str) -> Series:
+    """Middles and shares of the bins, by set."""
+    rows = [row for row in distributions if row["axis"] == axis]
+    series: Series = {}
     # Real frames are in the comparison with each generator, and the same in all.
     groups = {row["setting"]: row["group"] for row in reversed(rows)}
     for setting in dict.fromkeys(row["setting"] for row in rows):
         of_set = [row for row in rows if row["setting"] == setting and row["group"] == groups[setting]]
-        series[setting] = ([row["centre"] for row in of_set], np.cumsum([row["share"] for row in of_set]).tolist())
+        series[setting] = ([row["centre"] for row in of_set], [row["share"] for row in of_set])
+    return series
+
+
+def _values(series: Series) -> list[Section]:
+    series = {name: (centres, np.cumsum(shares).tolist()) for name, (centres, shares) in series.items()}
     caption = (
         "The area between the lines is their Wasserstein-1 distance in grey levels. Real lines have steps: event "
         "images hold few different counts."
     )
     title, labels = "Brightness of active pixels", (AXES["value"].label, "share of active pixels up to it")
     return [Curves(title, series, *labels, caption=caption)] if series else []
+
+
+def _spectra(series: Series) -> list[Section]:
+    """On a logarithmic axis, without the rings in which an image of this size has no frequency."""
+    shown = {}
+    for name, (centres, shares) in series.items():
+        kept = [(centre, share) for centre, share in zip(centres, shares, strict=True) if share > 0]
+        shown[name] = ([centre for centre, _ in kept], [share for _, share in kept])
+    caption = "Share of each spatial frequency, whatever its direction, in the power of an image without its mean."
+    labels = AXES["power_spectrum"].label, "share of the power"
+    return [Curves("Power spectrum", shown, *labels, log_y=True, caption=caption)] if shown else []
 
 
 def _table(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:

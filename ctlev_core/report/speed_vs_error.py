@@ -20,6 +20,7 @@ from ctlev_core.report.measurement_charts import (
     rows_of,
 )
 from ctlev_core.report.solver_studies import exact_score_sections, precision_sections
+from ctlev_core.report.speed_realism import realism_table
 from ctlev_core.sampling_errors import (
     CONTROLNET,
     CONVERGED,
@@ -174,6 +175,7 @@ class SpeedPage:
             *self.distance_charts(),
             *self.solution_charts(),
             self.settings(),
+            realism_table(self.rows, self._name),
             self._grid(),
             *exact_score_sections(self.rows),
             *precision_sections(self.rows),

@@ -8,6 +8,7 @@ from flow_scripts import artefacts
 
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.summary import summarise_frames
+from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from data_contracts.manifest import ManifestRef, read_manifest
 
 
@@ -18,7 +19,11 @@ def only_artefact(home, stage):
 
 def test_the_report_sets_synthetic_beside_real(smoke_home):
     page = (smoke_home / "reports" / "smoke.html").read_text()
-    for expected in ("How real do the synthetic frames look?", "How alike are the real recordings?", "noise_rate_hz"):
+    for expected in (
+        "How real do the synthetic frames look?", "How alike are the real recordings?", "noise_rate_hz",
+        "Can a network tell synthetic from recorded frames?", "fewer than 40 frames in a set", "isolated_pixel_share",
+        "Power spectrum",
+    ):  # fmt: skip
         assert expected in page
     published = pq.read_table(smoke_home / "reports" / "smoke" / "realism.parquet")
     assert published.equals(only_artefact(smoke_home, "realism").table)
@@ -37,6 +42,18 @@ def test_numbers_are_those_of_the_frames_that_were_sampled(smoke_home):
         assert 0 <= found["frames", setting, "value_js_bits"]["value"] <= 1
 
 
+def test_generator_and_baselines_are_told_from_recorded_frames_or_it_says_why_not(smoke_home):
+    tests = only_artefact(smoke_home, "realism").attached(TWO_SAMPLE_TESTS).to_pylist()
+    names = ("synthetic", "event_gan", "smpl_esim")
+    expected = {f"{name} against {other}" for name in names for other in ("real", "test")}
+    assert {test["setting"] for test in tests} == expected | {
+        "real against real",
+        "test against test",
+        "test against real",
+    }
+    assert all(test["value"] is None and test["note"] for test in tests), "smoke has too few frames for any"
+
+
 def test_distributions_add_up_to_1(smoke_home):
     table = only_artefact(smoke_home, "realism").attached(DISTRIBUTIONS).to_pylist()
     sums: dict[tuple, float] = {}
@@ -44,4 +61,5 @@ def test_distributions_add_up_to_1(smoke_home):
         key = (row["group"], row["setting"], row["axis"])
         sums[key] = sums.get(key, 0) + row["share"]
     assert {("events", "train", "interval"), ("events", "test", "pixel_rate"), ("frames", "real", "value")} <= set(sums)
+    assert ("frames", "synthetic", "power_spectrum") in sums
     np.testing.assert_allclose(list(sums.values()), 1)

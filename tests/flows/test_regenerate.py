@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from flow_scripts import digests, run_script, script
 
+from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.published import Version, latest_frames, published_folder, read_latest, read_versions
 from tasks.stage import in_one_run, planning
@@ -142,6 +143,18 @@ def test_what_no_gate_asks_for_is_not_scored(home, make_version):
     version = make_version(home, *(f"gates.{name}=null" for name in GATES))
     assert version.passed and version.checks == ()
     assert {artefact.stage for artefact in version.scored_in} == {"score_beside_real", "copy_check"}
+
+
+def test_statistics_of_the_frames_can_be_gates(home, make_version):
+    limits = "gates.max_realism_distances={active_pixel_share: 1, isolated_pixel_share: 1}"
+    version = make_version(home, limits)
+    checks = [check for check in version.checks if check.gate == "max_realism_distances"]
+    assert [check.score for check in checks] == ["active_pixel_share against real", "isolated_pixel_share against real"]
+    assert all(check.passed for check in checks)
+    assert "realism" in {artefact.stage for artefact in version.scored_in}
+    assert version.scores["synthetic against real, frames: active_pixel_share"] == checks[0].value
+    with pytest.raises(DataError, match="max_c2st: needs 40 frames"):
+        make_version(home, "gates.max_c2st=0.9")
 
 
 def test_an_interrupted_version_goes_on_from_its_samples(home, make_version, monkeypatch):

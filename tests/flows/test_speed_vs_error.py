@@ -51,6 +51,8 @@ def test_the_page_recommends_and_shows(measured):
         "Distance to held-out real frames",
         "ddpm in 12 steps: 95 %",
         "Exact score: trajectory",
+        "How real do the frames of each setting look?",
+        "fewer than 40 frames",
         "networks bfloat16, state float32",
         "data:image/png;base64,",
     ):

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 
 from ctlev_core.copy_check import CLOSEST_PAIRS
 from ctlev_core.realism.distances import DISTRIBUTIONS
+from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from data_contracts import tables
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, ManifestRef, label_columns, read_manifest, write_manifest
@@ -35,7 +36,8 @@ class Experiment:
         self.model_names = [f"{name}, seed {seed}" for name in SETTINGS for seed in seeds]
         self.models = [self._training("train_downstream") for _ in self.model_names]
         self.scores = self._scores()
-        self.realism = self._put("realism", _realism(), tables.SCORES, {DISTRIBUTIONS.name: _distributions()})
+        beside = {DISTRIBUTIONS.name: _distributions(), TWO_SAMPLE_TESTS.name: _tests()}
+        self.realism = self._put("realism", _realism(), tables.SCORES, beside)
         self.copies = [self._copies(name) for name in ("synthetic", "gan")]
 
     @property
@@ -194,3 +196,9 @@ def _realism() -> pa.Table:
 def _distributions() -> pa.Table:
     row = {"group": "frames", "setting": "real", "axis": "value", "centre": 30.0, "share": 1.0}
     return pa.Table.from_pylist([row], schema=DISTRIBUTIONS.arrow())
+
+
+def _tests() -> pa.Table:
+    unknown = dict.fromkeys(("value", "low", "high", "deviation"))
+    row = {"group": "frames", "setting": "synthetic against real", "num_first": 12, "num_second": 6, **unknown}
+    return pa.Table.from_pylist([{**row, "note": "too few frames"}], schema=TWO_SAMPLE_TESTS.arrow())

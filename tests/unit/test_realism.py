@@ -166,14 +166,16 @@ def test_numbers_of_an_image_by_hand():
     frame[0, 0, 0, 0] = 200  # a speckle of one
     frame[0, 5, 6:8, 2] = 100  # a speckle of two
     frame[0, 2:4, 2:4, 0] = 50  # a piece of four
-    frame[0, 0, 7] = 25  # below the limit
+    frame[0, 0, 7] = 24  # below the limit
     summary = summarise_frames(frame)
     assert summary.numbers["active_pixel_share"] == 7 / 48
     assert summary.numbers["speckle_share"] == 3 / 7
+    assert summary.numbers["isolated_pixel_share"] == 1 / 7
+    assert summary.numbers["hot_pixel_share"] == 1 / 48
     assert summary.numbers["value_mean"] == pytest.approx((200 + 2 * 100 + 4 * 50) / 7)
-    assert summary.numbers["positive_share"] == pytest.approx(425 / (425 + 225))
+    assert summary.numbers["positive_share"] == pytest.approx(424 / (424 + 224))
     value = summary.distributions["value"]
-    assert {int(v): value[v - 26] for v in (50, 100, 200)} == pytest.approx({50: 4 / 7, 100: 2 / 7, 200: 1 / 7})
+    assert {int(v): value[v - 25] for v in (50, 100, 200)} == pytest.approx({50: 4 / 7, 100: 2 / 7, 200: 1 / 7})
 
 
 def test_diagonal_neighbours_belong_together():
@@ -187,7 +189,8 @@ def test_images_without_colour_have_no_polarity_and_black_ones_no_values():
     grey = summarise_frames(np.full((2, 4, 4, 3), 99, np.uint8))
     assert "positive_share" not in grey.numbers and grey.numbers["active_pixel_share"] == 1
     black = summarise_frames(np.zeros((2, 4, 4, 3), np.uint8))
-    assert black.numbers == {"active_pixel_share": 0} and black.distributions == {}
+    assert black.numbers == {"active_pixel_share": 0, "hot_pixel_share": 0, "rms_contrast": 0}
+    assert black.distributions == {}
     assert summarise_frames(np.zeros((0, 4, 4, 3), np.uint8)).numbers == {}
     with pytest.raises(ValueError, match=r"frames must be \[N, H, W, 3\] uint8"):
         summarise_frames(np.zeros((1, 4, 4), np.uint8))

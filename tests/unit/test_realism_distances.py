@@ -18,7 +18,7 @@ from ctlev_core.realism.distances import (
     mean_distributions,
     wasserstein,
 )
-from ctlev_core.realism.summary import AXES, Summary
+from ctlev_core.realism.summary import ACTIVE_VALUE, AXES, Summary
 
 BINS = AXES["interval"].num_bins
 SHARES = st.lists(st.integers(0, 9), min_size=6, max_size=6).filter(any).map(lambda n: np.array(n) / sum(n))
@@ -110,7 +110,7 @@ def test_equal_seeds_give_equal_intervals():
 
 def test_the_divergence_of_values_takes_near_grey_levels_as_one():
     def at_value(value: int) -> Summary:
-        return Summary({}, {"value": np.eye(AXES["value"].num_bins)[value - 26]})
+        return Summary({}, {"value": np.eye(AXES["value"].num_bins)[value - ACTIVE_VALUE]})
 
     near, far = (estimate_distances([at_value(30)], [at_value(value)]) for value in (40, 200))
     assert (near["value_js_bits"].value, far["value_js_bits"].value) == (0, 1)

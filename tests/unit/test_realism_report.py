@@ -94,3 +94,38 @@ def test_what_is_missing_is_left_out():
     assert isinstance(only, Table) and only.rows == [["spread", "0.5", "", "", "", ""]]
     page = render_report(title="t", lead="", verdict="", sections=realism_sections(ROWS, DISTRIBUTIONS))
     assert "How real do the synthetic frames look?" in page and "<svg" in page
+
+
+def told(setting: str, value: float | None, low: float | None, high: float | None, note: str = "") -> dict:
+    return {
+        "group": "frames", "setting": setting, "value": value, "low": low, "high": high, "deviation": value and 0.0123,
+        "num_first": 50, "num_second": 50, "note": note,
+    }  # fmt: skip
+
+
+def test_the_two_sample_tests_of_all_generators_stand_below_those_of_recorded_frames():
+    tests = [
+        told("synthetic against real", 0.75, 0.625, 0.875),
+        told("gan against test", None, None, None, "fewer than 40 frames in a set"),
+        told("real against real", 0.5, 0.375, 0.625),
+        told("test against real", 0.625, None, None),
+    ]
+    frames, table, values, _ = realism_sections(ROWS, DISTRIBUTIONS, tests)
+    assert isinstance(frames, Table) and isinstance(values, Curves) and isinstance(table, Table)
+    assert table.rows == [
+        ["recorded training frames: halves", "0.500 [0.375, 0.625]", "0.012", "50 + 50", ""],
+        ["recorded training from recorded test frames", "0.625", "0.012", "50 + 50", ""],
+        ["synthetic from recorded training frames", "0.750 [0.625, 0.875]", "0.012", "50 + 50", ""],
+        ["gan from recorded test frames", None, None, "50 + 50", "fewer than 40 frames in a set"],
+    ]
+    assert set(table.bold) == {(2, 1)}
+    page = render_report(title="t", lead="", verdict="", sections=[table])
+    assert "fewer than 40 frames in a set" in page
+
+
+def test_power_spectra_are_a_chart():
+    spectra = [{**one, "axis": "power_spectrum"} for one in DISTRIBUTIONS if one["axis"] == "value"]
+    empty = [{**one, "axis": "power_spectrum", "centre": 25.0, "share": 0.0} for one in spectra[::2]]
+    _, chart, _ = realism_sections(ROWS, [*empty, *spectra])
+    assert isinstance(chart, Curves) and chart.title == "Power spectrum" and chart.log_y
+    assert chart.series == {"real": ([26.0, 27.0], [0.75, 0.25]), "synthetic": ([26.0, 27.0], [0.5, 0.5])}

@@ -15,7 +15,7 @@ def row(task, setting, metric, value, group="all"):
     return {"task": task, "setting": setting, "metric": metric, "value": value, "group": group, "num_samples": 1000}
 
 
-def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px"):
+def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px", realism=(0.75, 0.1)):
     real_error = 6.0 if metric == "mpjpe2d_px" else 0.75
     return [
         row("distance", "held-out real", f"fd_event_classifier_{DIGEST}", 3.0),
@@ -30,6 +30,11 @@ def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px"):
         row("net", "real", "pck_px4", 0.9),
         row("net", "labels of synthetic", metric, error),
         row("net", "labels of synthetic", "pck_px4", 0.1),
+        row("realism", "synthetic against real", "c2st", 0.99, "frames"),
+        row("realism", "synthetic against test", "c2st", realism[0], "frames"),
+        row("realism", "real against real", "isolated_pixel_share", 0.9, "frames"),
+        row("realism", "synthetic", "isolated_pixel_share", 0.9, "frames"),
+        row("realism", "synthetic against real", "isolated_pixel_share", realism[1], "frames"),
     ]
 
 
@@ -52,6 +57,8 @@ def check(gates, found, refused_share=0.0):
             0.5,
         ),
         ({"max_copies_share": 0.02}, scores(), scores(copies=(0.03, 0.0)), 0.02),
+        ({"max_c2st": 0.75}, scores(), scores(realism=(0.76, 0.1)), 0.75),
+        ({"max_realism_distances": {"isolated_pixel_share": 0.1}}, scores(), scores(realism=(0.5, 0.11)), 0.1),
     ],
 )
 def test_each_gate_is_kept_up_to_its_limit(gate, at_limit, above, limit):
@@ -75,6 +82,8 @@ def test_gates_that_are_not_asked_need_no_scores():
         ({"max_distance_ratio": 2}, ("distance", "held-out real", "fd_")),
         ({"max_label_error_ratio": 2}, ("net", "real", "")),
         ({"max_copies_share": 1}, ("copies", "synthetic", "close")),
+        ({"max_c2st": 1}, ("realism", "synthetic against test", "c2st")),
+        ({"max_realism_distances": {"isolated_pixel_share": 1}}, ("realism", "synthetic against real", "isolated")),
     ],
 )
 def test_a_gate_without_its_score_is_no_gate_that_was_kept(gate, without):

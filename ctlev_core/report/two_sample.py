@@ -1,0 +1,52 @@
+"""The table of the report that says how well a network tells frames from recorded ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ctlev_core.intervals import score_text
+from ctlev_core.realism.two_sample import MIN_FRAMES
+from ctlev_core.report.tables import Cell, Table
+
+_CAPTION = (
+    "A small network learns from half of the recordings which of two sets a frame is from. Area: under the ROC curve "
+    "on the other half, mean over four trainings (two random halvings, each half once to learn from), with its 95 % "
+    "interval over recordings and trainings; sd: over the trainings. 0.5 = it cannot tell, 1 = it always can. A "
+    "different mix of classes or poses is told as well as a different look, and so is a set of few frames over and "
+    "over. The rows of recorded frames say what chance and other subjects make alone. With fewer than "
+    f"{MIN_FRAMES} frames in a set no area is given. Bold: told apart, the interval lies above 0.5."
+)
+_AREA_COLUMN = 1
+_NAMES = {
+    "real against real": "recorded training frames: halves",
+    "test against test": "recorded test frames: halves",
+    "test against real": "recorded training from recorded test frames",
+}
+
+
+def two_sample_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
+    """One row a pair of sets, those of recorded frames first; no table without rows.
+
+    Args:
+        rows: of the table `two_sample_tests`.
+    """
+    body: list[list[Cell]] = []
+    bold: set[tuple[int, int]] = set()
+    for row in sorted(rows, key=lambda row: row["setting"] not in _NAMES):
+        area = deviation = None
+        if row["value"] is not None:
+            area, deviation = score_text(row["value"], row["low"], row["high"]), f"{row['deviation']:.3f}"
+            if row["low"] is not None and row["low"] > 0.5:
+                bold.add((len(body), _AREA_COLUMN))
+        counts = f"{row['num_first']} + {row['num_second']}"
+        body.append([_name(row["setting"]), area, deviation, counts, row["note"]])
+    columns = ["frames", "area (c2st)", "sd", "number", "note"]
+    title = "Can a network tell synthetic from recorded frames?"
+    return [Table(title, columns, body, caption=_CAPTION, bold=bold)] if body else []
+
+
+def _name(setting: str) -> str:
+    first, _, second = setting.partition(" against ")
+    against = {"real": "recorded training frames", "test": "recorded test frames"}.get(second, second)
+    return _NAMES.get(setting, f"{first} from {against}")

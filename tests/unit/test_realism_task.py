@@ -1,0 +1,118 @@
+"""The stage `realism` on frames made by hand: what the two-sample tests compare, and when there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from ctlev_core.realism import two_sample
+from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
+from data_contracts import tables
+from data_contracts.labels import Labels
+from data_contracts.manifest import label_columns, read_manifest, write_manifest
+from tasks.realism import realism
+from tasks.stage import Output
+
+
+def frame_set(folder, pictures, recordings, splits):
+    folder.mkdir(parents=True)
+    count = len(pictures)
+    np.save(folder / "frames.npy", pictures)
+    columns = {
+        "sample_id": [f"{name}:{row}" for row, name in enumerate(recordings)], "recording_id": recordings,
+        "subject": recordings, "split": splits, "class_name": ["a"] * count,
+        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), pa.array([1] * count, pa.int64())),
+        **label_columns(Labels(("a",) * count, np.zeros(count, np.int64))),
+    }  # fmt: skip
+    return read_manifest(write_manifest(folder, pa.table(columns), tables.FRAMES))
+
+
+def synthetic_set(folder, pictures, sources):
+    folder.mkdir(parents=True)
+    count = len(pictures)
+    np.save(folder / "frames.npy", pictures)
+    names = [f"made/{row}" for row in range(count)]
+    columns = {
+        "sample_id": names, "recording_id": names, "condition_id": names, "source_id": [f"{s}:0" for s in sources],
+        "subject": ["ann"] * count, "split": ["train"] * count, "class_name": ["a"] * count, "prompt": ["p"] * count,
+        "generator": ["g"] * count, "checkpoint_digest": ["c"] * count, "scheduler": ["ddim"] * count,
+        "num_inference_steps": pa.array([4] * count, pa.int32()), "guidance_scale": [1.0] * count,
+        "seed": [0] * count, "num_tries": pa.array([1] * count, pa.int32()), "refused": [""] * count,
+        **label_columns(Labels(("a",) * count, np.zeros(count, np.int64))),
+    }  # fmt: skip
+    table = pa.table(columns).select([column.name for column in tables.SYNTHETIC.columns])
+    return read_manifest(write_manifest(folder, table, tables.SYNTHETIC))
+
+
+def noise(count, share, seed):
+    active = np.random.default_rng(seed).random((count, 12, 12, 1)) < share
+    return (active * np.uint8(150)).repeat(3, axis=-1)
+
+
+@pytest.fixture
+def run(tmp_path):
+    def call(real, generated, names=("synthetic", "gan")):
+        folder = tmp_path / "made"
+        folder.mkdir()
+        table = realism.function(Output(folder, folder), None, real, generated, None, names=names)
+        tests = pq.read_table(folder / f"{TWO_SAMPLE_TESTS.name}.parquet").to_pylist()
+        return table.to_pylist(), {(test["group"], test["setting"]): test for test in tests}
+
+    return call
+
+
+def test_every_generator_is_told_from_training_and_test_frames_beside_both_floors(tmp_path, run):
+    count = 80
+    recordings = [f"r{row // 2}" for row in range(2 * count)]
+    real = frame_set(tmp_path / "real", noise(2 * count, 0.2, 0), recordings, ["train"] * count + ["test"] * count)
+    alike = synthetic_set(tmp_path / "alike", noise(count, 0.2, 1), ["elsewhere"] * count)
+    other = synthetic_set(tmp_path / "other", noise(count, 0.6, 2), ["elsewhere"] * count)
+    rows, tests = run(real, [alike, other])
+    assert set(tests) == {
+        ("frames", "real against real"), ("frames", "test against real"), ("frames", "test against test"),
+        ("frames", "synthetic against real"),
+        ("frames", "synthetic against test"), ("frames of gan", "gan against real"),
+        ("frames of gan", "gan against test"),
+    }  # fmt: skip
+    for (group, setting), test in tests.items():
+        if setting.startswith("gan"):
+            assert test["value"] > 0.95
+        else:
+            assert test["low"] < 0.5 < test["high"], (group, setting)
+    scored = {(row["group"], row["setting"]): row for row in rows if row["metric"] == "c2st"}
+    floors = ("real against real", "test against test", "test against real")
+    assert set(scored) == {*tests, *(("frames of gan", setting) for setting in floors)}
+    found = scored["frames of gan", "gan against test"]
+    assert (found["value"], found["low"]) == tuple(
+        tests["frames of gan", "gan against test"][k] for k in ("value", "low")
+    )
+    assert found["num_samples"] == count
+    assert {row["group"] for row in rows} == {"frames", "frames of gan"}, "no recordings, no events"
+
+
+def test_with_few_frames_the_table_says_why_and_the_scores_have_no_row(tmp_path, run):
+    real = frame_set(tmp_path / "real", noise(20, 0.2, 0), [f"r{row}" for row in range(20)], ["train"] * 20)
+    made = synthetic_set(tmp_path / "made_set", np.zeros((50, 12, 12, 3), np.uint8), ["elsewhere"] * 50)
+    rows, tests = run(real, [made], ("synthetic",))
+    assert all(test["value"] is None and "fewer than 40 frames" in test["note"] for test in tests.values())
+    assert not [row for row in rows if row["metric"] == "c2st"]
+    assert tests["frames", "synthetic against test"]["num_second"] == 0
+
+
+def test_frames_made_from_a_recording_are_held_out_with_it(tmp_path, run, monkeypatch):
+    count = 40
+    recordings = [f"r{row}" for row in range(count)]
+    real = frame_set(tmp_path / "real", noise(count, 0.2, 0), recordings, ["train"] * count)
+    made = synthetic_set(tmp_path / "made_set", noise(count, 0.2, 1), [*recordings[:-1], "elsewhere"])
+    seen = []
+    compare = two_sample.compare_frames
+
+    def watch(first, second, **groups):
+        seen.append(groups["first_groups"].tolist())
+        return compare(first, second, **groups)
+
+    monkeypatch.setattr(two_sample, "compare_frames", watch)
+    run(real, [made], ("synthetic",))
+    assert [*recordings[:-1], f"made/{count - 1}"] in seen
