@@ -26,7 +26,7 @@ from ctlev_core.condition_sources import (
 from ctlev_core.labelling import labels_in_image
 from ctlev_core.plugins import Plugin
 from ctlev_core.pose_choice import balanced_choice, surrounded
-from ctlev_core.row_seeds import row_seeds
+from ctlev_core.seeds import row_seeds
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.arrays import ArrayWriter

@@ -22,7 +22,7 @@ from ctlev_core.diffusion.sampling_shards import SHARD
 from ctlev_core.dithering import dither_counts
 from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
 from ctlev_core.image_geometry import check_whole_counts
-from ctlev_core.row_seeds import row_seeds
+from ctlev_core.seeds import row_seeds
 from ctlev_core.windows import spread, window_around
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows

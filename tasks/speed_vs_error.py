@@ -12,7 +12,6 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling_options import STOCHASTIC
-from ctlev_core.row_seeds import row_seeds
 from ctlev_core.sampling_errors import (
     CPU,
     EXACT,
@@ -31,6 +30,7 @@ from ctlev_core.sampling_errors import (
     pixel_error,
 )
 from ctlev_core.sampling_realism import realism_of_real, realism_of_samples
+from ctlev_core.seeds import row_seeds
 from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice, SamplingChoice

@@ -10,7 +10,7 @@ from flow_scripts import artefacts, run_script
 from ctlev_core.downstream import classifier
 from ctlev_core.frechet import frechet_distance
 from ctlev_core.generators import controlnet
-from ctlev_core.row_seeds import row_seeds
+from ctlev_core.seeds import row_seeds
 from data_contracts.labels import Conditions
 
 # So many test recordings that intervals, and with them a recommendation, can be given; nothing that is not measured.

@@ -13,7 +13,7 @@ from ctlev_core import plugins
 from ctlev_core.diffusion import sampling
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.image_gate import find_causes, fit_gate, seed_of_try
-from ctlev_core.row_seeds import row_seeds
+from ctlev_core.seeds import row_seeds
 from data_contracts import tables
 from data_contracts.config import SamplingChoice
 from data_contracts.labels import Conditions, Labels
