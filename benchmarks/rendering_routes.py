@@ -19,7 +19,7 @@ import numpy as np
 from analytic_surfaces import CENTRE, Surface, capsule, compare, exact_normals, sphere
 
 from ctlev_core.body.layer import load_body, pose_vertices
-from ctlev_core.body.motions import sample_pose
+from ctlev_core.body.motion.procedural import sample_pose
 from ctlev_core.render.gl import gl_available
 from ctlev_core.render.normals import render_normals
 from ctlev_core.render.rasteriser import NEAR_M, rasterise_normals, vertex_normals

@@ -98,7 +98,7 @@ def motion_around(track: Labels, moment_us: int, half_us: int, where: str) -> tu
     Raises:
         DataError: the labels have no SMPL parameters, or those around the moment are of no more than one time.
     """
-    from ctlev_core.body.motion_clip import MotionClip, resample
+    from ctlev_core.body.motion.clip import MotionClip, resample
 
     if track.smpl_pose is None or track.smpl_betas is None or track.smpl_transl is None:
         raise DataError(f"{where}: needs labels with SMPL parameters to see a body move")

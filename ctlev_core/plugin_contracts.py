@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ctlev_core.body.motion_clip import MotionClip
+from ctlev_core.body.motion.clip import MotionClip
 from data_contracts.config import Frozen
 from data_contracts.events import Events, SensorSize
 from data_contracts.labels import BodyMotions, Conditions, History, ImageTrack, Labels, Recording
@@ -115,7 +115,7 @@ class Format(Protocol):
 class MotionFormat(Protocol):
     """A file format of motions: poses over time.
 
-    `HAS_SIGNATURE = False` has the meaning that it has for a `Format` (`ctlev_core.motion_formats.find_format`).
+    `HAS_SIGNATURE = False` has the meaning that it has for a `Format` (`ctlev_core.body.motion.files.find_format`).
     """
 
     VERSION: int

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctlev_core.body.everyday_motions import EVERYDAY_MOTIONS
-from ctlev_core.body.keyframes import MOTIONS
+from ctlev_core.body.motion.everyday_keyframes import EVERYDAY_MOTIONS
+from ctlev_core.body.motion.keyframes import MOTIONS
 from ctlev_core.body.motion_sentences import Action
 from ctlev_core.body.motion_words import MAX_DURATION_S, MotionWord
 from data_contracts.errors import DataError

@@ -11,13 +11,11 @@ from typing import Protocol
 
 import numpy as np
 
-from ctlev_core.body.foot_planting import LEG_JOINTS, plant_feet
-from ctlev_core.body.ground_contact import body_path, find_contact
 from ctlev_core.body.layer import NUM_BETAS, NUM_JOINTS, joint_transforms, load_body
-from ctlev_core.body.motion_clip import MotionClip, check_clip
-from ctlev_core.body.motion_plan import Piece, plan_pieces
-from ctlev_core.body.motion_sentences import parse_sentence
-from ctlev_core.body.motions import (
+from ctlev_core.body.motion.clip import MotionClip, check_clip
+from ctlev_core.body.motion.foot_planting import LEG_JOINTS, plant_feet
+from ctlev_core.body.motion.ground_contact import body_path, find_contact
+from ctlev_core.body.motion.procedural import (
     COLUMN,
     SIDE_CHANNELS,
     MotionStyle,
@@ -25,6 +23,8 @@ from ctlev_core.body.motions import (
     find_motion,
     rotations_from_channels,
 )
+from ctlev_core.body.motion_plan import Piece, plan_pieces
+from ctlev_core.body.motion_sentences import parse_sentence
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle, matrix_from_euler, slerp
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from ctlev_core.body.motion_clip import (
+from ctlev_core.body.motion.clip import (
     REST_PELVIS,
     MotionClip,
     check_clip,

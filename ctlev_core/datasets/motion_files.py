@@ -27,9 +27,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import motion_formats
-from ctlev_core.body.motion_clip import Z_UP_TO_Y_UP, MotionClip
-from ctlev_core.body.motion_clip import move_world as _move_world
+from ctlev_core.body.motion import files as motion_formats
+from ctlev_core.body.motion.clip import Z_UP_TO_Y_UP, MotionClip
+from ctlev_core.body.motion.clip import move_world as _move_world
 from ctlev_core.dataset_files.pose_sources import PoseSourceOptions
 from ctlev_core.dataset_files.pose_sources import labels_before_camera as _labels_before_camera
 from ctlev_core.dataset_files.trees import check_inside, list_folder, recording_ids
@@ -126,7 +126,7 @@ def _read_clip(file: Path, options: Options) -> MotionClip:
     if options.up != "y":
         clip = _move_world(clip, _UP_AXES[options.up], np.zeros(3))
     if options.on_ground:
-        from ctlev_core.body.ground_level import put_feet_on_ground
+        from ctlev_core.body.motion.ground_level import put_feet_on_ground
 
         clip = put_feet_on_ground(clip)
     return replace(clip, caption=" ".join(clip.caption.split()))

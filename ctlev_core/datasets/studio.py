@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
+from ctlev_core.body.motion.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.sensor_choice import read_sensor, sensor_preset_files
 from ctlev_core.studio_options import Options
 from data_contracts.errors import DataError
@@ -28,7 +28,7 @@ from data_contracts.events import Events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
 
 if TYPE_CHECKING:
-    from ctlev_core.body.motions import MotionStyle
+    from ctlev_core.body.motion.procedural import MotionStyle
     from ctlev_core.camera import Camera
     from ctlev_core.render.moving_body import MovingBody
     from ctlev_core.render.scene import Subject
@@ -95,7 +95,7 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     Raises:
         DataError: the recording is not one of the studio with these options.
     """
-    from ctlev_core.body.motions import pose_at
+    from ctlev_core.body.motion.procedural import pose_at
     from ctlev_core.body_views import labels_in_camera, with_joints
 
     performance = _perform(recording, options)
@@ -171,7 +171,7 @@ class _Performance:
 
 def _perform(recording: Recording, options: Options) -> _Performance:
     from ctlev_core.body.layer import joint_transforms, load_body
-    from ctlev_core.body.motions import pose_at, sample_style
+    from ctlev_core.body.motion.procedural import pose_at, sample_style
 
     *entropy, number = _entropy(recording, options)
     style = sample_style(recording.class_name, np.random.default_rng(entropy))
@@ -211,7 +211,7 @@ def _subject(recording: Recording, entropy: list[int], options: Options) -> Subj
 
 def _film(recording: Recording, options: Options) -> MovingBody:
     """The person in motion, under a light and before a wall drawn at random."""
-    from ctlev_core.body.motions import pose_at
+    from ctlev_core.body.motion.procedural import pose_at
     from ctlev_core.render.moving_body import MovingBody
     from ctlev_core.render.scene import sample_background, sample_light
 

@@ -21,8 +21,9 @@ from pathlib import Path
 
 from pydantic import Field
 
-from ctlev_core import motion_formats, plugins
-from ctlev_core.body.motion_clip import MotionClip
+from ctlev_core import plugins
+from ctlev_core.body.motion import files as motion_formats
+from ctlev_core.body.motion.clip import MotionClip
 from ctlev_core.dataset_files.pose_sources import PoseSourceOptions
 from ctlev_core.dataset_files.pose_sources import labels_before_camera as _labels_before_camera
 from ctlev_core.dataset_files.trees import check_inside, list_folder

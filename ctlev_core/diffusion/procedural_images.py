@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from ctlev_core.body.layer import joint_transforms, load_body
-from ctlev_core.body.motions import SEEN, UNSEEN, pose_at, sample_style
+from ctlev_core.body.motion.procedural import SEEN, UNSEEN, pose_at, sample_style
 from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.body_views import labels_in_camera
 from ctlev_core.camera import is_inside, project

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.body.motion_clip import MotionClip, check_clip
+from ctlev_core.body.motion.clip import MotionClip, check_clip
 from data_contracts.errors import DataError
 
 VERSION = 1

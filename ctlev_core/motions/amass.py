@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.body.motion_clip import Z_UP_TO_Y_UP, MotionClip, check_clip, move_world
+from ctlev_core.body.motion.clip import Z_UP_TO_Y_UP, MotionClip, check_clip, move_world
 from ctlev_core.safe_files.numpy_files import list_npz, read_npz
 from data_contracts.errors import DataError
 

@@ -5,7 +5,7 @@ channels are degrees and turn one after the other, each about an axis that the o
 Position channels replace the OFFSET of their joint, axis by axis, which is how MotionBuilder and Blender write them.
 
 No BVH says its unit: CMU's conversions have 0.45 inches, others centimetres or metres. None is needed, for the motion
-is scaled to the legs of the body (`ctlev_core.body.retargeting`). Up is the axis along which the rest pose stands, or
+is scaled to the legs of the body (`ctlev_core.body.motion.retargeting`). Up is the axis along which the rest pose stands, or
 the one along which the person stands while it moves, where that is plainly another one. A rest pose that is none, all
 bones along one axis as LAFAN1 has it, gives way to the frame in which the person stands straightest.
 
@@ -24,10 +24,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.body.landmarks import find_landmarks
-from ctlev_core.body.motion_clip import MotionClip, take
-from ctlev_core.body.retargeting import retarget
-from ctlev_core.body.source_skeleton import SkeletonMotion
+from ctlev_core.body.motion.clip import MotionClip, take
+from ctlev_core.body.motion.landmarks import find_landmarks
+from ctlev_core.body.motion.retargeting import retarget
+from ctlev_core.body.motion.source_skeleton import SkeletonMotion
 from data_contracts.errors import DataError
 
 VERSION = 1

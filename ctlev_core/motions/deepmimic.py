@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.body.motion_clip import MotionClip
-from ctlev_core.body.retargeting import retarget
-from ctlev_core.body.source_skeleton import SkeletonMotion
+from ctlev_core.body.motion.clip import MotionClip
+from ctlev_core.body.motion.retargeting import retarget
+from ctlev_core.body.motion.source_skeleton import SkeletonMotion
 from data_contracts.errors import DataError
 
 VERSION = 1

@@ -6,7 +6,7 @@
                                    num_repetitions
 
 y is up, and 20 frames a second are taken unless who reads it says another rate; the files say neither. The poses come
-from the positions in closed form (`ctlev_core.body.inverse_kinematics`), after the person was scaled about the origin
+from the positions in closed form (`ctlev_core.body.motion.inverse_kinematics`), after the person was scaled about the origin
 to have legs as long as the bundled body's; other bone lengths that differ move joints, but do not turn bones.
 
 [T, 24, 3] may be SMPL's rotations as well, which the format `smpl_arrays` reads: these are positions where bones have
@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.body.motion_clip import MotionClip, check_clip
+from ctlev_core.body.motion.clip import MotionClip, check_clip
 from ctlev_core.safe_files import numpy_files
 from data_contracts.errors import DataError
 
@@ -49,7 +49,7 @@ def sniff(path: Path) -> bool:
     if shape is not None:
         if len(shape) != 3 or shape[0] == 0 or shape[1:] not in ((22, 3), (24, 3)):
             return False
-        from ctlev_core.body.inverse_kinematics import are_positions
+        from ctlev_core.body.motion.inverse_kinematics import are_positions
 
         return shape[1] == 22 or are_positions(_read_array(path))
     with path.open("rb") as file:
@@ -133,7 +133,7 @@ def _captions(results: dict[Any, Any], count: int, path: Path) -> list[str]:
 
 
 def _clip(joints: np.ndarray, caption: str, rate_hz: float, where: str) -> MotionClip:
-    from ctlev_core.body.inverse_kinematics import fit_pose, leg_length
+    from ctlev_core.body.motion.inverse_kinematics import fit_pose, leg_length
     from ctlev_core.body.rotations import axis_angle_from_matrix
 
     fitted = fit_pose(joints, where=where)

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.body.motion_clip import REST_PELVIS, MotionClip, check_clip
+from ctlev_core.body.motion.clip import REST_PELVIS, MotionClip, check_clip
 from ctlev_core.safe_files import numpy_files
 from data_contracts.errors import DataError
 
@@ -65,7 +65,7 @@ def sniff(path: Path) -> bool:
         return not {*POSE_NAMES, "body_pose"}.isdisjoint(names)
     shape = numpy_files.read_shape(path)
     if shape is not None:
-        from ctlev_core.body.inverse_kinematics import are_positions
+        from ctlev_core.body.motion.inverse_kinematics import are_positions
 
         return _is_known(shape) and not (shape[1:] == (24, 3) and are_positions(_read_array(path)))
     with path.open("rb") as file:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ctlev_core.body.layer import joint_transforms, load_body
-from ctlev_core.body.motion_clip import MotionClip
+from ctlev_core.body.motion.clip import MotionClip
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.skeletons import SMPL_JOINTS
 

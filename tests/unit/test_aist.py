@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ctlev_core import plugins
-from ctlev_core.body.motion_clip import REST_PELVIS
+from ctlev_core.body.motion.clip import REST_PELVIS
 from ctlev_core.datasets import aist
 from ctlev_core.motions import aist as aist_format
 from data_contracts.config import DatasetChoice

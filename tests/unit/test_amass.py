@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ctlev_core import plugins
-from ctlev_core.body.motion_clip import REST_PELVIS
+from ctlev_core.body.motion.clip import REST_PELVIS
 from ctlev_core.datasets import amass
 from ctlev_core.motions import amass as amass_format
 from data_contracts import tables

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from motion_writers import limb_error_deg, smpl_positions, solve_deepmimic, standing_frames, write_deepmimic
 from scipy.spatial.transform import Rotation
 
-from ctlev_core.body.motion_clip import check_clip
+from ctlev_core.body.motion.clip import check_clip
 from ctlev_core.motions import deepmimic
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError

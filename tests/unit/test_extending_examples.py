@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctlev_core import event_files, motion_formats, plugin_contracts, plugins
+from ctlev_core import event_files, plugin_contracts, plugins
+from ctlev_core.body.motion import files
 from ctlev_core.labelling import labels_at_windows, labels_in_image
 from ctlev_core.report import verdict
 from ctlev_core.skeletons import JOINT_SETS
@@ -212,12 +213,12 @@ def test_the_format_is_found_and_read_whole_and_in_pieces(tmp_path):
 def test_the_motion_format_is_found_and_read(tmp_path):
     path = tmp_path / "turn.json"
     path.write_text('{"turntable": 1, "rate_hz": 10, "root": [[0, 0, 0, 1, 2, 3], [0, 1.5, 0, 1, 2, 4]]}')
-    clip = motion_formats.read_motion(path)
+    clip = files.read_motion(path)
     np.testing.assert_array_equal(clip.pose[:, :3], [[0, 0, 0], [0, 1.5, 0]])
     assert not clip.pose[:, 3:].any() and clip.transl[1].tolist() == [1, 2, 4] and clip.time_s.tolist() == [0, 0.1]
     path.write_text('{"turntable": 1, "rate_hz": 0, "root": []}')
     with pytest.raises(DataError, match="expected root"):
-        motion_formats.read_motion(path)
+        files.read_motion(path)
 
 
 def test_the_encoding_marks_the_pixels_with_events():

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from ctlev_core.body.foot_planting import LEG_JOINTS, plant_feet
-from ctlev_core.body.ground_contact import GroundContact, body_path, find_contact
 from ctlev_core.body.layer import joint_transforms, load_body
-from ctlev_core.body.motions import MotionStyle, channels_at_phase, rotations_from_channels
+from ctlev_core.body.motion.foot_planting import LEG_JOINTS, plant_feet
+from ctlev_core.body.motion.ground_contact import GroundContact, body_path, find_contact
+from ctlev_core.body.motion.procedural import MotionStyle, channels_at_phase, rotations_from_channels
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.skeletons import SMPL_JOINTS
 

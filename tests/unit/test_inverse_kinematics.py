@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.body import motions
-from ctlev_core.body.inverse_kinematics import are_positions, fit_pose
 from ctlev_core.body.layer import joint_transforms, load_body
+from ctlev_core.body.motion import procedural
+from ctlev_core.body.motion.inverse_kinematics import are_positions, fit_pose
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
@@ -24,7 +24,7 @@ def joints_of(rotations: np.ndarray, transl: np.ndarray | None = None, betas: np
 
 
 def performed(name: str) -> tuple[np.ndarray, np.ndarray]:
-    return motions.sample_pose(name, np.linspace(0, 2, 30), np.random.default_rng(1))
+    return procedural.sample_pose(name, np.linspace(0, 2, 30), np.random.default_rng(1))
 
 
 def angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ def test_poses_follow_joints_smoothly_through_a_straight_limb():
 
 @pytest.mark.parametrize("name", ["spin_kick", "throw", "run", "crawl"])
 def test_poses_do_not_jump_where_joints_do_not(name):
-    rotations, transl = motions.sample_pose(name, np.arange(0, 1.3, 1 / 60), np.random.default_rng(2))
+    rotations, transl = procedural.sample_pose(name, np.arange(0, 1.3, 1 / 60), np.random.default_rng(2))
     fitted = fit_pose(joints_of(rotations, transl)).rotations
     steps = [angles_deg(turns[1:], turns[:-1]).max() for turns in (rotations, fitted)]
     # An elbow that straightens loses its hinge over some frames: a dozen degrees each; 80 in one without smoothing.

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctlev_core import motion_formats, plugins
-from ctlev_core.body import motions
+from ctlev_core import plugins
 from ctlev_core.body.layer import joint_transforms, load_body
+from ctlev_core.body.motion import files, procedural
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ctlev_core.motions import joints_npy
 from data_contracts.errors import DataError
@@ -17,7 +17,7 @@ COUNT = 40
 
 
 def walking_joints(num_joints: int = 22, name: str = "walk") -> np.ndarray:
-    rotations, transl = motions.sample_pose(name, np.arange(COUNT) / 20, np.random.default_rng(3))
+    rotations, transl = procedural.sample_pose(name, np.arange(COUNT) / 20, np.random.default_rng(3))
     return joint_transforms(load_body(), rotations, np.zeros(10), transl)[1][:, :num_joints]
 
 
@@ -48,8 +48,8 @@ def save(path: Path, content: Any) -> Path:
 def test_positions_come_back(tmp_path, num_joints):
     joints = walking_joints(num_joints)
     path = save(tmp_path / "000001.npy", joints.astype(np.float32))
-    assert motion_formats.find_format(path) is plugins.load("motions", "joints_npy")
-    clip = motion_formats.read_motion(path)
+    assert files.find_format(path) is plugins.load("motions", "joints_npy")
+    clip = files.read_motion(path)
     # The file has float32.
     np.testing.assert_allclose(joints_of(clip)[:, :num_joints], joints, atol=2e-6)
     np.testing.assert_allclose(clip.time_s, np.arange(COUNT) / 20)
@@ -71,10 +71,10 @@ def test_the_results_of_mdm_are_read_with_sentences_and_lengths(tmp_path):
 
 
 def test_rotations_are_left_to_their_own_format(tmp_path):
-    rotations, _ = motions.sample_pose("walk", np.arange(COUNT) / 20, np.random.default_rng(3))
+    rotations, _ = procedural.sample_pose("walk", np.arange(COUNT) / 20, np.random.default_rng(3))
     path = save(tmp_path / "pose.npy", axis_angle_from_matrix(rotations))
     assert not joints_npy.sniff(path)
-    assert motion_formats.find_format(path) is plugins.load("motions", "smpl_arrays")
+    assert files.find_format(path) is plugins.load("motions", "smpl_arrays")
 
 
 def test_other_files_are_not_claimed(tmp_path):

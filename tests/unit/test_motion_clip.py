@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from ctlev_core.body.motion_clip import (
+from ctlev_core.body.motion.clip import (
     REST_PELVIS,
     Y_UP_TO_Z_UP,
     Z_UP_TO_Y_UP,

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation, Slerp
 
 from ctlev_core.body.layer import joint_transforms, load_body
-from ctlev_core.body.motion_clip import REST_PELVIS, MotionClip, take
+from ctlev_core.body.motion.clip import REST_PELVIS, MotionClip, take
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.body_views import with_joints
 from ctlev_core.camera import Camera, is_inside, project

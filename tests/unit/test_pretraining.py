@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core.body.motions import HELD_OUT
+from ctlev_core.body.motion.procedural import HELD_OUT
 from ctlev_core.diffusion import picture_styles, pretraining, procedural_images
 from ctlev_core.diffusion.picture_styles import Diet
 from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain

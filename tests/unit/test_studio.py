@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctlev_core.body.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.body.layer import joint_transforms
+from ctlev_core.body.motion.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.datasets import studio
 from ctlev_core.sensor import PRESETS, EventBudgetError, simulate_events
 from ctlev_core.skeletons import JOINT_SETS, SMPL_TO_DHP19

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctlev_core.body import motions
 from ctlev_core.body.layer import joint_transforms, load_body
-from ctlev_core.body.motion_clip import resample
+from ctlev_core.body.motion import procedural
+from ctlev_core.body.motion.clip import resample
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ctlev_core.body.text_to_motion import generate_motion
 from ctlev_core.datasets import text_motion
@@ -34,7 +34,7 @@ def smpl_of(recording: Recording, chosen: text_motion.Options) -> tuple[np.ndarr
 
 
 def joints_of(name: str, count: int = 30) -> np.ndarray:
-    rotations, transl = motions.sample_pose(name, np.arange(count) / 20, np.random.default_rng(3))
+    rotations, transl = procedural.sample_pose(name, np.arange(count) / 20, np.random.default_rng(3))
     return joint_transforms(load_body(), rotations, np.zeros(10), transl)[1][:, :22]
 
 
@@ -100,7 +100,7 @@ def test_results_of_another_model_take_the_place_of_the_generator(tmp_path):
     assert recordings[2].files == (tmp_path / "results.npy",)
     pose, positions, t_us = smpl_of(recordings[2], chosen)
     assert len(pose) == 20 and t_us[1] == 50_000
-    rotations, transl = motions.sample_pose("dance", np.arange(20) / 20, np.random.default_rng(3))
+    rotations, transl = procedural.sample_pose("dance", np.arange(20) / 20, np.random.default_rng(3))
     root = axis_angle_from_matrix(rotations[:, 0])
     # Turned with the camera, so compare how far the pelvis turns between frames.
     turned = [matrix_from_axis_angle(vectors) for vectors in (pose[:, :3], root)]

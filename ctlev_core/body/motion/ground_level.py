@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ctlev_core.body.motion_clip import MotionClip
+from ctlev_core.body.motion.clip import MotionClip
 from ctlev_core.skeletons import SMPL_JOINTS
 
 SOLE_M = 0.02

@@ -12,9 +12,9 @@ from functools import cache
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from ctlev_core.body.everyday_motions import EVERYDAY_MOTIONS
-from ctlev_core.body.keyframes import HELD_OUT, MOTIONS, SEEN, STANDING, UNSEEN, Motion, Pose
 from ctlev_core.body.layer import NUM_JOINTS, joint_transforms, load_body
+from ctlev_core.body.motion.everyday_keyframes import EVERYDAY_MOTIONS
+from ctlev_core.body.motion.keyframes import HELD_OUT, MOTIONS, SEEN, STANDING, UNSEEN, Motion, Pose
 from ctlev_core.body.rotations import matrix_from_axis_angle, matrix_from_euler, slerp
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import ModuleType
 
 from ctlev_core import plugins
-from ctlev_core.body.motion_clip import MotionClip
+from ctlev_core.body.motion.clip import MotionClip
 from data_contracts.errors import DataError
 
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from ctlev_core.body.ground_contact import SIDES, GroundContact
 from ctlev_core.body.layer import NUM_BETAS, joint_transforms, load_body
+from ctlev_core.body.motion.ground_contact import SIDES, GroundContact
 from ctlev_core.body.rotations import axis_angle_from_matrix
 from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
 

@@ -23,8 +23,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from ctlev_core.body.motion_clip import MotionClip, check_clip, move_world
-from ctlev_core.body.source_skeleton import (
+from ctlev_core.body.motion.clip import MotionClip, check_clip, move_world
+from ctlev_core.body.motion.source_skeleton import (
     SIDES,
     UP,
     SkeletonMotion,

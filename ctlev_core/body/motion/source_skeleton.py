@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ctlev_core.body.landmarks import LANDMARKS
+from ctlev_core.body.motion.landmarks import LANDMARKS
 from data_contracts.errors import DataError
 
 SIDES = ("left", "right")

@@ -5,7 +5,7 @@ They are apart from `keyframes.MOTIONS`, whose members number the recordings of 
 
 from __future__ import annotations
 
-from ctlev_core.body.keyframes import Motion, Pose
+from ctlev_core.body.motion.keyframes import Motion, Pose
 
 _SEATED: Pose = {
     "pitch": 4, "hip": 91, "knee": 87, "bend": 5, "arm": 16, "elbow": 44, "turn": 8, "spread": 5,
