@@ -1,6 +1,6 @@
 """Motions told in words; poses to sample from, without events: sentence to motion to condition to event frames.
 
-Each sentence is performed so many times, by the project's own small generator (`ctlev_core.body.text_to_motion`), which
+Each sentence is performed so many times, by the project's own small generator (`ctlev_core.body.text_to_motion.compose`), which
 knows a few dozen verbs and refuses sentences that it does not understand. Motions that a learned model such as MDM made
 elsewhere take its place with the option `results`: a file that it wrote, or a folder of such files, in any format of
 `ctlev_core/motions`. What they show is in the files (MDM's `results.npy` has the sentences), or in a text file of the
@@ -83,7 +83,7 @@ def list_recordings(options: Options) -> list[Recording]:
     """
     if options.results is not None:
         return _list_results(options.results, options)
-    from ctlev_core.body.text_to_motion import check_sentence
+    from ctlev_core.body.text_to_motion.compose import check_sentence
 
     sentences = [_one_line(sentence) for sentence in options.sentences or EXAMPLES]
     for sentence in sentences:
@@ -108,13 +108,13 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     """SMPL labels of the chosen moments, in the frame of the recording's virtual camera.
 
     Raises:
-        DataError: see `ctlev_core.body.text_to_motion.generate_motion`, or the `read` of the results' format.
+        DataError: see `ctlev_core.body.text_to_motion.compose.generate_motion`, or the `read` of the results' format.
     """
     number = int(recording.recording_id.rpartition("/")[2])
     if recording.files:
         clip = _read_results(recording.files[0], options)[number]
     else:
-        from ctlev_core.body.text_to_motion import generate_motion
+        from ctlev_core.body.text_to_motion.compose import generate_motion
 
         clip = generate_motion(recording.class_name, seed=MAX_VARIATIONS * options.seed + number)
     return _labels_before_camera(clip, recording.class_name, recording.recording_id, options)

@@ -9,7 +9,7 @@ from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motion import procedural
 from ctlev_core.body.motion.clip import resample
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from ctlev_core.body.text_to_motion import generate_motion
+from ctlev_core.body.text_to_motion.compose import generate_motion
 from ctlev_core.datasets import text_motion
 from data_contracts import tables
 from data_contracts.config import DatasetChoice

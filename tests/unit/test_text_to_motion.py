@@ -11,11 +11,11 @@ from ctlev_core.body.motion.clip import MotionClip, check_clip
 from ctlev_core.body.motion.everyday_keyframes import EVERYDAY_MOTIONS
 from ctlev_core.body.motion.ground_contact import body_path, find_contact
 from ctlev_core.body.motion.procedural import CHANNELS, channels_at_phase, find_motion
-from ctlev_core.body.motion_clauses import known_verbs
-from ctlev_core.body.motion_sentences import parse_sentence
-from ctlev_core.body.motion_words import WORDS
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from ctlev_core.body.text_to_motion import check_sentence, generate_motion
+from ctlev_core.body.text_to_motion.clauses import known_verbs
+from ctlev_core.body.text_to_motion.compose import check_sentence, generate_motion
+from ctlev_core.body.text_to_motion.grammar import parse_sentence
+from ctlev_core.body.text_to_motion.words import WORDS
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 

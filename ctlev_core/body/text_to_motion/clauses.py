@@ -6,8 +6,8 @@ import difflib
 from dataclasses import dataclass, field
 from functools import cache
 
-from ctlev_core.body import motion_words as words
-from ctlev_core.body.motion_words import MAX_COUNT, MotionWord
+from ctlev_core.body.text_to_motion import words
+from ctlev_core.body.text_to_motion.words import MAX_COUNT, MotionWord
 from data_contracts.errors import DataError
 
 

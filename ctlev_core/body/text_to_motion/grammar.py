@@ -15,9 +15,9 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from ctlev_core.body import motion_words as words
-from ctlev_core.body.motion_clauses import Clause, known_verbs, read_clause
-from ctlev_core.body.motion_words import MotionWord
+from ctlev_core.body.text_to_motion import words
+from ctlev_core.body.text_to_motion.clauses import Clause, known_verbs, read_clause
+from ctlev_core.body.text_to_motion.words import MotionWord
 from data_contracts.errors import DataError
 
 _TOKEN = re.compile(r"[a-z]+(?:'s)?|\d+(?:\.\d+)?|,")

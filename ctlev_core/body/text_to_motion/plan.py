@@ -8,8 +8,8 @@ import numpy as np
 
 from ctlev_core.body.motion.everyday_keyframes import EVERYDAY_MOTIONS
 from ctlev_core.body.motion.keyframes import MOTIONS
-from ctlev_core.body.motion_sentences import Action
-from ctlev_core.body.motion_words import MAX_DURATION_S, MotionWord
+from ctlev_core.body.text_to_motion.grammar import Action
+from ctlev_core.body.text_to_motion.words import MAX_DURATION_S, MotionWord
 from data_contracts.errors import DataError
 
 GAIT_SECONDS = 3.0

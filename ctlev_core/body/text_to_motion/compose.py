@@ -23,9 +23,9 @@ from ctlev_core.body.motion.procedural import (
     find_motion,
     rotations_from_channels,
 )
-from ctlev_core.body.motion_plan import Piece, plan_pieces
-from ctlev_core.body.motion_sentences import parse_sentence
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle, matrix_from_euler, slerp
+from ctlev_core.body.text_to_motion.grammar import parse_sentence
+from ctlev_core.body.text_to_motion.plan import Piece, plan_pieces
 from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
