@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctlev_core.diffusion.prior import Prior
+from ctlev_core.diffusion.pretrained.loading import Prior
 from data_contracts.labels import Conditions
 
 Precision = Literal["float32", "bfloat16"]

@@ -34,7 +34,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from ctlev_core.diffusion import finetuning, training
 from ctlev_core.diffusion.acceleration import accelerated, autocast
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, denoising_loss, generator_for
-from ctlev_core.diffusion.prior import Prior, load_prior
+from ctlev_core.diffusion.pretrained.loading import Prior, load_prior
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.labels import Conditions
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from ctlev_core.diffusion.finetuning import Tune, fine_tune, forget_weights
-from ctlev_core.diffusion.prior import choose_device, load_prior, save_prior
+from ctlev_core.diffusion.pretrained.loading import choose_device, load_prior, save_prior
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.sharding import check_sharding, gather_networks, shard_networks
 from ctlev_core.diffusion.trainer import TrainingHistory

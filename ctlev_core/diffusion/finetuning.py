@@ -27,7 +27,7 @@ from ctlev_core.diffusion.latent_cache import (
     encode_images,
 )
 from ctlev_core.diffusion.picture_scenes import Rehearsal
-from ctlev_core.diffusion.prior import Prior, encode_prompts
+from ctlev_core.diffusion.pretrained.loading import Prior, encode_prompts
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.sampling import sample_frames
 from ctlev_core.diffusion.sampling_options import SamplingOptions

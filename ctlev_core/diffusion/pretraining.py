@@ -25,7 +25,7 @@ from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, valid
 from ctlev_core.diffusion.patch_autoencoder import PATCH_PX, PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.picture_scenes import picture_diet, scene_of
 from ctlev_core.diffusion.picture_styles import DEFAULT_DIET, Diet, Scene, apply_style
-from ctlev_core.diffusion.prior import (
+from ctlev_core.diffusion.pretrained.loading import (
     Prior,
     conditions_to_tensor,
     encode_prompts,
@@ -33,7 +33,7 @@ from ctlev_core.diffusion.prior import (
     load_prior,
     save_prior,
 )
-from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.small_prior import IMAGE_SIZE, WIDTHS, PredictionType, build_prior
 from ctlev_core.diffusion.trainer import Trainer, TrainingHistory

@@ -25,7 +25,7 @@ from tqdm import tqdm
 from ctlev_core.diffusion.controlnet_reuse import EveryKthStep
 from ctlev_core.diffusion.controlnet_reuse import cached_condition_embedding as cached_condition_embedding
 from ctlev_core.diffusion.denoising import Denoiser
-from ctlev_core.diffusion.prior import (
+from ctlev_core.diffusion.pretrained.loading import (
     Prior,
     choose_device,
     conditions_to_tensor,

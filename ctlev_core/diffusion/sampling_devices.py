@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from ctlev_core.diffusion.prior import choose_device
+from ctlev_core.diffusion.pretrained.loading import choose_device
 
 SMALL_BYTES = 500_000_000
 """Weights of more use several threads well, and fill the memory when they are read twice."""

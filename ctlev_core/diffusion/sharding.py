@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.distributed.tensor import DTensor, distribute_tensor
 
-from ctlev_core.diffusion.prior import Prior
+from ctlev_core.diffusion.pretrained.loading import Prior
 from ctlev_core.diffusion.training_options import FineTuningOptions
 
 BLOCKS = ("down_blocks", "mid_block", "up_blocks", "controlnet_cond_embedding")

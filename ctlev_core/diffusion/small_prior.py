@@ -19,7 +19,7 @@ from typing import Any, Literal
 import torch
 
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
-from ctlev_core.diffusion.prior import Prior
+from ctlev_core.diffusion.pretrained.loading import Prior
 
 IMAGE_SIZE = 64
 WIDTHS = (64, 64, 96)

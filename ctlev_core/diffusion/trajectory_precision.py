@@ -16,7 +16,13 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import Denoiser
-from ctlev_core.diffusion.prior import Prior, choose_device, conditions_to_tensor, encode_prompts, load_prior
+from ctlev_core.diffusion.pretrained.loading import (
+    Prior,
+    choose_device,
+    conditions_to_tensor,
+    encode_prompts,
+    load_prior,
+)
 from ctlev_core.diffusion.sampling import cached_condition_embedding
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.schedulers import make_scheduler

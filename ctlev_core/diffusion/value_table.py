@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import NoiseSchedule, generator_for
-from ctlev_core.diffusion.prior import Prior, decode_latents
+from ctlev_core.diffusion.pretrained.loading import Prior, decode_latents
 from data_contracts.errors import DataError
 
 TABLE_FOLDER, TABLE_NAME = "value_table", "probability.npy"

@@ -48,7 +48,7 @@ def prior_folders(options: Options) -> list[Path]:
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.prior_files import find_controlnet, prior_places
+    from ctlev_core.diffusion.pretrained.paths import find_controlnet, prior_places
 
     try:
         return prior_places(options.prior, controlnet=options.controlnet, needs_controlnet=True)

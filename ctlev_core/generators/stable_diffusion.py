@@ -38,7 +38,7 @@ def prior_folders(options: Options) -> list[Path]:
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.prior_files import BUNDLED_OBJECT_PRIOR, prior_places
+    from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_PRIOR, prior_places
 
     return prior_places(options.prior or BUNDLED_OBJECT_PRIOR)
 
@@ -61,7 +61,7 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
             the conditions have images.
     """
     from ctlev_core.diffusion.checkpoint_training import train_checkpoint
-    from ctlev_core.diffusion.prior_files import BUNDLED_OBJECT_PRIOR
+    from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_PRIOR
 
     _check_text_only(conditions)
     return train_checkpoint(

@@ -19,7 +19,7 @@ from ctlev_core.diffusion.exact_score import (
     solver_error,
     wasserstein_1,
 )
-from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 
 CONFIG = json.loads((BUNDLED_PRIOR / "scheduler" / "scheduler_config.json").read_text())

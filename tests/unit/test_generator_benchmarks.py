@@ -11,7 +11,7 @@ import torch
 from tiny_prior import make_data, make_prior
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule
-from ctlev_core.diffusion.prior import (
+from ctlev_core.diffusion.pretrained.loading import (
     conditions_to_tensor,
     encode_prompts,
     images_to_tensor,

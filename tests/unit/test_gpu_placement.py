@@ -14,7 +14,7 @@ from tiny_prior import make_data, make_prior
 
 from ctlev_core.diffusion import trainer
 from ctlev_core.diffusion.checkpoint_training import train_checkpoint
-from ctlev_core.diffusion.prior import save_prior
+from ctlev_core.diffusion.pretrained.loading import save_prior
 from ctlev_core.diffusion.sampling import sample_checkpoint
 from ctlev_core.diffusion.sampling_options import SPACINGS, SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions

@@ -11,8 +11,8 @@ from diffusers.pipelines.stable_diffusion.pipeline_stable_diffusion import Stabl
 from tiny_prior import SIDE, make_prior, shared_prior
 from tiny_stable_diffusion import make_models, tiny_changes, write_folder
 
-from ctlev_core.diffusion.prior import encode_prompts, load_prior, save_prior
-from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, check_prior_folder
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_prior, save_prior
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR, check_prior_folder
 from data_contracts.errors import DataError
 
 

@@ -12,8 +12,8 @@ from safetensors.torch import load_file, save_file
 from tiny_stable_diffusion import CHANGES, make_models, tiny_changes, write_folder
 
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
-from ctlev_core.diffusion.prior import Prior, decode_latents, encode_prompts, load_prior, save_prior
-from ctlev_core.diffusion.prior_files import check_prior_folder, prior_places
+from ctlev_core.diffusion.pretrained.loading import Prior, decode_latents, encode_prompts, load_prior, save_prior
+from ctlev_core.diffusion.pretrained.paths import check_prior_folder, prior_places
 from ctlev_core.generators import controlnet, stable_diffusion
 from data_contracts.config import GeneratorChoice
 from data_contracts.errors import DataError

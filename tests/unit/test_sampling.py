@@ -8,7 +8,7 @@ import torch
 from tiny_prior import SIDE, make_data, make_prior, shared_prior
 
 from ctlev_core.diffusion import sampling, sampling_shards
-from ctlev_core.diffusion.prior import load_prior, save_prior
+from ctlev_core.diffusion.pretrained.loading import load_prior, save_prior
 from ctlev_core.diffusion.sampling import cached_condition_embedding, decode_frames, sample_frames
 from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions
 from ctlev_core.diffusion.small_prior import break_zeros

@@ -67,7 +67,7 @@ def test_two_processes_make_the_frames_of_one(tmp_path, monkeypatch):
     from tiny_prior import make_data, make_prior
 
     from ctlev_core.diffusion import sampling, sampling_shards
-    from ctlev_core.diffusion.prior import save_prior
+    from ctlev_core.diffusion.pretrained.loading import save_prior
 
     monkeypatch.setattr(sampling_shards, "SHARD", 2)
     save_prior(make_prior(), tmp_path / "prior")

@@ -19,7 +19,7 @@ from tiny_stable_diffusion import make_models, tiny_changes, write_folder
 from ctlev_core import event_files, plugins
 from ctlev_core.diffusion.finetuning import fine_tune
 from ctlev_core.diffusion.latent_cache import cache_latents, check_cache
-from ctlev_core.diffusion.prior import decode_latents, images_to_tensor, load_prior
+from ctlev_core.diffusion.pretrained.loading import decode_latents, images_to_tensor, load_prior
 from ctlev_core.diffusion.sampling import sample_frames
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions

@@ -29,9 +29,9 @@ from tiny_stable_diffusion import (
 )
 from transformers import CLIPTextModel
 
-from ctlev_core.diffusion import single_file
-from ctlev_core.diffusion.prior import encode_prompts, load_prior, save_prior
-from ctlev_core.diffusion.prior_files import check_prior_folder, prior_places
+from ctlev_core.diffusion.pretrained import single_file
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_prior, save_prior
+from ctlev_core.diffusion.pretrained.paths import check_prior_folder, prior_places
 from data_contracts.errors import DataError
 
 STABLE_DIFFUSION_V1 = {"unet": 859_520_964, "controlnet": 361_279_120, "vae": 83_653_863, "text_encoder": 123_060_480}

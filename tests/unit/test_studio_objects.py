@@ -15,7 +15,7 @@ from tokenizers import Tokenizer
 from ctlev_core.conditions import text
 from ctlev_core.datasets import studio_objects
 from ctlev_core.datasets.studio_objects import CLASSES, COMPOSITIONS, HELD_OUT, UNSEEN, Options
-from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
 from ctlev_core.render.compositions import NOUNS, Composition, all_compositions, parse_composition
 from ctlev_core.render.object_drawing import draw_composition, draw_object
 from ctlev_core.render.objects import COLOURS, OBJECTS

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 
-from ctlev_core.diffusion.model_building import load_tensor
+from ctlev_core.diffusion.pretrained.model_building import load_tensor
 from ctlev_core.safe_files.tensor_files import check_finite, read_tensor_table
 from data_contracts.errors import DataError
 

@@ -15,7 +15,7 @@ from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.finetuning import check_channel_order, fine_tune
 from ctlev_core.diffusion.latent_cache import cache_latents, check_cache
-from ctlev_core.diffusion.prior import encode_prompts, save_prior
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_prior
 from ctlev_core.diffusion.sampling import sample_frames
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions
@@ -200,7 +200,7 @@ def test_many_prompts_are_embedded_some_at_a_time(monkeypatch):
     prior, taken = make_prior(), []
     prompts = [f"a photo of a {word}" for word in ("cup", "ball", "human", "moving")]
     whole = encode_prompts(prior, prompts)
-    monkeypatch.setattr("ctlev_core.diffusion.prior.PROMPT_BATCH", 3)
+    monkeypatch.setattr("ctlev_core.diffusion.pretrained.loading.PROMPT_BATCH", 3)
     prior.text_encoder.register_forward_pre_hook(lambda module, inputs: taken.append(len(inputs[0])))
     torch.testing.assert_close(encode_prompts(prior, prompts), whole)
     assert taken == [3, 1]

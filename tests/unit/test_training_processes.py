@@ -11,7 +11,7 @@ from tiny_prior import make_data, make_prior
 
 from ctlev_core.diffusion import training
 from ctlev_core.diffusion.checkpoint_training import train_checkpoint
-from ctlev_core.diffusion.prior import load_prior, save_prior
+from ctlev_core.diffusion.pretrained.loading import load_prior, save_prior
 from ctlev_core.diffusion.ranks import Ranks
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from ctlev_core.diffusion.training_processes import child_environment

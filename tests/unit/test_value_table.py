@@ -9,7 +9,7 @@ from tiny_prior import SIDE, make_data, make_prior
 
 from ctlev_core.diffusion import value_table
 from ctlev_core.diffusion.finetuning import fine_tune
-from ctlev_core.diffusion.prior import encode_prompts, images_to_tensor, save_prior
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, images_to_tensor, save_prior
 from ctlev_core.diffusion.sampling import sample_checkpoint
 from ctlev_core.diffusion.sampling_options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions

@@ -15,8 +15,8 @@ from safetensors.torch import save_file
 from tiny_prior import CORPUS
 from transformers import CLIPTextConfig, CLIPTextModel
 
-from ctlev_core.diffusion.prior_parts import read_json
-from ctlev_core.diffusion.single_file import CONFIGS
+from ctlev_core.diffusion.pretrained.components import read_json
+from ctlev_core.diffusion.pretrained.single_file import CONFIGS
 from ctlev_core.diffusion.small_prior import train_tokenizer
 
 SIDE = 32

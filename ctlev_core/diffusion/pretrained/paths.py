@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from ctlev_core.diffusion.prior_checks import check_parts
-from ctlev_core.diffusion.prior_parts import PriorFiles, PriorPart, read_json, read_part
-from ctlev_core.diffusion.single_file import (
+from ctlev_core.diffusion.pretrained.checks import check_parts
+from ctlev_core.diffusion.pretrained.components import PriorFiles, PriorPart, read_json, read_part
+from ctlev_core.diffusion.pretrained.single_file import (
     ENDINGS,
     files_beside,
     is_single_file,

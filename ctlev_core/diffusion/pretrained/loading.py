@@ -14,10 +14,10 @@ from typing import Any
 
 import torch
 
-from ctlev_core.diffusion.model_building import build_model
-from ctlev_core.diffusion.prior_checks import complete_schedule
-from ctlev_core.diffusion.prior_files import BUNDLED_PRIOR, read_prior_files
-from ctlev_core.diffusion.prior_parts import read_json
+from ctlev_core.diffusion.pretrained.checks import complete_schedule
+from ctlev_core.diffusion.pretrained.components import read_json
+from ctlev_core.diffusion.pretrained.model_building import build_model
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR, read_prior_files
 from data_contracts.errors import DataError
 
 logger = logging.getLogger(__name__)

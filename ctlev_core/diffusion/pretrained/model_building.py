@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ctlev_core.diffusion.prior_parts import PriorPart
+from ctlev_core.diffusion.pretrained.components import PriorPart
 from ctlev_core.safe_files.tensor_files import FLOATS, StoredTensor, read_items
 from data_contracts.errors import DataError
 

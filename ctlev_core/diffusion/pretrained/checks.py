@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ctlev_core.diffusion.prior_parts import PriorFiles, PriorPart, read_json
+from ctlev_core.diffusion.pretrained.components import PriorFiles, PriorPart, read_json
 from data_contracts.errors import DataError
 
 CLASSES = {

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from ctlev_core.diffusion.prior_parts import PriorFiles, PriorPart, read_json
+from ctlev_core.diffusion.pretrained.components import PriorFiles, PriorPart, read_json
 from ctlev_core.safe_files.tensor_files import StoredTensor, read_tensor_table
 from data_contracts.errors import DataError
 
