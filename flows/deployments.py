@@ -16,7 +16,7 @@ from typing import Any
 from prefect import Flow
 from prefect.logging import get_run_logger
 
-from ctlev_core.diffusion.pretraining import PretrainingOptions
+from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
 from ctlev_core.report.report_files import publish_report
 from flows import baselines as of_baselines
 from flows import compare as of_compare

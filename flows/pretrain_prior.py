@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import sys
 
-from ctlev_core.diffusion.pretraining import PretrainingOptions
+from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
 from data_contracts.manifest import ManifestRef
 from flows.command_line import PRESETS, load_preset, main
 from flows.settings import flow

@@ -18,7 +18,7 @@ from tasks.pretrain import pretrain_prior
 from tasks.stage import call_flow, numbered
 
 if TYPE_CHECKING:  # torch, which most plans do without
-    from ctlev_core.diffusion.pretraining import PretrainingOptions
+    from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
 
 
 @flow(name="train-generator")
@@ -51,7 +51,7 @@ def base_model_options(experiment: Experiment) -> PretrainingOptions:
         PluginError: an option is unknown or wrong.
         DataError: there are no pictures.
     """
-    from ctlev_core.diffusion.pretraining import PretrainingOptions
+    from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
     from ctlev_core.labelled_pictures import open_pictures
 
     options = validate_options(PretrainingOptions, experiment.base_model or {}, "base_model")

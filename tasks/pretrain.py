@@ -12,11 +12,11 @@ from data_contracts.manifest import history_table
 from tasks.stage import Output, files_of, stage
 
 if TYPE_CHECKING:  # torch, which flows that pre-train nothing need not wait for
-    from ctlev_core.diffusion.pretraining import PretrainingOptions
+    from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
 
 
 def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
-    from ctlev_core.diffusion.pretraining import start_folder
+    from ctlev_core.diffusion.pretraining.pretraining import start_folder
     from ctlev_core.labelled_pictures import picture_files
 
     options: PretrainingOptions = arguments["options"]
@@ -28,6 +28,6 @@ def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
 @stage(version=4, schema=tables.TRAINING, raw_files=_raw_files)
 def pretrain_prior(out: Output, *, options: PretrainingOptions) -> pa.Table:
     """Train the small prior on pictures; the artefact's `prior/` is an ordinary diffusers folder."""
-    from ctlev_core.diffusion.pretraining import pretrain
+    from ctlev_core.diffusion.pretraining.pretraining import pretrain
 
     return history_table(pretrain(options, out.folder / "prior", out.work))

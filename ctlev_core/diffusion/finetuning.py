@@ -26,12 +26,12 @@ from ctlev_core.diffusion.latent_cache import (
     check_training_data,
     encode_images,
 )
-from ctlev_core.diffusion.picture_scenes import Rehearsal
 from ctlev_core.diffusion.pretrained.loading import Prior, encode_prompts
+from ctlev_core.diffusion.pretraining.architecture import break_zeros
+from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
 from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.sampling import sample_frames
 from ctlev_core.diffusion.sampling_options import SamplingOptions
-from ctlev_core.diffusion.small_prior import break_zeros
 from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
 from ctlev_core.diffusion.training import check_run, run_training, sample_rows
 from ctlev_core.diffusion.training_log import picture_of_samples

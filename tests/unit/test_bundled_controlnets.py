@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from ctlev_core.diffusion import pretraining, procedural_images
 from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, validation_losses
 from ctlev_core.diffusion.pretrained.loading import load_prior
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretraining import pretraining, procedural_images
 from ctlev_core.generators import controlnet
 from data_contracts.errors import DataError
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core.diffusion import picture_styles, procedural_images
 from ctlev_core.diffusion.denoising import NoiseSchedule, generator_for
 from ctlev_core.diffusion.pretrained.loading import load_prior
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_PRIOR, BUNDLED_PRIOR
-from ctlev_core.diffusion.pretraining import Row, make_batch
+from ctlev_core.diffusion.pretraining import picture_styles, procedural_images
+from ctlev_core.diffusion.pretraining.pretraining import Row, make_batch
 from ctlev_core.generators import stable_diffusion
 from ctlev_core.render.object_drawing import draw_object
 from ctlev_core.render.objects import NAMES, OBJECTS

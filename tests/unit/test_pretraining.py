@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from ctlev_core.body.motion.procedural import HELD_OUT
-from ctlev_core.diffusion import picture_styles, pretraining, procedural_images
-from ctlev_core.diffusion.picture_styles import Diet
 from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_prior
-from ctlev_core.diffusion.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
-from ctlev_core.diffusion.small_prior import WORD_GAIN, learn_merges, train_tokenizer
+from ctlev_core.diffusion.pretraining import picture_styles, pretraining, procedural_images
+from ctlev_core.diffusion.pretraining.architecture import WORD_GAIN, learn_merges, train_tokenizer
+from ctlev_core.diffusion.pretraining.picture_styles import Diet
+from ctlev_core.diffusion.pretraining.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
 from ctlev_core.diffusion.training_options import TrainingOptions
 from ctlev_core.render.compositions import RELATIONS, parse_composition
 from ctlev_core.render.object_drawing import draw_object

@@ -9,9 +9,9 @@ from tiny_prior import SIDE, make_data, make_prior, shared_prior
 
 from ctlev_core.diffusion import sampling, sampling_shards
 from ctlev_core.diffusion.pretrained.loading import load_prior, save_prior
+from ctlev_core.diffusion.pretraining.architecture import break_zeros
 from ctlev_core.diffusion.sampling import cached_condition_embedding, decode_frames, sample_frames
 from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions
-from ctlev_core.diffusion.small_prior import break_zeros
 from ctlev_core.generators import controlnet, stable_diffusion
 from data_contracts.labels import Conditions
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ctlev_core.diffusion.patch_autoencoder import fit_patch_autoencoder
-from ctlev_core.diffusion.small_prior import build_prior
+from ctlev_core.diffusion.pretraining.architecture import build_prior
 from data_contracts.labels import Conditions
 
 SIDE = 16

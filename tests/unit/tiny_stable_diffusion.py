@@ -17,7 +17,7 @@ from transformers import CLIPTextConfig, CLIPTextModel
 
 from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.single_file import CONFIGS
-from ctlev_core.diffusion.small_prior import train_tokenizer
+from ctlev_core.diffusion.pretraining.architecture import train_tokenizer
 
 SIDE = 32
 CHANGES = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctlev_core import labelled_pictures
-from ctlev_core.diffusion.picture_styles import Diet, Scene, apply_style
+from ctlev_core.diffusion.pretraining.picture_styles import Diet, Scene, apply_style
 from ctlev_core.labelled_pictures import LabelledPictures, PictureOptions
 
 

@@ -20,11 +20,8 @@ import torch
 from pydantic import Field, model_validator
 
 from ctlev_core import labelled_pictures
-from ctlev_core.diffusion import procedural_images
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
 from ctlev_core.diffusion.patch_autoencoder import PATCH_PX, PatchAutoencoder, fit_patch_autoencoder
-from ctlev_core.diffusion.picture_scenes import picture_diet, scene_of
-from ctlev_core.diffusion.picture_styles import DEFAULT_DIET, Diet, Scene, apply_style
 from ctlev_core.diffusion.pretrained.loading import (
     Prior,
     conditions_to_tensor,
@@ -34,8 +31,11 @@ from ctlev_core.diffusion.pretrained.loading import (
     save_prior,
 )
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretraining import procedural_images
+from ctlev_core.diffusion.pretraining.architecture import IMAGE_SIZE, WIDTHS, PredictionType, build_prior
+from ctlev_core.diffusion.pretraining.picture_scenes import picture_diet, scene_of
+from ctlev_core.diffusion.pretraining.picture_styles import DEFAULT_DIET, Diet, Scene, apply_style
 from ctlev_core.diffusion.ranks import ALONE, Ranks
-from ctlev_core.diffusion.small_prior import IMAGE_SIZE, WIDTHS, PredictionType, build_prior
 from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
 from ctlev_core.diffusion.training import run_training, sample_rows
 from ctlev_core.diffusion.training_options import TrainingOptions

@@ -22,7 +22,7 @@ from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.body_views import labels_in_camera
 from ctlev_core.camera import is_inside, project
 from ctlev_core.conditions import normals
-from ctlev_core.diffusion.picture_styles import (
+from ctlev_core.diffusion.pretraining.picture_styles import (
     DEFAULT_DIET,
     OBJECT_CAPTIONS,
     PERSON_CAPTIONS,
