@@ -38,7 +38,7 @@ from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.loading import Prior, choose_device
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
 from ctlev_core.diffusion.pretrained.single_file import CONFIGS
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
 
 TINY: dict[str, dict[str, Any]] = {
     "unet": {"block_out_channels": [32, 32, 64, 64], "cross_attention_dim": 32, "attention_head_dim": 2},

@@ -33,8 +33,8 @@ from training import make_rows
 
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import Prior, conditions_to_tensor, encode_prompts, load_prior
-from ctlev_core.diffusion.sampling import make_scheduler, sample_frames
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import make_scheduler, sample_frames
 from ctlev_core.diffusion.trajectory_precision import PRECISIONS
 from data_contracts.labels import Conditions
 

@@ -17,8 +17,8 @@ from tqdm import tqdm
 
 from ctlev_core import event_files, plugins
 from ctlev_core.condition_sources import sensor_size_of
-from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
-from ctlev_core.diffusion.sampling_shards import SHARD
+from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
+from ctlev_core.diffusion.sampling.shards import SHARD
 from ctlev_core.dithering import dither_counts
 from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
 from ctlev_core.image_geometry import check_whole_counts

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.diffusion.sampling_options import STOCHASTIC
+from ctlev_core.diffusion.sampling.options import STOCHASTIC
 from ctlev_core.sampling_errors import (
     CPU,
     EXACT,

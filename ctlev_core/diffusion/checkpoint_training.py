@@ -21,11 +21,11 @@ import torch
 from ctlev_core.diffusion.finetuning import Tune, fine_tune, forget_weights
 from ctlev_core.diffusion.pretrained.loading import choose_device, load_prior, save_prior
 from ctlev_core.diffusion.ranks import ALONE, Ranks
+from ctlev_core.diffusion.sampling.value_table import write_value_table
 from ctlev_core.diffusion.sharding import check_sharding, gather_networks, shard_networks
 from ctlev_core.diffusion.trainer import TrainingHistory
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from ctlev_core.diffusion.training_processes import run_rank, train_in_processes
-from ctlev_core.diffusion.value_table import write_value_table
 from data_contracts.config import ConditionChoice
 from data_contracts.labels import Conditions
 

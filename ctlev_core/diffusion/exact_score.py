@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import NoiseSchedule
-from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions
-from ctlev_core.diffusion.schedulers import make_scheduler
+from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions
+from ctlev_core.diffusion.sampling.schedulers import make_scheduler
 
 _BISECTIONS = 80
 

@@ -30,13 +30,13 @@ from ctlev_core.diffusion.pretrained.loading import Prior, encode_prompts
 from ctlev_core.diffusion.pretraining.architecture import break_zeros
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
 from ctlev_core.diffusion.ranks import ALONE, Ranks
-from ctlev_core.diffusion.sampling import sample_frames
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import sample_frames
+from ctlev_core.diffusion.sampling.value_table import fit_value_table
 from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
 from ctlev_core.diffusion.training import check_run, run_training, sample_rows
 from ctlev_core.diffusion.training_log import picture_of_samples
 from ctlev_core.diffusion.training_options import FineTuningOptions
-from ctlev_core.diffusion.value_table import fit_value_table
 from ctlev_core.image_moves import move_image
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError

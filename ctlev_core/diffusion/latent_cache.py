@@ -15,7 +15,7 @@ from torch import Tensor
 from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch
 from ctlev_core.diffusion.pretrained.loading import Prior, conditions_to_tensor, encode_prompts, images_to_tensor
-from ctlev_core.diffusion.sampling_memory import ShrinkingBatches
+from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.diffusion.sampling import load_for_sampling, sample_frames
-from ctlev_core.diffusion.sampling_devices import device_names
-from ctlev_core.diffusion.sampling_options import SamplingOptions, noise_seeds
+from ctlev_core.diffusion.sampling.devices import device_names
+from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
+from ctlev_core.diffusion.sampling.sampling import load_for_sampling, sample_frames
 from data_contracts.labels import Conditions
 
 

@@ -31,7 +31,7 @@ class TrainingHistory(History):
 
     kept_step: int | None = None
     value_table: np.ndarray | None = None
-    """[256, 256], see `ctlev_core.diffusion.value_table`; None where it was not asked for."""
+    """[256, 256], see `ctlev_core.diffusion.sampling.value_table`; None where it was not asked for."""
 
 
 class Trainer:

@@ -23,9 +23,9 @@ from ctlev_core.diffusion.pretrained.loading import (
     encode_prompts,
     load_prior,
 )
-from ctlev_core.diffusion.sampling import cached_condition_embedding
-from ctlev_core.diffusion.sampling_options import SamplingOptions
-from ctlev_core.diffusion.schedulers import make_scheduler
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import cached_condition_embedding
+from ctlev_core.diffusion.sampling.schedulers import make_scheduler
 from data_contracts.labels import Conditions
 from data_contracts.speed_vs_error import KEEP_PRECISION
 

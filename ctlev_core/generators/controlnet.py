@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
@@ -98,7 +98,7 @@ def sample(
     checkpoint: Path, conditions: Conditions, options: SampleOptions, *, seeds: Sequence[int], work: Path
 ) -> np.ndarray:
     """Frames [N, H, W, 3] uint8 of N conditions; row i depends on condition i and seed i alone."""
-    from ctlev_core.diffusion.sampling import sample_checkpoint
+    from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
 
     _check_images(conditions)
     return sample_checkpoint(checkpoint, conditions, options, with_controlnet=True, seeds=seeds, work=work)

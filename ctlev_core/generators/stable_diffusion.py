@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.labels import Conditions, History
 
@@ -81,7 +81,7 @@ def sample(
     checkpoint: Path, conditions: Conditions, options: SampleOptions, *, seeds: Sequence[int], work: Path
 ) -> np.ndarray:
     """Frames [N, H, W, 3] uint8 of N prompts; row i depends on prompt i and seed i alone."""
-    from ctlev_core.diffusion.sampling import sample_checkpoint
+    from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
 
     _check_text_only(conditions)
     return sample_checkpoint(checkpoint, conditions, options, with_controlnet=False, seeds=seeds, work=work)

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.special import ndtr, ndtri
 
-from ctlev_core.diffusion.sampling_options import SPACINGS, STOCHASTIC
-from ctlev_core.diffusion.schedulers import make_scheduler
+from ctlev_core.diffusion.sampling.options import SPACINGS, STOCHASTIC
+from ctlev_core.diffusion.sampling.schedulers import make_scheduler
 
 CONFIG: dict[str, Any] = {
     "num_train_timesteps": 1000,

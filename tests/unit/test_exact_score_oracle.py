@@ -20,7 +20,7 @@ from ctlev_core.diffusion.exact_score import (
     wasserstein_1,
 )
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
 
 CONFIG = json.loads((BUNDLED_PRIOR / "scheduler" / "scheduler_config.json").read_text())
 WEIGHTS, MEANS, SPREADS = (0.85, 0.15), (-0.6, 1.2), (0.05, 0.4)

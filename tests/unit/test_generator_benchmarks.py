@@ -18,8 +18,8 @@ from ctlev_core.diffusion.pretrained.loading import (
     load_prior,
     save_prior,
 )
-from ctlev_core.diffusion.sampling import sample_latents
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import sample_latents
 from data_contracts.labels import Conditions
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"

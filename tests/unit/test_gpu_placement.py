@@ -15,8 +15,8 @@ from tiny_prior import make_data, make_prior
 from ctlev_core.diffusion import trainer
 from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 from ctlev_core.diffusion.pretrained.loading import save_prior
-from ctlev_core.diffusion.sampling import sample_checkpoint
-from ctlev_core.diffusion.sampling_options import SPACINGS, SamplingOptions
+from ctlev_core.diffusion.sampling.options import SPACINGS, SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from ctlev_core.downstream import classifier, pose2d, smpl_regressor
 from ctlev_core.generators import event_gan

@@ -7,11 +7,11 @@ import pytest
 import torch
 from tiny_prior import SIDE, make_data, make_prior, shared_prior
 
-from ctlev_core.diffusion import sampling, sampling_shards
 from ctlev_core.diffusion.pretrained.loading import load_prior, save_prior
 from ctlev_core.diffusion.pretraining.architecture import break_zeros
-from ctlev_core.diffusion.sampling import cached_condition_embedding, decode_frames, sample_frames
-from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions
+from ctlev_core.diffusion.sampling import sampling, shards
+from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import cached_condition_embedding, decode_frames, sample_frames
 from ctlev_core.generators import controlnet, stable_diffusion
 from data_contracts.labels import Conditions
 
@@ -50,7 +50,7 @@ def test_seed_and_condition_matter_and_repeat(tmp_path):
 
 
 def test_killed_run_reuses_finished_shards(tmp_path, monkeypatch):
-    monkeypatch.setattr(sampling_shards, "SHARD", 2)
+    monkeypatch.setattr(shards, "SHARD", 2)
     conditions = conditions_of()
     whole = sample_frames(shared_prior(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
     calls = []

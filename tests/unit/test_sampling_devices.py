@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core.diffusion import sampling_devices
-from ctlev_core.diffusion.sampling_devices import device_names, run_on_devices, spread_over_cores
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling import devices
+from ctlev_core.diffusion.sampling.devices import device_names, run_on_devices, spread_over_cores
+from ctlev_core.diffusion.sampling.options import SamplingOptions
 from data_contracts.errors import DataError
 
 
@@ -66,8 +66,9 @@ def test_the_first_failure_ends_the_other_processes(deed, error, message):
 def test_two_processes_make_the_frames_of_one(tmp_path, monkeypatch):
     from tiny_prior import make_data, make_prior
 
-    from ctlev_core.diffusion import sampling, sampling_shards
     from ctlev_core.diffusion.pretrained.loading import save_prior
+    from ctlev_core.diffusion.sampling import sampling
+    from ctlev_core.diffusion.sampling import shards as sampling_shards
 
     monkeypatch.setattr(sampling_shards, "SHARD", 2)
     save_prior(make_prior(), tmp_path / "prior")
@@ -99,5 +100,5 @@ def test_small_networks_on_a_cpu_have_a_process_a_core(tmp_path, monkeypatch):
     assert spread_over_cores("cpu", tmp_path, 2) == ["cpu"] * 2
     assert spread_over_cores("cpu", tmp_path, 0) == ["cpu"]
     assert spread_over_cores("cuda:0", tmp_path, 9) == ["cuda:0"]
-    monkeypatch.setattr(sampling_devices, "SMALL_BYTES", 99)
+    monkeypatch.setattr(devices, "SMALL_BYTES", 99)
     assert spread_over_cores("cpu", tmp_path, 9) == ["cpu"]

@@ -10,13 +10,13 @@ import pytest
 import torch
 from tiny_prior import SIDE, make_data, make_prior, shared_prior
 
-from ctlev_core.diffusion import sampling
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 from ctlev_core.diffusion.pretrained.loading import images_to_tensor, save_prior
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
-from ctlev_core.diffusion.sampling import decode_frames, sample_checkpoint, sample_frames, sample_latents
-from ctlev_core.diffusion.sampling_memory import is_out_of_memory
-from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions, noise_seeds
+from ctlev_core.diffusion.sampling import sampling
+from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions, noise_seeds
+from ctlev_core.diffusion.sampling.out_of_memory import is_out_of_memory
+from ctlev_core.diffusion.sampling.sampling import decode_frames, sample_checkpoint, sample_frames, sample_latents
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 

@@ -13,8 +13,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.diffusion.denoising import NoiseSchedule
-from ctlev_core.diffusion.sampling_options import SPACINGS, STOCHASTIC, SamplingOptions
-from ctlev_core.diffusion.schedulers import clean_latents, make_scheduler
+from ctlev_core.diffusion.sampling.options import SPACINGS, STOCHASTIC, SamplingOptions
+from ctlev_core.diffusion.sampling.schedulers import clean_latents, make_scheduler
 from data_contracts.errors import DataError
 
 CONFIG: dict[str, Any] = {

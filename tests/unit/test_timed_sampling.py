@@ -6,7 +6,7 @@ import torch
 from tiny_prior import make_data, make_prior
 
 from ctlev_core.diffusion.pretrained.loading import save_prior
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.timed_sampling import sample_timed
 from ctlev_core.diffusion.trajectory_precision import PRECISIONS, precision_errors
 from ctlev_core.generators import controlnet

@@ -16,8 +16,8 @@ from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_lo
 from ctlev_core.diffusion.finetuning import check_channel_order, fine_tune
 from ctlev_core.diffusion.latent_cache import cache_latents, check_cache
 from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_prior
-from ctlev_core.diffusion.sampling import sample_frames
-from ctlev_core.diffusion.sampling_options import SamplingOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.training_options import FineTuningOptions
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError, TrainingError

@@ -22,8 +22,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ctlev_core.diffusion.controlnet_reuse import EveryKthStep
-from ctlev_core.diffusion.controlnet_reuse import cached_condition_embedding as cached_condition_embedding
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import (
     Prior,
@@ -33,12 +31,14 @@ from ctlev_core.diffusion.pretrained.loading import (
     encode_prompts,
     load_prior,
 )
-from ctlev_core.diffusion.sampling_devices import device_names, run_on_devices, spread_over_cores
-from ctlev_core.diffusion.sampling_memory import ShrinkingBatches
-from ctlev_core.diffusion.sampling_options import STOCHASTIC, SamplingOptions, noise_seeds
-from ctlev_core.diffusion.sampling_shards import Shard, plan_shards
-from ctlev_core.diffusion.schedulers import make_scheduler as make_scheduler
-from ctlev_core.diffusion.value_table import draw_values, read_value_table
+from ctlev_core.diffusion.sampling.controlnet_reuse import EveryKthStep
+from ctlev_core.diffusion.sampling.controlnet_reuse import cached_condition_embedding as cached_condition_embedding
+from ctlev_core.diffusion.sampling.devices import device_names, run_on_devices, spread_over_cores
+from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions, noise_seeds
+from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
+from ctlev_core.diffusion.sampling.schedulers import make_scheduler as make_scheduler
+from ctlev_core.diffusion.sampling.shards import Shard, plan_shards
+from ctlev_core.diffusion.sampling.value_table import draw_values, read_value_table
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions

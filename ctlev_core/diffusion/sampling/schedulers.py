@@ -22,7 +22,7 @@ from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepSchedu
 from diffusers.schedulers.scheduling_utils import SchedulerOutput
 from torch import Tensor
 
-from ctlev_core.diffusion.sampling_options import SPACINGS, check_spacing
+from ctlev_core.diffusion.sampling.options import SPACINGS, check_spacing
 from data_contracts.errors import DataError
 
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
