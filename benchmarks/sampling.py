@@ -35,7 +35,7 @@ from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import Prior, conditions_to_tensor, encode_prompts, load_prior
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import make_scheduler, sample_frames
-from ctlev_core.diffusion.trajectory_precision import PRECISIONS
+from ctlev_core.diffusion.solver_studies.trajectory_precision import PRECISIONS
 from data_contracts.labels import Conditions
 
 WANTED = 1.3

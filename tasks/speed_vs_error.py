@@ -48,7 +48,7 @@ def sample_timed(
 
     Times are those of the machine and the moment at which the artefact is made.
     """
-    from ctlev_core.diffusion.timed_sampling import sample_timed as core_sample_timed
+    from ctlev_core.diffusion.solver_studies.timed_sampling import sample_timed as core_sample_timed
 
     rows, asked, seeds = _asked(conditions, num_images, seed)
     options = plugins.load_options(sampling).options
@@ -181,7 +181,7 @@ def exact_score_errors(
 
     `sampling` names the generator whose solvers these are; none of its options but the solver's matters here.
     """
-    from ctlev_core.diffusion.exact_score import LatentMixture, distribution_floors, solver_error
+    from ctlev_core.diffusion.solver_studies.analytic_score import LatentMixture, distribution_floors, solver_error
 
     config = json.loads((checkpoint.ref.path / "checkpoint" / "scheduler" / "scheduler_config.json").read_text())
     sampling_options = type(plugins.load_options(sampling).options)
@@ -216,7 +216,7 @@ def precision_errors(
     seed: int,
 ) -> pa.Table:
     """Errors of single trajectories in several precisions against float64."""
-    from ctlev_core.diffusion.trajectory_precision import precision_errors as core_precision_errors
+    from ctlev_core.diffusion.solver_studies.trajectory_precision import precision_errors as core_precision_errors
 
     _, asked, seeds = _asked(conditions, options.num_images, seed)
     own = plugins.load_options(sampling).options

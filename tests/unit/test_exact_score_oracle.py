@@ -10,7 +10,9 @@ from scipy.special import logsumexp
 from scipy.stats import norm, wasserstein_distance
 
 from ctlev_core.diffusion.denoising import NoiseSchedule
-from ctlev_core.diffusion.exact_score import (
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.solver_studies.analytic_score import (
     LatentMixture,
     distribution_floors,
     exact_prediction,
@@ -19,8 +21,6 @@ from ctlev_core.diffusion.exact_score import (
     solver_error,
     wasserstein_1,
 )
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
-from ctlev_core.diffusion.sampling.options import SamplingOptions
 
 CONFIG = json.loads((BUNDLED_PRIOR / "scheduler" / "scheduler_config.json").read_text())
 WEIGHTS, MEANS, SPREADS = (0.85, 0.15), (-0.6, 1.2), (0.05, 0.4)

@@ -7,8 +7,8 @@ from tiny_prior import make_data, make_prior
 
 from ctlev_core.diffusion.pretrained.loading import save_prior
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.timed_sampling import sample_timed
-from ctlev_core.diffusion.trajectory_precision import PRECISIONS, precision_errors
+from ctlev_core.diffusion.solver_studies.timed_sampling import sample_timed
+from ctlev_core.diffusion.solver_studies.trajectory_precision import PRECISIONS, precision_errors
 from ctlev_core.generators import controlnet
 
 SEEDS = [7, 1, 4, 3, 5]
