@@ -31,11 +31,12 @@ from diffusers_loop import STAGES, ExampleLoop
 from interleaved import Comparison, describe_machine, matmul_flops, measure, now_s, print_comparisons, print_targets
 from torch.utils.flop_counter import FlopCounterMode
 
-from ctlev_core.diffusion import finetuning, training
-from ctlev_core.diffusion.acceleration import accelerated, autocast
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.pretrained.loading import Prior, load_prior
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training import finetuning
+from ctlev_core.diffusion.training import loop as training
+from ctlev_core.diffusion.training.acceleration import accelerated, autocast
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.labels import Conditions
 
 Route = Literal["controlnet", "text"]

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History
@@ -78,7 +78,7 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
         ValueError: options do not go together, frames do not fit the prior or the conditions, or
             there are no condition images.
     """
-    from ctlev_core.diffusion.checkpoint_training import train_checkpoint
+    from ctlev_core.diffusion.training.entry import train_checkpoint
 
     _check_images(conditions)
     return train_checkpoint(

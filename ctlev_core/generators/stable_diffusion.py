@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.labels import Conditions, History
 
 VERSION = 3
@@ -60,8 +60,8 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
         ValueError: options do not go together, frames do not fit the prior or the conditions, or
             the conditions have images.
     """
-    from ctlev_core.diffusion.checkpoint_training import train_checkpoint
     from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_PRIOR
+    from ctlev_core.diffusion.training.entry import train_checkpoint
 
     _check_text_only(conditions)
     return train_checkpoint(

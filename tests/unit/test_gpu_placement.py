@@ -12,12 +12,12 @@ from test_event_gan import TINY as TINY_GAN
 from test_event_gan import moving_squares
 from tiny_prior import make_data, make_prior
 
-from ctlev_core.diffusion import trainer
-from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 from ctlev_core.diffusion.pretrained.loading import save_prior
 from ctlev_core.diffusion.sampling.options import SPACINGS, SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training import trainer
+from ctlev_core.diffusion.training.entry import train_checkpoint
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.downstream import classifier, pose2d, smpl_regressor
 from ctlev_core.generators import event_gan
 from data_contracts.labels import Labels

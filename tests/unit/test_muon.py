@@ -6,9 +6,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.diffusion.muon import COEFFICIENTS, ITERATIONS, MATRIX_RATE, Muon, is_matrix, orthogonalised
-from ctlev_core.diffusion.training import Trainer
-from ctlev_core.diffusion.training_options import TrainingOptions
+from ctlev_core.diffusion.training.loop import Trainer
+from ctlev_core.diffusion.training.muon import COEFFICIENTS, ITERATIONS, MATRIX_RATE, Muon, is_matrix, orthogonalised
+from ctlev_core.diffusion.training.options import TrainingOptions
 
 BETAS = (0.9, 0.999)
 

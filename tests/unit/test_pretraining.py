@@ -10,7 +10,7 @@ from ctlev_core.diffusion.pretraining import picture_styles, pretraining, proced
 from ctlev_core.diffusion.pretraining.architecture import WORD_GAIN, learn_merges, train_tokenizer
 from ctlev_core.diffusion.pretraining.picture_styles import Diet
 from ctlev_core.diffusion.pretraining.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
-from ctlev_core.diffusion.training_options import TrainingOptions
+from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.render.compositions import RELATIONS, parse_composition
 from ctlev_core.render.object_drawing import draw_object
 from ctlev_core.render.objects import COLOURS, NAMES, OBJECTS

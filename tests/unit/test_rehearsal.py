@@ -8,13 +8,13 @@ import torch
 from pydantic import ValidationError
 from tiny_prior import SIDE, make_data, make_prior
 
-from ctlev_core.diffusion import finetuning
-from ctlev_core.diffusion.finetuning import fine_tune, move_frames
 from ctlev_core.diffusion.pretrained.loading import load_prior
 from ctlev_core.diffusion.pretraining import picture_styles, pretraining
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
 from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions, draw_block, pretrain, split_pictures
-from ctlev_core.diffusion.training_options import FineTuningOptions, TrainingOptions
+from ctlev_core.diffusion.training import finetuning
+from ctlev_core.diffusion.training.finetuning import fine_tune, move_frames
+from ctlev_core.diffusion.training.options import FineTuningOptions, TrainingOptions
 from ctlev_core.image_moves import Moves
 from ctlev_core.labelled_pictures import PictureOptions
 from data_contracts.errors import DataError

@@ -17,12 +17,12 @@ from sd1_latent_tiny import REAL_DATA, SCALING_FACTOR, tiny_autoencoder
 from tiny_stable_diffusion import make_models, tiny_changes, write_folder
 
 from ctlev_core import event_files, plugins
-from ctlev_core.diffusion.finetuning import fine_tune
-from ctlev_core.diffusion.latent_cache import cache_latents, check_cache
 from ctlev_core.diffusion.pretrained.loading import decode_latents, images_to_tensor, load_prior
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training.finetuning import fine_tune
+from ctlev_core.diffusion.training.latent_cache import cache_latents, check_cache
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.image_resampling import resample_images
 from data_contracts.config import EncodingChoice
 from data_contracts.labels import Conditions

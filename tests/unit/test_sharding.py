@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_prior import make_prior
 
-from ctlev_core.diffusion.sharding import gather_networks, part_of, part_of_optimizer, shard_networks, whole
+from ctlev_core.diffusion.training.fsdp import gather_networks, part_of, part_of_optimizer, shard_networks, whole
 
 PROCESSES = 2
 

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_prior import make_data, make_prior, shared_prior
 
-from ctlev_core.diffusion import training
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, generator_for
-from ctlev_core.diffusion.finetuning import fine_tune, forget_weights
-from ctlev_core.diffusion.training import sample_rows
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training import loop
+from ctlev_core.diffusion.training.finetuning import fine_tune, forget_weights
+from ctlev_core.diffusion.training.loop import sample_rows
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.errors import TrainingError
 from data_contracts.labels import Conditions
 
@@ -38,7 +38,7 @@ class Killed(Exception):
 
 def kill_after(monkeypatch, updates):
     """Let the process die inside the given update, after the state of the previous step was saved."""
-    original, count = training.Trainer.update, [0]
+    original, count = loop.Trainer.update, [0]
 
     def update(self, progress):
         if count[0] == updates:
@@ -46,7 +46,7 @@ def kill_after(monkeypatch, updates):
         count[0] += 1
         return original(self, progress)
 
-    monkeypatch.setattr(training.Trainer, "update", update)
+    monkeypatch.setattr(loop.Trainer, "update", update)
 
 
 @pytest.mark.parametrize("accumulation", [1, 2])
@@ -116,20 +116,20 @@ def test_state_of_another_run_is_refused(tmp_path):
 
 def test_non_finite_losses_are_skipped_then_raised(tmp_path, monkeypatch):
     frames, conditions = make_data()
-    original = training.denoising_loss
+    original = loop.denoising_loss
     calls = []
 
     def sometimes_nan(*arguments):
         calls.append(len(calls))
         return original(*arguments) * (math.nan if calls[-1] in (1, 2) else 1.0)
 
-    monkeypatch.setattr(training, "denoising_loss", sometimes_nan)
+    monkeypatch.setattr(loop, "denoising_loss", sometimes_nan)
     prior = make_prior()
     history = fine_tune(prior, frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path / "some")
     assert all(math.isfinite(loss) for loss in history.loss)
     assert all(bool(torch.isfinite(value).all()) for value in weights(prior).values())
 
-    monkeypatch.setattr(training, "denoising_loss", lambda *arguments: original(*arguments) * math.nan)
+    monkeypatch.setattr(loop, "denoising_loss", lambda *arguments: original(*arguments) * math.nan)
     options = OPTIONS.model_copy(update={"num_steps": 30})
     with pytest.raises(TrainingError, match="not finite 10 times in a row, the last at step 9"):
         fine_tune(make_prior(), frames, conditions, options, tune="unet", seed=0, work=tmp_path / "all")

@@ -10,15 +10,15 @@ import pytest
 import torch
 from tiny_prior import CORPUS, make_data, make_prior, shared_prior
 
-from ctlev_core.diffusion import trainer
-from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_loss, generator_for
-from ctlev_core.diffusion.finetuning import check_channel_order, fine_tune
-from ctlev_core.diffusion.latent_cache import cache_latents, check_cache
 from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_prior
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training import trainer
+from ctlev_core.diffusion.training.entry import train_checkpoint
+from ctlev_core.diffusion.training.finetuning import check_channel_order, fine_tune
+from ctlev_core.diffusion.training.latent_cache import cache_latents, check_cache
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import Conditions
@@ -69,7 +69,7 @@ def test_latents_that_are_not_finite_name_their_frame(tmp_path):
 
 
 def test_embeddings_that_are_not_finite_name_their_prompt(tmp_path, monkeypatch):
-    from ctlev_core.diffusion import latent_cache
+    from ctlev_core.diffusion.training import latent_cache
 
     def broken(prior, prompts):
         embeddings = encode_prompts(prior, prompts)

@@ -8,9 +8,9 @@ import pytest
 import torch
 from tiny_prior import SIDE, make_data, make_prior
 
-from ctlev_core.diffusion import trainer
-from ctlev_core.diffusion.finetuning import SHOWN, draw_samples, fine_tune, split_rows
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training import trainer
+from ctlev_core.diffusion.training.finetuning import SHOWN, draw_samples, fine_tune, split_rows
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.labels import Conditions
 
 OPTIONS = FineTuningOptions(

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_prior import make_data, make_prior, shared_prior
 
-from ctlev_core.diffusion import acceleration, finetuning, trainer, training
 from ctlev_core.diffusion.denoising import generator_for
-from ctlev_core.diffusion.finetuning import draw_turns, fine_tune, split_rows
 from ctlev_core.diffusion.float32_attention import use_float32_attention
-from ctlev_core.diffusion.latent_cache import LatentCache, cache_latents, turn_conditions
-from ctlev_core.diffusion.muon import MATRIX_RATE, is_matrix
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training import acceleration, finetuning, loop, trainer
+from ctlev_core.diffusion.training.finetuning import draw_turns, fine_tune, split_rows
+from ctlev_core.diffusion.training.latent_cache import LatentCache, cache_latents, turn_conditions
+from ctlev_core.diffusion.training.muon import MATRIX_RATE, is_matrix
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.render.normals import turn_normal_map
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError, TrainingError
@@ -44,7 +44,7 @@ def same(one, other):
 
 def on_any_device(monkeypatch):
     """Float16 on a CPU is slow and lacks operations, but what the tests need is there."""
-    monkeypatch.setattr(training, "check_precision", lambda options, device: None)
+    monkeypatch.setattr(loop, "check_precision", lambda options, device: None)
 
 
 class Killed(Exception):

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_prior import make_data, make_prior
 
-from ctlev_core.diffusion import training
-from ctlev_core.diffusion.checkpoint_training import train_checkpoint
 from ctlev_core.diffusion.pretrained.loading import load_prior, save_prior
-from ctlev_core.diffusion.ranks import Ranks
-from ctlev_core.diffusion.training_options import FineTuningOptions
-from ctlev_core.diffusion.training_processes import child_environment
+from ctlev_core.diffusion.training import loop
+from ctlev_core.diffusion.training.distributed import Ranks
+from ctlev_core.diffusion.training.entry import train_checkpoint
+from ctlev_core.diffusion.training.launch import child_environment
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.generators import controlnet
 from data_contracts.errors import TrainingError
 
@@ -108,7 +108,7 @@ def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder, shared)
 def test_parts_of_weights_go_on_from_whole_ones(tmp_path, prior_folder, monkeypatch):
     """One process is killed in its third step; two that share out the weights end where it would have."""
     trained(tmp_path / "alone", prior_folder, OPTIONS)
-    loss = training.denoising_loss
+    loss = loop.denoising_loss
     calls = iter(range(2 * OPTIONS.gradient_accumulation))
 
     def killed(*arguments):
@@ -116,7 +116,7 @@ def test_parts_of_weights_go_on_from_whole_ones(tmp_path, prior_folder, monkeypa
             raise KeyboardInterrupt
         return loss(*arguments)
 
-    monkeypatch.setattr(training, "denoising_loss", killed)
+    monkeypatch.setattr(loop, "denoising_loss", killed)
     with pytest.raises(KeyboardInterrupt):
         trained(tmp_path / "resumed", prior_folder, OPTIONS.model_copy(update={"checkpoint_every_s": 1e-9}))
     assert torch.load(tmp_path / "resumed" / "work" / "state.pt", weights_only=True)["step"] == 2

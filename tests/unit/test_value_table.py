@@ -7,13 +7,13 @@ import pytest
 import torch
 from tiny_prior import SIDE, make_data, make_prior
 
-from ctlev_core.diffusion.finetuning import fine_tune
 from ctlev_core.diffusion.pretrained.loading import encode_prompts, images_to_tensor, save_prior
 from ctlev_core.diffusion.sampling import value_table
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
 from ctlev_core.diffusion.sampling.value_table import draw_values, fit_value_table, read_value_table, write_value_table
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training.finetuning import fine_tune
+from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 

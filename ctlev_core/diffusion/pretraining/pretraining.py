@@ -35,11 +35,11 @@ from ctlev_core.diffusion.pretraining import procedural_images
 from ctlev_core.diffusion.pretraining.architecture import IMAGE_SIZE, WIDTHS, PredictionType, build_prior
 from ctlev_core.diffusion.pretraining.picture_scenes import picture_diet, scene_of
 from ctlev_core.diffusion.pretraining.picture_styles import DEFAULT_DIET, Diet, Scene, apply_style
-from ctlev_core.diffusion.ranks import ALONE, Ranks
-from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
-from ctlev_core.diffusion.training import run_training, sample_rows
-from ctlev_core.diffusion.training_options import TrainingOptions
-from ctlev_core.diffusion.training_processes import run_rank, train_in_processes
+from ctlev_core.diffusion.training.distributed import ALONE, Ranks
+from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
+from ctlev_core.diffusion.training.loop import run_training, sample_rows
+from ctlev_core.diffusion.training.options import TrainingOptions
+from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 from ctlev_core.labelled_pictures import PictureOptions
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from ctlev_core.diffusion.finetuning import Tune, fine_tune, forget_weights
 from ctlev_core.diffusion.pretrained.loading import choose_device, load_prior, save_prior
-from ctlev_core.diffusion.ranks import ALONE, Ranks
 from ctlev_core.diffusion.sampling.value_table import write_value_table
-from ctlev_core.diffusion.sharding import check_sharding, gather_networks, shard_networks
-from ctlev_core.diffusion.trainer import TrainingHistory
-from ctlev_core.diffusion.training_options import FineTuningOptions
-from ctlev_core.diffusion.training_processes import run_rank, train_in_processes
+from ctlev_core.diffusion.training.distributed import ALONE, Ranks
+from ctlev_core.diffusion.training.finetuning import Tune, fine_tune, forget_weights
+from ctlev_core.diffusion.training.fsdp import check_sharding, gather_networks, shard_networks
+from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
+from ctlev_core.diffusion.training.options import FineTuningOptions
+from ctlev_core.diffusion.training.trainer import TrainingHistory
 from data_contracts.config import ConditionChoice
 from data_contracts.labels import Conditions
 

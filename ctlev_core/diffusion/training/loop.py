@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ctlev_core.diffusion.acceleration import accelerated, autocast, check_precision
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, generator_for
-from ctlev_core.diffusion.ranks import ALONE, Ranks
-from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
-from ctlev_core.diffusion.training_log import TrainingLog, training_log
+from ctlev_core.diffusion.training.acceleration import accelerated, autocast, check_precision
+from ctlev_core.diffusion.training.distributed import ALONE, Ranks
+from ctlev_core.diffusion.training.tensorboard import TrainingLog, training_log
+from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 
 
 def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.distributed.tensor import DTensor, distribute_tensor
 
 from ctlev_core.diffusion.pretrained.loading import Prior
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training.options import FineTuningOptions
 
 BLOCKS = ("down_blocks", "mid_block", "up_blocks", "controlnet_cond_embedding")
 """Parts of a U-Net and of a ControlNet whose weights are put together at a time; what is left is one part more."""

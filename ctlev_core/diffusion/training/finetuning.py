@@ -19,24 +19,24 @@ import torch
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
-from ctlev_core.diffusion.latent_cache import (
+from ctlev_core.diffusion.pretrained.loading import Prior, encode_prompts
+from ctlev_core.diffusion.pretraining.architecture import break_zeros
+from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import sample_frames
+from ctlev_core.diffusion.sampling.value_table import fit_value_table
+from ctlev_core.diffusion.training.distributed import ALONE, Ranks
+from ctlev_core.diffusion.training.latent_cache import (
     LatentCache,
     cache_latents,
     check_cache,
     check_training_data,
     encode_images,
 )
-from ctlev_core.diffusion.pretrained.loading import Prior, encode_prompts
-from ctlev_core.diffusion.pretraining.architecture import break_zeros
-from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
-from ctlev_core.diffusion.ranks import ALONE, Ranks
-from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.sampling.sampling import sample_frames
-from ctlev_core.diffusion.sampling.value_table import fit_value_table
-from ctlev_core.diffusion.trainer import Trainer, TrainingHistory
-from ctlev_core.diffusion.training import check_run, run_training, sample_rows
-from ctlev_core.diffusion.training_log import picture_of_samples
-from ctlev_core.diffusion.training_options import FineTuningOptions
+from ctlev_core.diffusion.training.loop import check_run, run_training, sample_rows
+from ctlev_core.diffusion.training.options import FineTuningOptions
+from ctlev_core.diffusion.training.tensorboard import picture_of_samples
+from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 from ctlev_core.image_moves import move_image
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError

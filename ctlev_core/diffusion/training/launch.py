@@ -16,8 +16,8 @@ from typing import Any
 
 import torch
 
-from ctlev_core.diffusion.ranks import Ranks, start_ranks, stop_ranks
-from ctlev_core.diffusion.trainer import TrainingHistory
+from ctlev_core.diffusion.training.distributed import Ranks, start_ranks, stop_ranks
+from ctlev_core.diffusion.training.trainer import TrainingHistory
 from ctlev_core.processes import die_with_parent, num_cores
 from data_contracts.errors import TrainingError
 

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 import torch
 
 from ctlev_core.diffusion.denoising import Denoiser
-from ctlev_core.diffusion.training_options import TrainingOptions
+from ctlev_core.diffusion.training.options import TrainingOptions
 
 logger = logging.getLogger(__name__)
 

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.distributed.tensor import DTensor
 
-from ctlev_core.diffusion.muon import Muon
-from ctlev_core.diffusion.sharding import part_of, part_of_optimizer, whole
-from ctlev_core.diffusion.training_options import TrainingOptions
+from ctlev_core.diffusion.training.fsdp import part_of, part_of_optimizer, whole
+from ctlev_core.diffusion.training.muon import Muon
+from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.training_state import read_training_state, write_training_state
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
