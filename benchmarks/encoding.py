@@ -30,7 +30,7 @@ import numpy as np
 from numba import njit
 
 from ctlev_core.encodings import event_histogram
-from ctlev_core.windows import cut
+from ctlev_core.events.windows import cut
 from data_contracts.config import Windows
 from data_contracts.events import Events, SensorSize
 

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 
 from ctlev_core.conditions import picture
-from ctlev_core.event_files import read_events_file
+from ctlev_core.events.files import read_events_file
 from ctlev_core.generators import filmed_pictures
 from data_contracts.events import Events
 from data_contracts.labels import Conditions, Labels

@@ -27,7 +27,7 @@ from typing import Literal
 
 import numpy as np
 
-from ctlev_core.windows import spread as spread_evenly
+from ctlev_core.events.windows import spread as spread_evenly
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctlev_core import plugins
-from ctlev_core.windows import spread
+from ctlev_core.events.windows import spread
 from data_contracts.errors import DataError
 
 if TYPE_CHECKING:

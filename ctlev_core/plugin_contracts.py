@@ -90,7 +90,7 @@ class Format(Protocol):
     """A raw event file format.
 
     One whose files carry no signature says `HAS_SIGNATURE = False`: its `sniff` takes what is merely plausible, and
-    is asked only where no other format knows the file (`ctlev_core.event_files.find_format`).
+    is asked only where no other format knows the file (`ctlev_core.events.files.find_format`).
     """
 
     VERSION: int

@@ -263,7 +263,7 @@ def write_preset(path: Path, calibration: Calibration, recording: str) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """The command line."""
-    from ctlev_core.event_files import read_events_file
+    from ctlev_core.events.files import read_events_file
     from ctlev_core.sensor_options import read_preset
 
     parser = argparse.ArgumentParser(

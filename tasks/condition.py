@@ -23,11 +23,11 @@ from ctlev_core.condition_sources import (
     rows_of_frames,
     sensor_size_of,
 )
+from ctlev_core.events.windows import spread
 from ctlev_core.labelling import labels_in_image
 from ctlev_core.plugins import Plugin
 from ctlev_core.pose_choice import balanced_choice, surrounded
 from ctlev_core.seeds import row_seeds
-from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.arrays import ArrayWriter
 from data_contracts.config import ConditionChoice, EncodingChoice, Windows

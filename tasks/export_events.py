@@ -13,12 +13,13 @@ import numpy as np
 import pyarrow as pa
 from tqdm import tqdm
 
-from ctlev_core import event_files, plugins
+from ctlev_core import plugins
 from ctlev_core.event_streams import TimeModel, fit_times, sample_streams
+from ctlev_core.events import files as event_files
+from ctlev_core.events.image_grid import check_whole_counts, count_size, pixel_bins
+from ctlev_core.events.windows import spread
 from ctlev_core.format_files import event_pieces
 from ctlev_core.image_counts import CountModel, estimate_counts, fit_counts
-from ctlev_core.image_geometry import check_whole_counts, count_size, pixel_bins
-from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError

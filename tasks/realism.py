@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core import event_files
+from ctlev_core.events import files as event_files
+from ctlev_core.events.windows import spread
 from ctlev_core.realism import distances, two_sample
 from ctlev_core.realism.summary import AXES, Summary, summarise_events, summarise_frames
-from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage

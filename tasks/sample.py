@@ -15,15 +15,16 @@ import numpy as np
 import pyarrow as pa
 from tqdm import tqdm
 
-from ctlev_core import event_files, plugins
+from ctlev_core import plugins
 from ctlev_core.condition_sources import sensor_size_of
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling.shards import SHARD
 from ctlev_core.dithering import dither_counts
+from ctlev_core.events import files
+from ctlev_core.events.image_grid import check_whole_counts
+from ctlev_core.events.windows import spread, window_around
 from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
-from ctlev_core.image_geometry import check_whole_counts
 from ctlev_core.seeds import row_seeds
-from ctlev_core.windows import spread, window_around
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
@@ -184,7 +185,7 @@ def _calibrated(plugin: plugins.Plugin, recordings: Manifest, conditions: Manife
     if not ranges:
         raise DataError(f"{recordings.ref.path}: no training recording with events, which {plugin.name!r} is fitted to")
     chosen = [ranges[number] for number in spread(len(ranges), MAX_CALIBRATION)]
-    read = (event_files.read_events_range(path, start, stop) for _, path, start, stop in chosen)
+    read = (files.read_events_range(path, start, stop) for _, path, start, stop in chosen)
     names = [class_name for class_name, *_ in chosen]
     options, measured = plugin.module.calibrate(read, names, conditions_of(conditions), plugin.options)
     found = {"options": options.model_dump(mode="json"), "measured": measured}

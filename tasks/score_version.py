@@ -6,9 +6,9 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.events.windows import spread
 from ctlev_core.feature_distances import name_distance
 from ctlev_core.version_gates import HELD_OUT, SYNTHETIC
-from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import STOCHASTIC
+from ctlev_core.events.windows import spread
 from ctlev_core.sampling_errors import (
     CPU,
     EXACT,
@@ -31,7 +32,6 @@ from ctlev_core.sampling_errors import (
 )
 from ctlev_core.sampling_realism import realism_of_real, realism_of_samples
 from ctlev_core.seeds import row_seeds
-from ctlev_core.windows import spread
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice, SamplingChoice
 from data_contracts.labels import Conditions

@@ -20,7 +20,7 @@ from ctlev_core.body.motion.clip import (
     times_at_rate,
 )
 from ctlev_core.camera import orbit_rotation
-from ctlev_core.windows import spread
+from ctlev_core.events.windows import spread
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_labels

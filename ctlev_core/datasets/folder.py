@@ -21,8 +21,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import event_files
 from ctlev_core.dataset_files.trees import recording_ids
+from ctlev_core.events import files as event_files
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events

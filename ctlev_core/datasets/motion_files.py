@@ -33,7 +33,7 @@ from ctlev_core.body.motion.clip import move_world as _move_world
 from ctlev_core.dataset_files.pose_sources import PoseSourceOptions
 from ctlev_core.dataset_files.pose_sources import labels_before_camera as _labels_before_camera
 from ctlev_core.dataset_files.trees import check_inside, list_folder, recording_ids
-from ctlev_core.windows import spread
+from ctlev_core.events.windows import spread
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
 from data_contracts.events import Events

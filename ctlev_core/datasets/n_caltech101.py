@@ -34,7 +34,6 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from ctlev_core import event_files
 from ctlev_core.dataset_files.trees import (
     check_inside,
     check_name,
@@ -44,6 +43,7 @@ from ctlev_core.dataset_files.trees import (
     list_folder,
     shuffled,
 )
+from ctlev_core.events import files as event_files
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events

@@ -35,7 +35,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import event_files
 from ctlev_core.dataset_files.trees import (
     check_inside,
     check_root,
@@ -45,6 +44,7 @@ from ctlev_core.dataset_files.trees import (
     read_lines,
     shuffled,
 )
+from ctlev_core.events import files as event_files
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events

@@ -33,9 +33,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ctlev_core import event_files
 from ctlev_core.dataset_files.trees import check_inside, check_name, check_root, list_files, list_folder, shuffled
-from ctlev_core.windows import time_bins
+from ctlev_core.events import files as event_files
+from ctlev_core.events.windows import time_bins
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize

@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import image_drawing, image_geometry
-from ctlev_core.windows import check_ranges
+from ctlev_core.events import image_drawing, image_grid
+from ctlev_core.events.windows import check_ranges
 from data_contracts.events import Events
 
 VERSION = 2
 
 
-class Options(image_geometry.ImageFit):
+class Options(image_grid.ImageFit):
     """Options of the event histogram."""
 
     polarity: bool = Field(
@@ -51,7 +51,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         ValueError: a window is not a range of the events, or the image is too large.
         DataError: an event lies outside the sensor.
     """
-    from ctlev_core import histogram as kernels
+    from ctlev_core.events import histogram_kernels as kernels
 
     windows = check_ranges(windows, len(events))
     shape = _shape(events, options)
@@ -61,7 +61,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
     counts = (np.zeros if is_clear else np.empty)((len(windows), *shape), np.uint16)
     count = _counter(events, windows, options)
     outside = count(windows, counts.reshape(len(windows), math.prod(shape)), is_clear)
-    image_geometry.check_inside(events, outside)
+    image_grid.check_inside(events, outside)
     return counts
 
 
@@ -78,7 +78,7 @@ def encode_each(events: Events, windows: np.ndarray, options: Options) -> Iterat
         ValueError: a window is not a range of the events, or the image is too large.
         DataError: an event lies outside the sensor.
     """
-    from ctlev_core import histogram as kernels
+    from ctlev_core.events import histogram_kernels as kernels
 
     windows = check_ranges(windows, len(events))
     counts = np.zeros(_shape(events, options), np.uint16)
@@ -87,7 +87,7 @@ def encode_each(events: Events, windows: np.ndarray, options: Options) -> Iterat
     is_sensor = counts.shape[:0:-1] == events.sensor_size
     is_clear = True
     for row, (start, stop) in enumerate(windows.tolist()):
-        image_geometry.check_inside(events, count(windows[row : row + 1], flat, is_clear))
+        image_grid.check_inside(events, count(windows[row : row + 1], flat, is_clear))
         yield counts
         is_clear = is_sensor and stop - start < kernels.SPARSE * counts.size
         if is_clear:
@@ -97,7 +97,7 @@ def encode_each(events: Events, windows: np.ndarray, options: Options) -> Iterat
 
 def _shape(events: Events, options: Options) -> tuple[int, int, int]:
     """(C, H, W) of one window."""
-    width, height = image_geometry.count_size(events.sensor_size, options)
+    width, height = image_grid.count_size(events.sensor_size, options)
     num_channels = 2 if options.polarity else 1
     if num_channels * height * width >= 2**32:
         raise ValueError(f"a window must have fewer than 2^32 cells, got {num_channels} x {height} x {width}")
@@ -106,7 +106,7 @@ def _shape(events: Events, options: Options) -> tuple[int, int, int]:
 
 def _counter(events: Events, windows: np.ndarray, options: Options) -> Callable[..., int]:
     """The kernel for these options, of (windows, histogram [N, cells], is_clear): fast where nothing is scaled."""
-    from ctlev_core import histogram as kernels
+    from ctlev_core.events import histogram_kernels as kernels
 
     num_channels, height, width = _shape(events, options)
     num_cells = num_channels * height * width
@@ -116,7 +116,7 @@ def _counter(events: Events, windows: np.ndarray, options: Options) -> Callable[
         return lambda windows, histogram, is_clear=False: kernels.count_pixels(
             events.x, events.y, events.p, windows, (width, height), options.polarity, narrow, is_clear, histogram
         )
-    column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
+    column_of, row_of = image_grid.pixel_bins(events.sensor_size, options)
     negative_start = (num_channels - 1) * height * width
     return lambda windows, histogram, is_clear=False: kernels.count_events(
         events.x, events.y, events.p, windows, column_of, row_of * width, negative_start, histogram
@@ -128,7 +128,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
 
     Both polarities share one full scale, so that their ratio survives: three standard deviations of the total counts
     over the pixels with events (n - 1 in the divisor, at least 0.1 / 255), or the largest count of any channel. What
-    comes of that in an image of another size than the sensor's says `ctlev_core.image_drawing`.
+    comes of that in an image of another size than the sensor's says `ctlev_core.events.image_drawing`.
 
     Args:
         histogram: [N, C, H, W] uint16 as `encode` returns it.
@@ -141,12 +141,12 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     Source: SensorsINI/DHP19, normalizeImage3Sigma.m. There one channel holds both polarities.
     """
     channels = 2 if options.polarity else 1
-    image_geometry.check_encoded(histogram, channels, np.uint16)
-    from ctlev_core import histogram as kernels
+    image_grid.check_encoded(histogram, channels, np.uint16)
+    from ctlev_core.events import histogram_kernels as kernels
 
     histogram = np.ascontiguousarray(histogram)
     size = histogram.shape[:1:-1]
-    if options.resampling == "area" and image_geometry.image_size(size, options) != size:
+    if options.resampling == "area" and image_grid.image_size(size, options) != size:
         levels = image_drawing.draw_counts(histogram, options, options.normalisation, options.full_scale_count)
         return _as_colours(levels)
     images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
@@ -165,11 +165,11 @@ def render_levels(levels: np.ndarray, options: Options) -> np.ndarray:
     Raises:
         ValueError: the shape or dtype is another.
     """
-    image_geometry.check_encoded(levels, 2 if options.polarity else 1, np.uint8)
+    image_grid.check_encoded(levels, 2 if options.polarity else 1, np.uint8)
     return _as_colours(image_drawing.fit_levels(levels, options, options.normalisation))
 
 
-map_points = image_geometry.map_points
+map_points = image_grid.map_points
 
 
 def full_scales(histogram: np.ndarray, options: Options) -> np.ndarray:

@@ -4,7 +4,7 @@ What happens one after the other then lies beside one another, where a single hi
 an N-MNIST recording the three saccades, each of which shows the edges across its own direction. Polarity is discarded,
 for an image has three channels; what a direction of movement and a polarity say of an edge is much the same.
 
-Each window is cut into parts of equal duration, from its first event to its last (`ctlev_core.windows.time_bins`).
+Each window is cut into parts of equal duration, from its first event to its last (`ctlev_core.events.windows.time_bins`).
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import image_drawing, image_geometry
-from ctlev_core.windows import check_order, check_ranges, time_bins
+from ctlev_core.events import image_drawing, image_grid
+from ctlev_core.events.windows import check_order, check_ranges, time_bins
 from data_contracts.events import Events
 
 VERSION = 1
 COLOURS = 3
 
 
-class Options(image_geometry.ImageFit):
+class Options(image_grid.ImageFit):
     """Options of the time bins."""
 
     num_bins: int = Field(default=3, ge=1, le=COLOURS, description="parts of a window; what is left of RGB is black")
@@ -44,17 +44,17 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         ValueError: a window is not a range of the events.
         DataError: an event lies outside the sensor, or time stamps go back.
     """
-    from ctlev_core import histogram as kernels
+    from ctlev_core.events import histogram_kernels as kernels
 
     windows = check_ranges(windows, len(events))
     check_order(events.t)
-    width, height = image_geometry.count_size(events.sensor_size, options)
-    column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
+    width, height = image_grid.count_size(events.sensor_size, options)
+    column_of, row_of = image_grid.pixel_bins(events.sensor_size, options)
     parts = time_bins(events.t, windows, options.num_bins).reshape(-1, 2)
     counts = np.empty((len(parts), height * width), np.uint16)
     columns = events.x, events.y, events.p
     outside = kernels.count_events(*columns, parts, column_of, row_of * width, 0, counts)
-    image_geometry.check_inside(events, outside)
+    image_grid.check_inside(events, outside)
     return counts.reshape(len(windows), options.num_bins, height, width)
 
 
@@ -69,11 +69,11 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     Raises:
         ValueError: the shape or dtype is not that of counts encoded with these options.
     """
-    image_geometry.check_encoded(histogram, options.num_bins, np.uint16)
+    image_grid.check_encoded(histogram, options.num_bins, np.uint16)
     levels = image_drawing.draw_counts(histogram, options, options.normalisation, options.full_scale_count)
     images = np.zeros((len(levels), *levels.shape[2:], COLOURS), np.uint8)
     images[..., : options.num_bins] = levels.transpose(0, 2, 3, 1)
     return images
 
 
-map_points = image_geometry.map_points
+map_points = image_grid.map_points

@@ -16,14 +16,14 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import image_drawing, image_geometry
-from ctlev_core.windows import check_order, check_ranges
+from ctlev_core.events import image_drawing, image_grid
+from ctlev_core.events.windows import check_order, check_ranges
 from data_contracts.events import Events
 
 VERSION = 2
 
 
-class Options(image_geometry.ImageFit):
+class Options(image_grid.ImageFit):
     """Options of the time surface."""
 
     polarity: bool = Field(default=True, description="a surface for each polarity; otherwise one for both")
@@ -44,12 +44,12 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         ValueError: a window is not a range of the events.
         DataError: an event lies outside the sensor, or time stamps go back.
     """
-    from ctlev_core import temporal_kernels as kernels
+    from ctlev_core.events import temporal_kernels as kernels
 
     windows = check_ranges(windows, len(events))
     check_order(events.t)
-    width, height = image_geometry.count_size(events.sensor_size, options)
-    column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
+    width, height = image_grid.count_size(events.sensor_size, options)
+    column_of, row_of = image_grid.pixel_bins(events.sensor_size, options)
     num_channels = 2 if options.polarity else 1
     surfaces = np.zeros((len(windows), num_channels * height * width), np.float32)
     outside = kernels.decay_from_end(
@@ -65,7 +65,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         float(np.finfo(np.float32).tiny),
         surfaces,
     )
-    image_geometry.check_inside(events, outside)
+    image_grid.check_inside(events, outside)
     return surfaces.reshape(len(windows), num_channels, height, width)
 
 
@@ -83,7 +83,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
         ValueError: the shape or dtype is not that of surfaces encoded with these options.
     """
     channels = 2 if options.polarity else 1
-    image_geometry.check_encoded(histogram, channels, np.float32)
+    image_grid.check_encoded(histogram, channels, np.float32)
     values = np.floor(255.0 * histogram).astype(np.uint8)
     if options.resampling == "area":
         values = image_drawing.fit_levels(values, options, "max")
@@ -94,4 +94,4 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     return images
 
 
-map_points = image_geometry.map_points
+map_points = image_grid.map_points

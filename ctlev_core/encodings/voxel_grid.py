@@ -18,14 +18,14 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import image_drawing, image_geometry
-from ctlev_core.windows import check_order, check_ranges
+from ctlev_core.events import image_drawing, image_grid
+from ctlev_core.events.windows import check_order, check_ranges
 from data_contracts.events import Events
 
 VERSION = 2
 
 
-class Options(image_geometry.ImageFit):
+class Options(image_grid.ImageFit):
     """Options of the voxel grid."""
 
     num_bins: int = Field(default=5, ge=1, description="temporal bins; 5 as in E2VID, 9 as in Zhu et al.")
@@ -61,12 +61,12 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         ValueError: a window is not a range of the events.
         DataError: an event lies outside the sensor, or time stamps go back.
     """
-    from ctlev_core import temporal_kernels as kernels
+    from ctlev_core.events import temporal_kernels as kernels
 
     windows = check_ranges(windows, len(events))
     check_order(events.t)
-    width, height = image_geometry.count_size(events.sensor_size, options)
-    column_of, row_of = image_geometry.pixel_bins(events.sensor_size, options)
+    width, height = image_grid.count_size(events.sensor_size, options)
+    column_of, row_of = image_grid.pixel_bins(events.sensor_size, options)
     is_separate = options.polarity == "separate"
     num_channels = options.num_bins * (2 if is_separate else 1)
     scratch = np.zeros(num_channels * height * width)
@@ -88,7 +88,7 @@ def encode(events: Events, windows: np.ndarray, options: Options) -> np.ndarray:
         touched,
         grids,
     )
-    image_geometry.check_inside(events, outside)
+    image_grid.check_inside(events, outside)
     for grid in grids:
         _normalise(grid, options)
     return grids.reshape(len(windows), num_channels, height, width)
@@ -127,11 +127,11 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
         ValueError: the shape or dtype is not that of grids encoded with these options.
     """
     channels = options.num_bins * (2 if options.polarity == "separate" else 1)
-    image_geometry.check_encoded(histogram, channels, np.float32)
+    image_grid.check_encoded(histogram, channels, np.float32)
     is_grey = options.polarity == "discarded"
     width, height = size = histogram.shape[:1:-1]
     if options.resampling == "area":
-        width, height = image_geometry.image_size(size, options)
+        width, height = image_grid.image_size(size, options)
     images = np.zeros((len(histogram), height, width, 3), np.uint8)
     for grid, image in zip(histogram, images, strict=True):
         if options.polarity == "separate":
@@ -158,4 +158,4 @@ def _three_sigma(magnitudes: np.ndarray) -> float:
     return 3 * sigma if sigma > 0 else float(used.max(initial=0)) or 1.0
 
 
-map_points = image_geometry.map_points
+map_points = image_grid.map_points

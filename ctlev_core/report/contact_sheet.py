@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ctlev_core.events.windows import spread
 from ctlev_core.report.html import ImageGrid, Section, Table
-from ctlev_core.windows import spread
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest
 

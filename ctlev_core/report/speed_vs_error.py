@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ctlev_core.events.windows import spread
 from ctlev_core.report.html import Curves, ImageGrid, Section, Table
 from ctlev_core.report.measurement_charts import (
     CONVERGED_LINE,
@@ -35,7 +36,6 @@ from ctlev_core.sampling_errors import (
     REFERENCE,
     WALL,
 )
-from ctlev_core.windows import spread
 
 QUICK = (5, 10)
 """Evaluations of the network in which a quick setting is looked for."""

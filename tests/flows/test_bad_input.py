@@ -112,9 +112,9 @@ def parquet_recording(path, **changed):
     from ctlev_core.formats import parquet
 
     make_recording(path.with_suffix(".raw"))
-    from ctlev_core import event_files
+    from ctlev_core.events import files
 
-    events = event_files.read_events_file(path.with_suffix(".raw"))
+    events = files.read_events_file(path.with_suffix(".raw"))
     path.with_suffix(".raw").unlink()
     parquet.write(path, events)
     table = pq.read_table(path)

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.encodings.event_histogram import Options, encode, render_image
-from ctlev_core.event_files import read_events_file
-from ctlev_core.windows import cut
+from ctlev_core.events.files import read_events_file
+from ctlev_core.events.windows import cut
 from data_contracts.config import Windows
 from data_contracts.events import Events
 
@@ -119,7 +119,7 @@ def test_three_sigma_keeps_small_differences_of_large_counts():
     # Counts 65,534 and 65,535: with sums of squares in 32-bit floats their sigma would come out as 0 or NaN.
     counts = np.full((1, 1, 512, 512), 65535, np.uint16)
     counts[0, 0, ::2] = 65534
-    from ctlev_core.histogram import full_scales
+    from ctlev_core.events.histogram_kernels import full_scales
 
     scales = np.empty(1)
     full_scales(counts, scales)

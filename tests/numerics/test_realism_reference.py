@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ctlev_core.event_files import read_events_file
+from ctlev_core.events.files import read_events_file
 from ctlev_core.realism.summary import AXES, HOT_FACTOR, HOT_MIN_EVENTS, RADIUS_US, summarise_events
 from data_contracts.events import Events
 

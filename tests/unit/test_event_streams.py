@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest, spearmanr
 
-from ctlev_core import event_files, plugins
+from ctlev_core import plugins
 from ctlev_core.event_streams import Spread, TimeModel, fit_times, sample_duration_us, sample_streams
+from ctlev_core.events import files
+from ctlev_core.events.windows import cut
 from ctlev_core.realism.distances import estimate_distances, estimate_floor
 from ctlev_core.realism.summary import summarise_events
-from ctlev_core.windows import cut
 from data_contracts.config import Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
@@ -185,7 +186,7 @@ def distances_of(spread: Spread, model: TimeModel, windows: list[Events]) -> dic
 def test_real_gaps_are_closer_to_the_real_person_than_uniform_times(real_recordings):
     """Other windows of the recording; the floor is the distance of halves of the real windows from one another."""
     (path,) = (real_recordings / "person").iterdir()
-    events = event_files.read_events_file(path)
+    events = files.read_events_file(path)
     windows = [events.slice(*window) for window in cut(events, Windows(num_events=7500)).tolist()]
     model = fit_times(windows[::2])
     uniform, field = (distances_of(spread, model, windows[1::2]) for spread in ("uniform", "field"))

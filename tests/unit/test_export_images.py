@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 from generated_frames import REFUSED_ROW, make_generated, publish
 
-from ctlev_core import event_files
 from ctlev_core.event_dataset import EventDataset
+from ctlev_core.events import files
 from ctlev_core.provenance import read_provenance
 from data_contracts import image_folder, tables
 from data_contracts.config import cache_material
@@ -227,14 +227,14 @@ def make_streams(made, home, one_file):
     for row, events in enumerate(streams):
         name = "events.parquet" if one_file else f"{row:06d}.parquet"
         if not one_file:
-            event_files.write_events_parquet(folder / name, events)
+            files.write_events_parquet(folder / name, events)
             start = start_us = 0
         last_us = start_us + int(events.t[-1])
         rows.append((f"events/{name}", start, len(events), start_us, last_us))
         start, start_us = start + len(events), last_us + 100
     if one_file:
         moved = [Events(e.t + r[3], e.x, e.y, e.p, e.sensor_size) for e, r in zip(streams, rows, strict=True)]
-        event_files.write_event_chunks_parquet(folder / "events.parquet", moved)
+        files.write_event_chunks_parquet(folder / "events.parquet", moved)
     names = ("file", "event_start", "num_events", "t_start_us", "t_end_us")
     columns = {name: [row[number] for row in rows] for number, name in enumerate(names)}
     columns |= {

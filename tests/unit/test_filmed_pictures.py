@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctlev_core import event_files
+from ctlev_core.events import files as event_files
 from ctlev_core.generators import filmed_pictures
 from ctlev_core.generators.filmed_pictures import UNCALIBRATED, SampleOptions, calibrate, frame_times_us, sample_events
 from ctlev_core.render.panned_picture import pan

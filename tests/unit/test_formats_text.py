@@ -9,7 +9,8 @@ from format_helpers import P, T, X, Y, assert_events, read_both_ways
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ctlev_core import event_files, plugins
+from ctlev_core import plugins
+from ctlev_core.events import files
 from data_contracts.errors import DataError
 
 SECONDS = "".join(f"{t / 1e6:.9f} {x} {y} {p}\n" for t, x, y, p in zip(T, X, Y, P, strict=True))
@@ -74,7 +75,7 @@ def test_wrong_text_names_the_row(text, message, tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(text)
     with pytest.raises(DataError, match=message):
-        event_files.read_events_file(path)
+        files.read_events_file(path)
 
 
 def test_text_is_parsed_the_same_across_blocks(tmp_path, monkeypatch):

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core import event_files, plugins
+from ctlev_core import plugins
+from ctlev_core.events import files
+from ctlev_core.events.windows import cut
 from ctlev_core.image_count_kernels import find_scale_ranges, settle_saturated
 from ctlev_core.image_counts import estimate_counts, fit_counts
-from ctlev_core.windows import cut
 from data_contracts.config import Windows
 from data_contracts.errors import DataError
 
@@ -122,7 +123,7 @@ def test_black_white_and_random_images(options):
 
 def test_the_real_person_comes_back_exactly(real_recordings):
     (path,) = (real_recordings / "person").iterdir()
-    events = event_files.read_events_file(path)
+    events = files.read_events_file(path)
     for options in ALL_OPTIONS:
         for num_events in (500, 7500):
             counts = ENCODING.encode(events, cut(events, Windows(num_events=num_events, max_windows=12)), options)

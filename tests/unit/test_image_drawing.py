@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core import image_geometry
 from ctlev_core.encodings import event_histogram, time_surface, voxel_grid
-from ctlev_core.image_drawing import draw_counts, fit_levels, full_scales, grey_levels
-from ctlev_core.image_geometry import ImageFit
-from ctlev_core.image_resampling import average_areas, find_overlaps
+from ctlev_core.events import image_grid
+from ctlev_core.events.image_drawing import draw_counts, fit_levels, full_scales, grey_levels
+from ctlev_core.events.image_grid import ImageFit
+from ctlev_core.events.image_resampling import average_areas, find_overlaps
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -23,8 +23,8 @@ NORMALISATIONS = st.sampled_from(["three_sigma", "max", "count"])
 def averaged(levels, fit):
     """[N, h, w] float32: averages of [N, H, W] without rounding."""
     size = levels.shape[:0:-1]
-    columns, rows = image_geometry.pixel_edges(size, fit)
-    width, height = image_geometry.image_size(size, fit)
+    columns, rows = image_grid.pixel_edges(size, fit)
+    width, height = image_grid.image_size(size, fit)
     return average_areas(levels, find_overlaps(columns, width), find_overlaps(rows, height))
 
 
@@ -37,7 +37,7 @@ def random_counts(seed, shape):
 def test_the_mean_over_the_sensor_is_kept(sensor, size, how, seed):
     fit = ImageFit(image_size=size, fit=how)
     levels = np.random.default_rng(seed).integers(0, 256, (1, sensor[1], sensor[0]), np.uint8)
-    columns, rows = image_geometry.pixel_edges(sensor, fit)
+    columns, rows = image_grid.pixel_edges(sensor, fit)
     area = (columns[-1] - columns[0]) * (rows[-1] - rows[0])
     assert averaged(levels, fit).sum(dtype=np.float64) / area == pytest.approx(levels.mean(), rel=1e-6)
 
@@ -49,7 +49,7 @@ def test_equal_counts_leave_no_gaps(sensor, size, how, normalisation, count):
     fit = ImageFit(image_size=size, fit=how)
     scale = full_scales(counts, normalisation)
     expected = grey_levels(counts, scale)[0, 0, 0, 0]
-    if normalisation != "count" and image_geometry.is_reduced(sensor, fit):
+    if normalisation != "count" and image_grid.is_reduced(sensor, fit):
         expected = 255
     assert (draw_counts(counts, fit, normalisation) == expected).all()
 
@@ -58,7 +58,7 @@ def test_equal_counts_leave_no_gaps(sensor, size, how, normalisation, count):
 @given(SIZES, SIZES)
 def test_bars_of_padding_are_black_and_the_rest_has_no_gaps(sensor, size):
     fit = ImageFit(image_size=size, fit="pad")
-    columns, rows = image_geometry.pixel_edges(sensor, fit)
+    columns, rows = image_grid.pixel_edges(sensor, fit)
     levels = fit_levels(np.full((1, 1, sensor[1], sensor[0]), 255, np.uint8), fit, "count")[0, 0]
     starts_x, starts_y = np.arange(size[0]), np.arange(size[1])
     is_inside = ((starts_y >= rows[0]) & (starts_y + 1 <= rows[-1]))[:, None]
@@ -87,12 +87,12 @@ def test_a_lone_pixel_lies_where_its_point_maps_to(sensor, size, how, data):
     levels[0, row, column] = 255
     image = averaged(levels, fit)[0].astype(np.float64)
     corners = np.array([[column, row], [column + 1, row + 1]], float)
-    (left, top), (right, bottom) = image_geometry.map_points(corners, sensor, fit)
+    (left, top), (right, bottom) = image_grid.map_points(corners, sensor, fit)
     if min(left, top) < 0 or right > size[0] or bottom > size[1]:
         return  # a part of it is not in the image
     rows, columns = np.mgrid[: size[1], : size[0]] + 0.5
     found = np.array([(columns * image).sum(), (rows * image).sum()]) / image.sum()
-    expected = image_geometry.map_points(np.array([column + 0.5, row + 0.5]), sensor, fit)
+    expected = image_grid.map_points(np.array([column + 0.5, row + 0.5]), sensor, fit)
     assert np.abs(found - expected).max() <= 0.5 + 1e-5
     lit = np.argwhere(image > 0)
     assert (lit.min(axis=0) >= np.floor([top + 1e-9, left + 1e-9])).all()
@@ -105,7 +105,7 @@ def slow_image(counts, options):
     total = counts.sum(axis=0)
     active = total[total > 0].astype(float)
     levels = np.minimum(255, np.floor(255.0 * counts / (3 * max(active.std(ddof=1), 0.1 / 255)))).astype(np.uint8)
-    columns, rows = image_geometry.pixel_edges((width, height), options)
+    columns, rows = image_grid.pixel_edges((width, height), options)
     share = np.zeros((2, max(options.image_size), max(width, height)))
     for axis, (edges, num_new) in enumerate(zip((columns, rows), options.image_size, strict=True)):
         for new in range(num_new):
@@ -113,7 +113,7 @@ def slow_image(counts, options):
                 share[axis, new, old] = max(0.0, min(new + 1, edges[old + 1]) - max(new, edges[old]))
     across, down = share[0, : options.image_size[0], :width], share[1, : options.image_size[1], :height]
     averages = np.stack([down @ channel @ across.T for channel in levels.astype(float)])
-    if not image_geometry.is_reduced((width, height), options):
+    if not image_grid.is_reduced((width, height), options):
         return np.rint(averages)
     values = np.rint(256 * averages)
     total = values.sum(axis=0)
@@ -183,6 +183,6 @@ def test_every_encoding_keeps_the_sensor_and_draws_the_image(encoding, size):
 
 
 def test_counts_of_other_pixels_than_the_images_are_refused():
-    image_geometry.check_whole_counts((5, 1, 64, 48), (5, 64, 48, 3), "export")
+    image_grid.check_whole_counts((5, 1, 64, 48), (5, 64, 48, 3), "export")
     with pytest.raises(DataError, match=r"export needs whole counts .* 48 x 64 px, .* 64 x 64 px: .*resampling=events"):
-        image_geometry.check_whole_counts((5, 1, 64, 48), (5, 64, 64, 3), "export")
+        image_grid.check_whole_counts((5, 1, 64, 48), (5, 64, 64, 3), "export")

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.encodings import event_histogram
-from ctlev_core.image_resampling import average_areas, find_overlaps, resample_images
+from ctlev_core.events.image_resampling import average_areas, find_overlaps, resample_images
 
 
 def point_map(scale, offset):

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from ctlev_core.datasets import nmnist
-from ctlev_core.windows import time_bins
+from ctlev_core.events.windows import time_bins
 from data_contracts.errors import DataError
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "nmnist"

@@ -16,14 +16,15 @@ import torch
 from sd1_latent_tiny import REAL_DATA, SCALING_FACTOR, tiny_autoencoder
 from tiny_stable_diffusion import make_models, tiny_changes, write_folder
 
-from ctlev_core import event_files, plugins
+from ctlev_core import plugins
 from ctlev_core.diffusion.pretrained.loading import decode_latents, images_to_tensor, load_prior
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.training.finetuning import fine_tune
 from ctlev_core.diffusion.training.latent_cache import cache_latents, check_cache
 from ctlev_core.diffusion.training.options import FineTuningOptions
-from ctlev_core.image_resampling import resample_images
+from ctlev_core.events import files
+from ctlev_core.events.image_resampling import resample_images
 from data_contracts.config import EncodingChoice
 from data_contracts.labels import Conditions
 
@@ -52,7 +53,7 @@ def onto_512_px(images: np.ndarray) -> np.ndarray:
 
 def drawn(folder: str, num_events: int) -> np.ndarray:
     encoding = plugins.load_options(EncodingChoice(name="event_histogram"))
-    events = event_files.read_events_file(min((REAL_DATA / folder).iterdir()))
+    events = files.read_events_file(min((REAL_DATA / folder).iterdir()))
     first = (len(events) - num_events) // 2
     window = np.array([[first, first + num_events]])
     return encoding.module.render_image(encoding.module.encode(events, window, encoding.options), encoding.options)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from ctlev_core.event_files import write_events_parquet
+from ctlev_core.events.files import write_events_parquet
 from ctlev_core.generators import filmed_pictures
 from data_contracts.config import ConditionChoice, DatasetChoice, EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError

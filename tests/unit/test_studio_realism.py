@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from ctlev_core import plugins
-from ctlev_core.event_files import read_events_file
+from ctlev_core.events.files import read_events_file
 from ctlev_core.realism.distances import mean_distributions, wasserstein
 from ctlev_core.realism.summary import AXES, summarise_events
 from ctlev_core.sensor import PRESETS

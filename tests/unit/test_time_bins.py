@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.encodings import time_bins
-from ctlev_core.image_geometry import ImageFit, map_points
-from ctlev_core.windows import time_bins as cut_bins
+from ctlev_core.events.image_grid import ImageFit, map_points
+from ctlev_core.events.windows import time_bins as cut_bins
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.windows import Cutter, check_ranges, cut, cut_chunks, spread
+from ctlev_core.events.windows import Cutter, check_ranges, cut, cut_chunks, spread
 from data_contracts.config import Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events

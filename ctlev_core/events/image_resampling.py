@@ -50,7 +50,7 @@ def average_areas(images: np.ndarray, columns: Overlaps, rows: Overlaps) -> np.n
     Returns:
         [N, new rows, new columns] float32, 0 .. 255. Sums are made in 64 bits.
     """
-    from ctlev_core import image_resampling_kernels as kernels
+    from ctlev_core.events import image_resampling_kernels as kernels
 
     out = np.empty((len(images), len(rows.first), len(columns.first)), np.float32)
     kernels.average_areas(np.ascontiguousarray(images), *columns, *rows, out)

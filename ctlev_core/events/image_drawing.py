@@ -19,8 +19,8 @@ from typing import Literal
 
 import numpy as np
 
-from ctlev_core.image_geometry import Fit, ImageFit, image_size, is_reduced, pixel_edges
-from ctlev_core.image_resampling import Overlaps, average_areas, find_overlaps
+from ctlev_core.events.image_grid import Fit, ImageFit, image_size, is_reduced, pixel_edges
+from ctlev_core.events.image_resampling import Overlaps, average_areas, find_overlaps
 from data_contracts.events import SensorSize
 
 Normalisation = Literal["three_sigma", "max", "count"]
@@ -69,7 +69,7 @@ def full_scales(counts: np.ndarray, normalisation: Normalisation, full_scale_cou
         return np.full(len(counts), float(full_scale_count))
     if normalisation == "max":
         return np.maximum(counts.max(axis=(1, 2, 3), initial=0), 1).astype(np.float64)
-    from ctlev_core import histogram as kernels
+    from ctlev_core.events import histogram_kernels as kernels
 
     scales = np.empty(len(counts))
     kernels.full_scales(np.ascontiguousarray(counts), scales)
@@ -78,7 +78,7 @@ def full_scales(counts: np.ndarray, normalisation: Normalisation, full_scale_cou
 
 def grey_levels(counts: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """min(255, floor(255 count / scale)) of [N, C, H, W] uint16 counts and [N] scales; uint8."""
-    from ctlev_core import histogram as kernels
+    from ctlev_core.events import histogram_kernels as kernels
 
     levels = np.empty(counts.shape, np.uint8)
     kernels.grey_levels(np.ascontiguousarray(counts), scales, levels)
