@@ -26,7 +26,7 @@ import numpy as np
 
 from ctlev_core import plugins
 from ctlev_core.events import files
-from ctlev_core.format_files import prophesee
+from ctlev_core.events.decoding import prophesee
 from data_contracts.events import Events
 
 REAL = Path(__file__).resolve().parents[1].parent / "shared" / "real" / "events"

@@ -68,7 +68,7 @@ def read_stream(path: Path, num_vicon_rows: int, filters: bool) -> Stream:
         DataError: no AEDAT 2.0 file, no events, or triggers of no known pattern.
     Source: extract_from_aedat.m. Its reader loses the first record of a file; that one precedes the start trigger.
     """
-    from ctlev_core.format_files.aedat2 import read_records
+    from ctlev_core.events.decoding.aedat2 import read_records
 
     address, stamp = read_records(path)
     # Bit 31: picture samples and IMU. Bit 10: special events, here the triggers of the motion capture.

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 from ctlev_core import plugins
-from ctlev_core.format_files import event_pieces
+from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 

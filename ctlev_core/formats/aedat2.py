@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.format_files import aedat2, record_files
-from ctlev_core.format_files.sensor_sizes import smallest_sensor
+from ctlev_core.events.decoding import aedat2, record_files
+from ctlev_core.events.decoding.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events
 
@@ -65,7 +65,7 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
 
 
 def _open(path: Path) -> record_files.RecordFile:
-    from ctlev_core.format_files import aedat2_decoding as decoding
+    from ctlev_core.events.decoding import aedat2_decoding as decoding
 
     header = aedat2.read_header(path)
     num_records = aedat2.check_size(path, header)

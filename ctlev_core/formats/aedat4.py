@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.format_files import event_pieces
+from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.format_files import record_files
-from ctlev_core.format_files.sensor_sizes import smallest_sensor
+from ctlev_core.events.decoding import record_files
+from ctlev_core.events.decoding.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events
 
@@ -77,7 +77,7 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
 
 
 def _open(path: Path) -> record_files.RecordFile:
-    from ctlev_core.format_files.atis_decoding import decode_atis
+    from ctlev_core.events.decoding.atis_decoding import decode_atis
 
     def sensor_size(state: np.ndarray, num_events: int) -> SensorSize:
         if num_events == 0:

@@ -22,8 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.format_files import event_pieces, event_tables
-from ctlev_core.format_files.sensor_sizes import smallest_sensor
+from ctlev_core.events.decoding import event_pieces, event_tables
+from ctlev_core.events.decoding.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
@@ -165,7 +165,7 @@ def _parse_header(line: str, path: Path, is_comment: bool) -> tuple[str | None, 
 
 def _read_rows(path: Path, layout: _Layout, seconds: bool | None = None) -> Iterator[tuple[np.ndarray, bool]]:
     """Rows [M, 4] int64 of t (if its unit is known), x, y, p a block, and whether any t has a point or an exponent."""
-    from ctlev_core.format_files import text_decoding
+    from ctlev_core.events.decoding import text_decoding
 
     unit = text_decoding.UNKNOWN
     if seconds is not None:
@@ -191,7 +191,7 @@ def _read_rows(path: Path, layout: _Layout, seconds: bool | None = None) -> Iter
 
 
 def _parse_block(content: bytes, places: np.ndarray, unit: int, path: Path, first_byte: int) -> tuple[np.ndarray, bool]:
-    from ctlev_core.format_files.text_decoding import parse_rows
+    from ctlev_core.events.decoding.text_decoding import parse_rows
 
     rows = np.empty((content.count(b"\n"), 4), np.int64)
     array = np.frombuffer(content, np.uint8)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.format_files import prophesee, record_files
+from ctlev_core.events.decoding import prophesee, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 
@@ -64,7 +64,7 @@ def _read_type(path: Path, header: prophesee.Header) -> bytes:
 
 
 def _open(path: Path) -> record_files.RecordFile:
-    from ctlev_core.format_files import prophesee_decoding as decoding
+    from ctlev_core.events.decoding import prophesee_decoding as decoding
 
     header = prophesee.read_header(path)
     kind = _read_type(path, header)

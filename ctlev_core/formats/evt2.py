@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from ctlev_core.format_files import prophesee
+from ctlev_core.events.decoding import prophesee
 from data_contracts.events import Events
 
 VERSION = 1

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.format_files import event_pieces, event_tables
+from ctlev_core.events.decoding import event_pieces, event_tables
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 

@@ -16,8 +16,8 @@ from typing import IO
 
 import numpy as np
 
-from ctlev_core.format_files import array_files, event_pieces, event_tables
-from ctlev_core.format_files.sensor_sizes import smallest_sensor
+from ctlev_core.events.decoding import array_files, event_pieces, event_tables
+from ctlev_core.events.decoding.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, check_events
 

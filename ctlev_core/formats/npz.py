@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.format_files import array_files, event_pieces, event_tables
-from ctlev_core.format_files.sensor_sizes import COMMON_SENSORS
+from ctlev_core.events.decoding import array_files, event_pieces, event_tables
+from ctlev_core.events.decoding.sensor_sizes import COMMON_SENSORS
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 

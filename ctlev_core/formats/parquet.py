@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctlev_core.format_files import event_pieces
-from ctlev_core.format_files.event_tables import parse_sensor_size
+from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding.event_tables import parse_sensor_size
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 

@@ -15,7 +15,7 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
-from ctlev_core.format_files import array_files
+from ctlev_core.events.decoding import array_files
 from ctlev_core.safe_files.bounded_reader import BoundedReader
 from ctlev_core.safe_files.plain_unpickler import Marker, PlainUnpickler
 from data_contracts.errors import DataError

@@ -23,7 +23,7 @@ from types import ModuleType
 import numpy as np
 
 from ctlev_core import plugins
-from ctlev_core.format_files import event_pieces
+from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 
@@ -42,7 +42,7 @@ def check_reader(module: ModuleType, path: Path) -> bool:
         Failure: several formats claim the file, another exception than DataError, wrong events, or pieces that differ
             from the whole.
     """
-    record_files = importlib.import_module("ctlev_core.format_files.record_files")
+    record_files = importlib.import_module("ctlev_core.events.decoding.record_files")
     record_files._SMALLEST_BLOCK = 3  # so that small files cross from block to block
     others = [plugins.load("formats", name) for name in plugins.names("formats")]
     claims = [other.__name__ for other in others if other.sniff(path) and getattr(other, "HAS_SIGNATURE", True)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ctlev_core.events import files
-from ctlev_core.format_files import event_pieces
+from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from ctlev_core import plugins
 from ctlev_core.events import files
-from ctlev_core.format_files import event_pieces
+from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

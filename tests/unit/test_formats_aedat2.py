@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.format_files import aedat2
+from ctlev_core.events.decoding import aedat2
 from data_contracts.errors import DataError
 
 HEADER = b"#!AER-DAT2.0\r\n# This is a raw AE data file - do not edit\r\n# AEChip: eu.seebetter.ini.chips.davis.%s\r\n"

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ctlev_core import plugins
 from ctlev_core.events import files
-from ctlev_core.format_files import prophesee, prophesee_decoding, record_files
+from ctlev_core.events.decoding import prophesee, prophesee_decoding, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

@@ -10,7 +10,7 @@ import pytest
 
 from ctlev_core import plugins
 from ctlev_core.events import files
-from ctlev_core.format_files import event_pieces, record_files
+from ctlev_core.events.decoding import event_pieces, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.lib.recfunctions import repack_fields
 
 from ctlev_core.events import files
-from ctlev_core.format_files import event_tables
+from ctlev_core.events.decoding import event_tables
 from data_contracts.errors import DataError
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.format_files import event_pieces
+from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize
 

@@ -11,7 +11,7 @@ from typing import IO
 
 import numpy as np
 
-from ctlev_core.format_files.event_tables import require_columns, times_as_named
+from ctlev_core.events.decoding.event_tables import require_columns, times_as_named
 from data_contracts.errors import DataError
 
 MAGIC = b"\x93NUMPY"

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ctlev_core.format_files import event_pieces
-from ctlev_core.format_files.sensor_sizes import COMMON_SENSORS, smallest_sensor
+from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding.sensor_sizes import COMMON_SENSORS, smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize
 

@@ -1,4 +1,4 @@
-"""The loops over EVT 2.0, EVT 3.0 and DAT words, compiled. `ctlev_core.format_files.prophesee` is the way in.
+"""The loops over EVT 2.0, EVT 3.0 and DAT words, compiled. `ctlev_core.events.decoding.prophesee` is the way in.
 
 Words before the first TIME_HIGH carry no time, EVT3 events before the first row or vector base no position: they are
 skipped, as Prophesee's own decoders do. So are triggers and reserved types (some cameras pad with 0x9999).

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.format_files import record_files
-from ctlev_core.format_files.sensor_sizes import smallest_sensor
+from ctlev_core.events.decoding import record_files
+from ctlev_core.events.decoding.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events
 
@@ -102,7 +102,7 @@ def read_chunks(path: Path, num_events: int, encoding: str) -> Iterator[Events]:
 
 
 def _open(path: Path, encoding: str) -> record_files.RecordFile:
-    from ctlev_core.format_files import prophesee_decoding as decoding
+    from ctlev_core.events.decoding import prophesee_decoding as decoding
 
     header = read_header(path)
     if header.encoding != encoding:
@@ -159,7 +159,7 @@ def write(path: Path, events: Events, encoding: str) -> None:
     Raises:
         DataError: events break `check_events`, the sensor is wider than 11 bits, or the time stamps start too late.
     """
-    from ctlev_core.format_files import prophesee_encoding
+    from ctlev_core.events.decoding import prophesee_encoding
 
     check_events(events, f"events to be written to {path}")
     width, height = events.sensor_size

@@ -1,4 +1,4 @@
-"""The loops that write EVT 2.0 and EVT 3.0 words, compiled. `ctlev_core.format_files.prophesee` is the way in.
+"""The loops that write EVT 2.0 and EVT 3.0 words, compiled. `ctlev_core.events.decoding.prophesee` is the way in.
 
 Every overflow of the camera's clock is spelled out, from time 0 on.
 """

@@ -18,7 +18,7 @@ def decode_aedat2(
 
     DAVIS: bit 31 a frame or inertial sample, y 30:22, x 21:12, polarity 11, bit 10 a special event, camera 3:0.
     DVS128: bit 15 a special event, y 14:8, x 7:1, bit 0 set for OFF. What is no polarity event is skipped. The clock is
-    unwrapped as in `ctlev_core.format_files.aedat2`.
+    unwrapped as in `ctlev_core.events.decoding.aedat2`.
 
     Args:
         items: [2 R] uint32 as they lie in the file, bytes not yet swapped.
