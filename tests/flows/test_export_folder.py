@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from flow_scripts import artefacts, run_script
 
-from ctlev_core.event_dataset import EventDataset
+from ctlev_core.export.event_dataset import EventDataset
 
 
 def test_synthesize_ends_in_a_plain_folder(smoke_home, tmp_path):

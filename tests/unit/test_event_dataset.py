@@ -12,7 +12,7 @@ import torch
 from generated_frames import REFUSED_ROW, make_generated, make_labels, publish
 from torch.utils.data import ConcatDataset, DataLoader
 
-from ctlev_core.event_dataset import EventDataset
+from ctlev_core.export.event_dataset import EventDataset
 from data_contracts import tables
 from data_contracts.errors import DataError
 from data_contracts.manifest import label_columns

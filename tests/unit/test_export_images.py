@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 from generated_frames import REFUSED_ROW, make_generated, publish
 
-from ctlev_core.event_dataset import EventDataset
 from ctlev_core.events import files
+from ctlev_core.export.event_dataset import EventDataset
 from ctlev_core.provenance import read_provenance
 from data_contracts import image_folder, tables
 from data_contracts.config import cache_material

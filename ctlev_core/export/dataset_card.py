@@ -116,7 +116,7 @@ table = load_dataset("parquet", data_files="labels.parquet", split="train")  # n
 """
 _TORCH = """\
 from torch.utils.data import DataLoader
-from ctlev_core.event_dataset import EventDataset
+from ctlev_core.export.event_dataset import EventDataset
 
 for batch in DataLoader(EventDataset("."), batch_size=32, shuffle=True):
     batch["image"]  # [N, 3, H, W] float32, 0 to 1; labels under the names of the columns
