@@ -9,8 +9,8 @@ import numpy as np
 
 from ctlev_core.body.layer import load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle
+from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_PARENTS
 from ctlev_core.metrics import mpjpe2d, mpjpe3d, oks, pck2d, pck3d, pve
-from ctlev_core.skeletons import JOINT_SETS, SMPL_PARENTS
 from data_contracts.labels import Labels
 
 Scores = dict[str, float]

@@ -33,7 +33,7 @@ from threadpoolctl import threadpool_limits
 from ctlev_core.body.layer import BodyModel, make_body, pose_vertices
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.body.torch_layer import BodyLayer
-from ctlev_core.skeletons import SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_PARENTS
 
 NUM_VERTICES, NUM_FACES = 6890, 13776
 

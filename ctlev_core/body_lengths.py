@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.skeletons import JOINT_SETS
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 
 
 def torso_length(joints: np.ndarray, joint_set: str) -> np.ndarray:

@@ -9,9 +9,9 @@ import numpy as np
 from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, pose_vertices
 from ctlev_core.body.rigid_motion import move_roots
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from ctlev_core.camera import Camera, camera_from_intrinsics, is_inside, project
-from ctlev_core.skeletons import joint_indices
-from ctlev_core.virtual_camera import CameraRange, sample_camera
+from ctlev_core.geometry.camera import Camera, camera_from_intrinsics, is_inside, project
+from ctlev_core.geometry.joint_sets import joint_indices
+from ctlev_core.geometry.random_cameras import CameraRange, sample_camera
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
 from data_contracts.labels import Labels
@@ -75,7 +75,7 @@ def with_joints(labels: Labels, sensor_size: SensorSize, joint_set: str, occlusi
     Args:
         labels: N rows with SMPL parameters in the camera frame (x right, y down, z forward).
         sensor_size: (width, height) px of the image which the intrinsics are of.
-        joint_set: of the result, a key of `ctlev_core.skeletons.JOINT_SETS`.
+        joint_set: of the result, a key of `ctlev_core.geometry.joint_sets.JOINT_SETS`.
         occlusion: joints that the body itself hides are not visible either. This poses and renders each body, at
             `OCCLUSION_SIDE_PX`. The data sets' own labels, from markers, call hidden joints visible.
     Returns:
@@ -122,7 +122,7 @@ def from_new_side(
         labels: N rows with SMPL parameters, one or more.
         rng: source of the randomness.
         sensor_size: (width, height) px of the new camera.
-        ranges: what to draw from; see `ctlev_core.virtual_camera.sample_camera`.
+        ranges: what to draw from; see `ctlev_core.geometry.random_cameras.sample_camera`.
     Returns:
         The same rows with SMPL parameters in the new camera's frame, and its intrinsics. Joints of the old view are
         gone; `with_joints` gives those of the new one.

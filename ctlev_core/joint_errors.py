@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ctlev_core.procrustes import align_similarity
-from ctlev_core.skeletons import JOINT_SETS
+from ctlev_core.geometry.joint_sets import JOINT_SETS
+from ctlev_core.geometry.procrustes import align_similarity
 from data_contracts.labels import Labels
 
 Alignment = Literal["none", "pelvis", "procrustes"]

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ctlev_core.camera import is_inside
+from ctlev_core.geometry.camera import is_inside
 from data_contracts.labels import Labels
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
+from ctlev_core.geometry.procrustes import RELATIVE_SIZE
 from ctlev_core.joint_errors import Alignment
-from ctlev_core.procrustes import RELATIVE_SIZE
-from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.labels import Labels
 
 _ROWS_AT_ONCE = 16
@@ -36,7 +36,7 @@ def compute_vertex_errors_mm(
         DataError: the body cannot be read.
     """
     from ctlev_core.body.layer import load_body
-    from ctlev_core.procrustes_kernels import mean_distances
+    from ctlev_core.geometry.procrustes_kernels import mean_distances
 
     body = load_body(body_file)
     both = _check("predicted", predicted, len(target)), _check("target", target.arrays, len(target))

@@ -105,7 +105,7 @@ class Labels:
         t_us: [N] int64, time of each moment, microseconds on the clock of the events.
         joints2d: [N, J, 2] float32, px, (x right, y down), pixel centres at integer + 0.5; NaN = unknown.
         visible: [N, J] bool; False = outside the image, occluded or unknown.
-        joint_set: name of the joint order, a key of `ctlev_core.skeletons.JOINT_SETS`; empty without joints.
+        joint_set: name of the joint order, a key of `ctlev_core.geometry.joint_sets.JOINT_SETS`; empty without joints.
         joints3d: [N, J, 3] float32, mm, camera frame (x right, y down, z forward), same order; NaN = unknown.
         smpl_pose: [N, 72] float32, rad, axis-angle of the 24 SMPL joints, the root's (global orientation) first.
         smpl_betas: [N, 10] float32, shape coefficients.

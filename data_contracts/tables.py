@@ -62,7 +62,7 @@ _RECORDING = Column("recording_id", pa.string(), "recording the row was made fro
 _SUBJECT = Column("subject", pa.string(), "who or what was recorded")
 _CLASS = Column("class_name", pa.string(), "class or motion; empty without classes")
 _LABELS = (
-    Column("joint_set", pa.string(), "joint order (ctlev_core.skeletons); empty without joints"),
+    Column("joint_set", pa.string(), "joint order (ctlev_core.geometry.joint_sets); empty without joints"),
     Column("joints2d_px", pa.list_(pa.float32()), "J x (x, y), flattened; NaN = unknown", nullable=True, finite=False),
     Column("visible", pa.list_(pa.bool_()), "J flags", nullable=True),
     Column("joints3d_mm", pa.list_(pa.float32()), "J x (x, y, z), camera; NaN = unknown", nullable=True, finite=False),

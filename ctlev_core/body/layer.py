@@ -16,7 +16,7 @@ import numpy as np
 
 from ctlev_core.body.skinning import abreast, chain_bones, skin, skin_frames
 from ctlev_core.body.smpl_files import read_smpl_file
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_PARENTS
 from data_contracts.errors import DataError
 
 __all__ = ["BodyModel", "joint_transforms", "load_body", "make_body", "pose_offsets", "pose_vertices", "shape_vertices"]

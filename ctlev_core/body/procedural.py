@@ -16,7 +16,7 @@ import numpy as np
 from ctlev_core.body.body_shape import BORDER_M, GROIN_NORMAL, GROIN_POINT, LEFT_JOINTS, MIDDLE_JOINTS, Cone, Tube
 from ctlev_core.body.implicit_surface import MIRROR, PARTS, body_distance, magnify, part_distance
 from ctlev_core.body.layer import BONES_PER_VERTEX, BUNDLED_BODY, NUM_BETAS, NUM_JOINTS, BodyModel, make_body
-from ctlev_core.skeletons import JOINT_SETS, SMPL_JOINTS, SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_JOINTS, SMPL_PARENTS
 
 INDEX = {name: joint for joint, name in enumerate(SMPL_JOINTS)}
 MIRROR_JOINT = list(JOINT_SETS["smpl"].mirror)

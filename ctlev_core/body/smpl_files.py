@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_PARENTS
 from ctlev_core.safe_files import numpy_files, safe_pickle
 from ctlev_core.safe_files.plain_unpickler import StandIn
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
 from data_contracts.errors import DataError
 
 REQUIRED = ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table")

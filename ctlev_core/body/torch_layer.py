@@ -14,7 +14,7 @@ import torch
 
 from ctlev_core.body.layer import NUM_BETAS, NUM_JOINTS, NUM_POSE_FEATURES, BodyModel
 from ctlev_core.body.torch_rotations import matrix_from_axis_angle
-from ctlev_core.skeletons import SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_PARENTS
 
 FRAMES_ON_CPU = 4
 """The blended matrices, 12 numbers a vertex, of so many frames stay in a CPU's cache; a GPU takes all at once."""

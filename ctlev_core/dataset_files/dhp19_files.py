@@ -19,7 +19,7 @@ from data_contracts.errors import DataError
 if TYPE_CHECKING:
     import h5py
 
-    from ctlev_core.camera import Camera
+    from ctlev_core.geometry.camera import Camera
 
 NUM_CAMERAS = 4
 SENSOR_SIZE = (346, 260)
@@ -221,7 +221,7 @@ def camera_of(matrix: np.ndarray, where: str) -> Camera:
     Raises:
         DataError: the matrix has no inverse camera (its left 3 x 3 block is singular).
     """
-    from ctlev_core.camera import from_projection_matrix
+    from ctlev_core.geometry.camera import from_projection_matrix
 
     flipped = np.array([[1, 0, 0], [0, -1, SENSOR_SIZE[1]], [0, 0, 1]]) @ matrix
     camera = from_projection_matrix(flipped, SENSOR_SIZE, where)

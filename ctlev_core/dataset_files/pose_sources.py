@@ -19,8 +19,8 @@ from ctlev_core.body.motion.clip import (
     resample,
     times_at_rate,
 )
-from ctlev_core.camera import orbit_rotation
 from ctlev_core.events.windows import spread
+from ctlev_core.geometry.camera import orbit_rotation
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_labels

@@ -154,7 +154,7 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     Raises:
         DataError: a label file is not as the authors write it.
     """
-    from ctlev_core.camera import is_inside
+    from ctlev_core.geometry.camera import is_inside
 
     paths = _labels_of(recording)
     joints2d = np.stack([files.read_label(path).joints2d for path in paths])

@@ -34,7 +34,7 @@ from data_contracts.events import Events, check_events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
 
 if TYPE_CHECKING:
-    from ctlev_core.camera import Camera
+    from ctlev_core.geometry.camera import Camera
 
 VERSION = 1
 JOINT_SET = "dhp19"
@@ -320,7 +320,7 @@ def _windows(recording: Recording, options: Options) -> tuple[np.ndarray, np.nda
 
 def _labels(recording: Recording, positions: np.ndarray, t_us: np.ndarray, options: Options) -> Labels:
     """Labels of joint positions [N, 13, 3], mm, of the motion capture, seen by the recording's camera."""
-    from ctlev_core.camera import project
+    from ctlev_core.geometry.camera import project
 
     camera = read_camera(recording, options)
     joints2d = project(camera, positions / 1000.0)

@@ -33,7 +33,7 @@ from data_contracts.events import Events, check_events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
 
 if TYPE_CHECKING:
-    from ctlev_core.camera import Camera
+    from ctlev_core.geometry.camera import Camera
 
 VERSION = 3
 JOINT_SET = "smpl"
@@ -126,7 +126,7 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     Raises:
         DataError: a pose file is damaged; of raw recordings also as `read_events`.
     """
-    from ctlev_core.camera import is_inside
+    from ctlev_core.geometry.camera import is_inside
 
     numbers = np.array(list(_poses(recording)), np.int64)
     t_us, known = _times_us(recording, numbers, options)
@@ -188,7 +188,7 @@ def read_camera(recording: Recording, options: Options) -> Camera:
     Without distortion, as the authors' loader, losses and viewer project. Their `projection` also knows OpenCV's
     rational model (k1 .. k6, p1, p2); its coefficients are in none of the files of theirs that we know.
     """
-    from ctlev_core.camera import Camera
+    from ctlev_core.geometry.camera import Camera
 
     f, c = files.FOCAL_LENGTH, files.CENTRE
     K = np.array([[f, 0, c], [0, f, c], [0, 0, 1]])

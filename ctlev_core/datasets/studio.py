@@ -29,7 +29,7 @@ from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_lab
 
 if TYPE_CHECKING:
     from ctlev_core.body.motion.procedural import MotionStyle
-    from ctlev_core.camera import Camera
+    from ctlev_core.geometry.camera import Camera
     from ctlev_core.render.moving_body import MovingBody
     from ctlev_core.render.scene import Subject
 
@@ -187,7 +187,7 @@ def _perform(recording: Recording, options: Options) -> _Performance:
 
 def _camera(entropy: list[int], number: int, count: int, joints: np.ndarray, options: Options) -> Camera:
     """One of `count` cameras; each has its own part of the range of yaw, so that they stand around the person."""
-    from ctlev_core.virtual_camera import CameraRange, sample_camera
+    from ctlev_core.geometry.random_cameras import CameraRange, sample_camera
 
     low, high = np.deg2rad(options.yaw_range_deg)
     part = (high - low) / count

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.image_shifts import shift_images
-from ctlev_core.skeletons import JOINT_SETS
 from ctlev_core.supervised_options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError

@@ -24,8 +24,8 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 from ctlev_core.body.smpl_files import given_body_file
 from ctlev_core.body_samples import BodySamples, mirror_half, shift
 from ctlev_core.frame_sequences import find_sequences
+from ctlev_core.geometry.joint_sets import joint_indices
 from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
-from ctlev_core.skeletons import joint_indices
 from ctlev_core.supervised_options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError

@@ -21,7 +21,7 @@ A sample is a dictionary, of which PyTorch's own collation makes batches. All sa
     smpl_transl_m  [3] float32, camera frame
     intrinsics_px  [4] float32, fx, fy, cx, cy
 
-Which labels there are depends on the data; `joint_set` names the order of the joints (ctlev_core.skeletons).
+Which labels there are depends on the data; `joint_set` names the order of the joints (ctlev_core.geometry.joint_sets).
 """
 
 from __future__ import annotations

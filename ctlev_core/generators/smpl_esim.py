@@ -155,7 +155,7 @@ def _scene(
     The clock starts anew because seconds in floating point lose microseconds on a clock that has run for long.
     """
     from ctlev_core.body.rotations import matrix_from_axis_angle
-    from ctlev_core.camera import camera_from_intrinsics
+    from ctlev_core.geometry.camera import camera_from_intrinsics
     from ctlev_core.render.moving_body import MovingBody
     from ctlev_core.render.scene import sample_background, sample_light, sample_subject
 

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_validator
 
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.joint_errors import Sums, compute_joint_errors_px, quotients, row_means
-from ctlev_core.skeletons import JOINT_SETS
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 

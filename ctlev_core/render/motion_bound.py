@@ -20,9 +20,9 @@ import numba
 import numpy as np
 
 from ctlev_core.body.layer import BodyModel
-from ctlev_core.camera import Camera
+from ctlev_core.geometry.camera import Camera
+from ctlev_core.geometry.joint_sets import SMPL_PARENTS
 from ctlev_core.render.rasteriser import NEAR_M
-from ctlev_core.skeletons import SMPL_PARENTS
 
 SEGMENT_TURN_RAD = 0.1
 """By how much the fastest bone may turn in a segment: then the bound is within a tenth of the speed."""

@@ -10,9 +10,9 @@ import numpy as np
 
 from ctlev_core.body.layer import BodyModel, joint_transforms, load_body, pose_offsets, shape_vertices, skin
 from ctlev_core.body.skinning import abreast, skin_frames
-from ctlev_core.camera import Camera, project
+from ctlev_core.geometry.camera import Camera, project
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from ctlev_core.render.rasteriser import NEAR_M, rasterise
-from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 __all__ = [

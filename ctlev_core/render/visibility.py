@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 _FLESH_M = {

@@ -8,7 +8,7 @@ import scipy.sparse
 from flow_scripts import run_script
 
 from ctlev_core.body.layer import BUNDLED_BODY
-from ctlev_core.skeletons import SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_PARENTS
 from data_contracts.manifest import ManifestRef, read_manifest
 
 STUDIO = "{num_train_recordings: 4, num_test_recordings: 2, num_condition_recordings: 0}"

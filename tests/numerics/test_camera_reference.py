@@ -8,9 +8,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial import KDTree
 
-from ctlev_core.camera import Camera, orbit_rotation, project, triangulate, undistort_points
 from ctlev_core.dataset_files.dhp19_files import CHANNEL_OF_CAMERA, camera_of
-from ctlev_core.lens_distortion import distort, largest_radius
+from ctlev_core.geometry.camera import Camera, orbit_rotation, project, triangulate, undistort_points
+from ctlev_core.geometry.lens_distortion import distort, largest_radius
 
 CALIBRATION = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "dhp19_calib"
 K = np.array([[335.86, 0.0, 128.2], [0.0, 330.0, 120.0], [0.0, 0.0, 1.0]])

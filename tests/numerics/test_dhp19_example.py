@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from dhp19_example import LABELS, PREDICTED, PUBLISHED_MM, PUBLISHED_PX
 
-from ctlev_core import camera as cameras
 from ctlev_core.dataset_files import dhp19_files
+from ctlev_core.geometry import camera as cameras
 from ctlev_core.metrics import mpjpe2d, mpjpe3d
 from data_contracts.labels import Labels
 

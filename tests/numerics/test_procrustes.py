@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import orthogonal_procrustes
 from scipy.spatial.transform import Rotation
 
-from ctlev_core.procrustes import align_similarity
+from ctlev_core.geometry.procrustes import align_similarity
 
 ALL = np.ones((1, 13), bool)
 

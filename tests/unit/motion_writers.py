@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motion.clip import MotionClip
 from ctlev_core.body.rotations import matrix_from_axis_angle
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 
 LIMBS = [
     (f"{side}_{upper}", f"{side}_{lower}")

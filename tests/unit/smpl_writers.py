@@ -14,7 +14,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import scipy.sparse
 
-from ctlev_core.skeletons import SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_PARENTS
 
 
 def smpl_arrays(seed: int = 0, num_vertices: int = 6890, num_faces: int = 13776) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import trimesh
 from ctlev_core.body import layer, procedural
 from ctlev_core.body.motion import procedural as motions
 from ctlev_core.body.rotations import matrix_from_axis_angle
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_PARENTS
 from data_contracts.errors import DataError
 
 BODY = layer.load_body()

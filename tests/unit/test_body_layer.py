@@ -13,7 +13,7 @@ from smpl_writers import smpl_arrays
 from ctlev_core.body import layer
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.body.torch_layer import BodyLayer
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_PARENTS
 from data_contracts.errors import DataError
 
 BUNDLED = layer.load_body()

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from ctlev_core.body.layer import load_body
 from ctlev_core.body.motion.clip import Z_UP_TO_Y_UP, check_clip
 from ctlev_core.body.motion.landmarks import LANDMARKS, find_landmarks
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from ctlev_core.motions import bvh
-from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "motion"

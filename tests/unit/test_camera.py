@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.camera import (
+from ctlev_core.geometry.camera import (
     Camera,
     camera_from_intrinsics,
     from_projection_matrix,

@@ -11,8 +11,8 @@ import pytest
 from ctlev_core import plugins
 from ctlev_core.dataset_files import cdehp_files
 from ctlev_core.datasets import cdehp
+from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_TO_DHP19, joint_indices
 from ctlev_core.plugins import PluginError
-from ctlev_core.skeletons import JOINT_SETS, SMPL_TO_DHP19, joint_indices
 from data_contracts.config import DatasetChoice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels

@@ -14,8 +14,8 @@ from motion_writers import limb_error_deg, smpl_positions, solve_deepmimic, stan
 from scipy.spatial.transform import Rotation
 
 from ctlev_core.body.motion.clip import check_clip
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from ctlev_core.motions import deepmimic
-from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "motion"

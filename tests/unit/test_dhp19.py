@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from dhp19_writers import SPECIAL, START, address, busy, matrix, write_aedat, write_vicon
 
-from ctlev_core.camera import project
 from ctlev_core.dataset_files import dhp19_files
 from ctlev_core.datasets import dhp19
+from ctlev_core.geometry.camera import project
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels
 

@@ -11,9 +11,9 @@ import scipy.io
 from dhp19_writers import busy, matrix, write_aedat, write_vicon
 
 from ctlev_core import plugins
-from ctlev_core.camera import project
 from ctlev_core.dataset_files import dhp19_files
 from ctlev_core.datasets import dhp19
+from ctlev_core.geometry.camera import project
 from ctlev_core.plugins import PluginError
 from data_contracts.config import DatasetChoice, cache_material
 from data_contracts.errors import DataError

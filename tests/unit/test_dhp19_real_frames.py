@@ -14,8 +14,8 @@ import h5py
 import numpy as np
 import pytest
 
-from ctlev_core import camera as cameras
 from ctlev_core.dataset_files import dhp19_files
+from ctlev_core.geometry import camera as cameras
 from data_contracts.config import DatasetChoice, EncodingChoice, Windows
 from data_contracts.manifest import read_manifest
 from tasks.encode import encode

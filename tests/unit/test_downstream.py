@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.downstream import classifier, pose2d
-from ctlev_core.skeletons import JOINT_SETS
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.training_rows import TrainingRows
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import Labels

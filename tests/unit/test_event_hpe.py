@@ -9,8 +9,8 @@ import joblib
 import numpy as np
 import pytest
 
-from ctlev_core.camera import project
 from ctlev_core.datasets import event_hpe
+from ctlev_core.geometry.camera import project
 from ctlev_core.labelling import labels_at_windows
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError

@@ -16,9 +16,9 @@ from ctlev_core import plugin_contracts, plugins
 from ctlev_core.body.motion import files as event_files
 from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.labelling import labels_at_windows, labels_in_image
 from ctlev_core.report import verdict
-from ctlev_core.skeletons import JOINT_SETS
 from data_contracts.config import Frozen, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, check_events

@@ -8,7 +8,7 @@ from ctlev_core.body.motion.foot_planting import LEG_JOINTS, plant_feet
 from ctlev_core.body.motion.ground_contact import GroundContact, body_path, find_contact
 from ctlev_core.body.motion.procedural import MotionStyle, channels_at_phase, rotations_from_channels
 from ctlev_core.body.rotations import matrix_from_axis_angle
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 
 BODY = load_body()
 STEP_S = 0.01

@@ -9,7 +9,7 @@ from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motion import procedural
 from ctlev_core.body.motion.inverse_kinematics import are_positions, fit_pose
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 BODY = load_body()

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ctlev_core.body.layer import load_body, pose_vertices
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.metrics import mpjpe2d, oks, pck2d, pck3d, pve
-from ctlev_core.skeletons import JOINT_SETS
 from data_contracts.labels import Labels
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.motion.procedural import pose_at, sample_style
-from ctlev_core.camera import camera_from_intrinsics, is_inside, orbit_rotation
+from ctlev_core.geometry.camera import camera_from_intrinsics, is_inside, orbit_rotation
 from ctlev_core.render.moving_body import MovingBody
 from ctlev_core.render.rasteriser import NEAR_M, render_attributes
 from ctlev_core.render.scene import (

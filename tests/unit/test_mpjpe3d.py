@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.metrics import mpjpe3d
-from ctlev_core.skeletons import JOINT_SETS
 from data_contracts.labels import Labels
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from ctlev_core.body import layer, procedural
 from ctlev_core.body.rotations import matrix_from_axis_angle
-from ctlev_core.skeletons import JOINT_SETS, SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_JOINTS
 
 BODY = layer.load_body()
 MESH = trimesh.Trimesh(BODY.v_template, BODY.faces, process=False)

@@ -6,7 +6,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.camera import Camera, is_inside, project
+from ctlev_core.geometry.camera import Camera, is_inside, project
 from ctlev_core.render.rasteriser import NEAR_M, render_attributes, vertex_normals
 from data_contracts.errors import DataError
 

@@ -8,10 +8,10 @@ import pyarrow as pa
 import pytest
 
 from ctlev_core import plugin_contracts, plugins
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.metrics import pve
 from ctlev_core.plugins import PluginError
 from ctlev_core.score_requirements import check_dataset, check_distances, check_frames, check_labels, check_metrics
-from ctlev_core.skeletons import JOINT_SETS
 from data_contracts import tables
 from data_contracts.config import DatasetChoice, DownstreamChoice, MetricChoice, cache_material
 from data_contracts.errors import DataError

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_JOINTS, openpose_sources
 from ctlev_core.render import skeleton
 from ctlev_core.render.skeleton import draw_skeleton
-from ctlev_core.skeletons import JOINT_SETS, SMPL_JOINTS, openpose_sources
 from data_contracts.errors import DataError
 
 NAMES = JOINT_SETS["dhp19"].joints

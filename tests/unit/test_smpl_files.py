@@ -15,9 +15,9 @@ from smpl_writers import chumpy_classes, pickled, pickled_by_python_2, smpl_arra
 
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.smpl_files import read_smpl_file, smpl_pose_from_smplh
+from ctlev_core.geometry.joint_sets import SMPL_PARENTS
 from ctlev_core.safe_files import safe_pickle
 from ctlev_core.safe_files.plain_unpickler import StandIn
-from ctlev_core.skeletons import SMPL_PARENTS
 from data_contracts.errors import DataError
 
 SMALL = smpl_arrays(1, num_vertices=40, num_faces=50)

@@ -11,7 +11,7 @@ from ctlev_core.body_samples import BodySamples, mirror_half, shift
 from ctlev_core.body_views import with_joints
 from ctlev_core.conditions import normals
 from ctlev_core.downstream import smpl_regressor
-from ctlev_core.skeletons import JOINT_SETS
+from ctlev_core.geometry.joint_sets import JOINT_SETS
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 

@@ -16,7 +16,7 @@ from ctlev_core.body.text_to_motion.clauses import known_verbs
 from ctlev_core.body.text_to_motion.compose import check_sentence, generate_motion
 from ctlev_core.body.text_to_motion.grammar import parse_sentence
 from ctlev_core.body.text_to_motion.words import WORDS
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 BODY = load_body()

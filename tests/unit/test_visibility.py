@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.body.layer import load_body
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from ctlev_core.render.normals import render_normals
 from ctlev_core.render.visibility import SMPL_FLESH_M, joint_visibility
-from ctlev_core.skeletons import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 SIZE = (48, 36)

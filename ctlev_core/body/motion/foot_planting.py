@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from ctlev_core.body.layer import NUM_BETAS, joint_transforms, load_body
 from ctlev_core.body.motion.ground_contact import SIDES, GroundContact
 from ctlev_core.body.rotations import axis_angle_from_matrix
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_PARENTS
 
 PLANTED_M, LIFTED_M = 0.006, 0.02
 """Gap under a foot below which it is held, and above which it is free; between, a bit of both."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from ctlev_core.body.layer import NUM_BETAS, load_body, pose_vertices
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 
 SOFTNESS_M = 0.004
 """How far above the lowest vertex another still carries weight: contact moves smoothly from place to place."""

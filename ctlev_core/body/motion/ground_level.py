@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ctlev_core.body.motion.clip import MotionClip
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 
 SOLE_M = 0.02
 """Height of the skin over the lowest of a standing foot that still is its sole."""

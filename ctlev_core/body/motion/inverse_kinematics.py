@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from ctlev_core.body.layer import NUM_BETAS, NUM_JOINTS, BodyModel, joint_transforms, load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle, slerp
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_PARENTS
 from data_contracts.errors import DataError
 
 NUM_BODY_JOINTS = 22

@@ -16,7 +16,7 @@ from ctlev_core.body.layer import NUM_JOINTS, joint_transforms, load_body
 from ctlev_core.body.motion.everyday_keyframes import EVERYDAY_MOTIONS
 from ctlev_core.body.motion.keyframes import HELD_OUT, MOTIONS, SEEN, STANDING, UNSEEN, Motion, Pose
 from ctlev_core.body.rotations import matrix_from_axis_angle, matrix_from_euler, slerp
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 __all__ = [

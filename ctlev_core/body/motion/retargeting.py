@@ -36,7 +36,7 @@ from ctlev_core.body.motion.source_skeleton import (
     on_its_feet,
     rest_axes,
 )
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_PARENTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_PARENTS
 
 MAX_FOOT_TURN_DEG = 60.0
 

@@ -26,7 +26,7 @@ from ctlev_core.body.motion.procedural import (
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle, matrix_from_euler, slerp
 from ctlev_core.body.text_to_motion.grammar import parse_sentence
 from ctlev_core.body.text_to_motion.plan import Piece, plan_pieces
-from ctlev_core.skeletons import SMPL_JOINTS
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from data_contracts.errors import DataError
 
 GRID_S = 0.01

@@ -20,7 +20,6 @@ from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motion.procedural import SEEN, UNSEEN, pose_at, sample_style
 from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.body_views import labels_in_camera
-from ctlev_core.camera import is_inside, project
 from ctlev_core.conditions import normals
 from ctlev_core.diffusion.pretraining.picture_styles import (
     DEFAULT_DIET,
@@ -30,13 +29,14 @@ from ctlev_core.diffusion.pretraining.picture_styles import (
     Diet,
     Scene,
 )
+from ctlev_core.geometry.camera import is_inside, project
+from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_TO_DHP19
+from ctlev_core.geometry.random_cameras import CameraRange, sample_camera
 from ctlev_core.render.compositions import RELATIONS, all_compositions
 from ctlev_core.render.object_drawing import draw_composition, draw_object
 from ctlev_core.render.objects import COLOURS, OBJECTS
 from ctlev_core.render.scene import render_person, sample_background, sample_subject
 from ctlev_core.render.skeleton import draw_skeleton
-from ctlev_core.skeletons import SMPL_JOINTS, SMPL_TO_DHP19
-from ctlev_core.virtual_camera import CameraRange, sample_camera
 
 ConditionKind = Literal["skeleton", "normals"]
 MOTION_SHARE = 0.55

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctlev_core.camera import Camera, orbit_rotation
+from ctlev_core.geometry.camera import Camera, orbit_rotation
 from data_contracts.errors import DataError
 
 

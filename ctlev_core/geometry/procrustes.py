@@ -26,7 +26,7 @@ def align_similarity(points: np.ndarray, target: np.ndarray, known: np.ndarray) 
     Source: Umeyama, IEEE TPAMI 1991, eq. 34-43. Event-HPE's own function returns NaN for coinciding points and takes
     batches of two or three poses for transposed ones.
     """
-    from ctlev_core.procrustes_kernels import align_rows
+    from ctlev_core.geometry.procrustes_kernels import align_rows
 
     if points.shape != target.shape or points.ndim != 3 or points.shape[2] != 3 or known.shape != points.shape[:2]:
         raise ValueError(

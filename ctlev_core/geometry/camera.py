@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctlev_core.lens_distortion import NUM_COEFFICIENTS, distort, undistort
+from ctlev_core.geometry.lens_distortion import NUM_COEFFICIENTS, distort, undistort
 from data_contracts.errors import DataError
 
 NO_PARALLAX = 1e-10
@@ -28,7 +28,7 @@ class Camera:
         R: [3, 3] float64, world to camera.
         translation: [3] float64, m, camera frame.
         image_size: (width, height) px.
-        distortion: [8] float64: k1, k2, p1, p2, k3, k4, k5, k6 of `ctlev_core.lens_distortion`; None = none.
+        distortion: [8] float64: k1, k2, p1, p2, k3, k4, k5, k6 of `ctlev_core.geometry.lens_distortion`; None = none.
     """
 
     K: np.ndarray
@@ -113,7 +113,7 @@ def project(camera: Camera, points_world: np.ndarray) -> np.ndarray:
     """Pixels [..., 2] float64 of world points [..., 3] m.
 
     NaN where there is no finite pixel: on or behind the plane of the camera, where the distortion folds back (see
-    `ctlev_core.lens_distortion`), and for points that are not finite.
+    `ctlev_core.geometry.lens_distortion`), and for points that are not finite.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         points = points_world @ camera.R.T + camera.translation
