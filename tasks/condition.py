@@ -13,7 +13,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from ctlev_core import plugins
-from ctlev_core.condition_sources import (
+from ctlev_core.events.windows import spread
+from ctlev_core.labels.label_sampling import balanced_choice, surrounded
+from ctlev_core.labels.labelling import labels_in_image
+from ctlev_core.labels.sources import (
     LabelledRows,
     as_different_as_training,
     half_window_us,
@@ -23,10 +26,7 @@ from ctlev_core.condition_sources import (
     rows_of_frames,
     sensor_size_of,
 )
-from ctlev_core.events.windows import spread
-from ctlev_core.labelling import labels_in_image
 from ctlev_core.plugins import Plugin
-from ctlev_core.pose_choice import balanced_choice, surrounded
 from ctlev_core.seeds import row_seeds
 from data_contracts import tables
 from data_contracts.arrays import ArrayWriter
@@ -156,7 +156,7 @@ def _seen(
     into its middle. Bodies that no sensor saw, or in `turned` [N] all of one number from one new side, are seen by a
     virtual camera with the experiment's sensor.
     """
-    from ctlev_core.body_views import with_joints  # here, because a cached run needs no numba and no scipy
+    from ctlev_core.labels.body_views import with_joints  # here, because a cached run needs no numba and no scipy
 
     size = sensor_size_of(recordings)
     labels = _on_sensor(labels, sensors, size) if turned is None else _from_new_sides(labels, turned, size, seed)
@@ -185,7 +185,7 @@ def _on_sensor(labels: Labels, sensors: np.ndarray, size: SensorSize) -> Labels:
 
 def _from_new_sides(labels: Labels, turned: np.ndarray, sensor_size: SensorSize, seed: int) -> Labels:
     """Bodies before new cameras, one for each number in `turned` [N]; row order stays."""
-    from ctlev_core.body_views import from_new_side
+    from ctlev_core.labels.body_views import from_new_side
 
     if labels.smpl_pose is None:
         raise DataError("pose_views 'new' needs bodies (SMPL parameters) to turn; these labels have joints or classes")

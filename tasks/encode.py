@@ -16,7 +16,7 @@ from tqdm import tqdm
 from ctlev_core import plugins
 from ctlev_core.events import files
 from ctlev_core.events.windows import cut_chunks, spread
-from ctlev_core.labelling import has_label, labels_at_windows, labels_in_image
+from ctlev_core.labels.labelling import has_label, labels_at_windows, labels_in_image
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError

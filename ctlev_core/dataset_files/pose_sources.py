@@ -100,7 +100,7 @@ def labels_before_camera(clip: MotionClip, class_name: str, recording_id: str, o
 
 def _still_translation(way: np.ndarray, distance_m: float) -> np.ndarray:
     """Where the world goes [3], m, so that a still camera sees a body along `way` [T, 3], m, axes of the camera."""
-    from ctlev_core.body_views import BODY_REACH_M, FOCAL_PER_SIDE
+    from ctlev_core.labels.body_views import BODY_REACH_M, FOCAL_PER_SIDE
 
     low, high = way.min(axis=0), way.max(axis=0)
     centre = (low + high) / 2

@@ -96,7 +96,7 @@ def read_labels(recording: Recording, options: Options) -> Labels:
         DataError: the recording is not one of the studio with these options.
     """
     from ctlev_core.body.motion.procedural import pose_at
-    from ctlev_core.body_views import labels_in_camera, with_joints
+    from ctlev_core.labels.body_views import labels_in_camera, with_joints
 
     performance = _perform(recording, options)
     if recording.has_events:

@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 import pytest
 from flow_scripts import REPOSITORY, artefacts, digests, run_script, script
 
-from ctlev_core.body_views import smpl_joints
 from ctlev_core.events.files import read_events_file
+from ctlev_core.labels.body_views import smpl_joints
 from data_contracts.labels import Labels
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef, conditions_of, read_manifest
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ctlev_core import plugins
-from ctlev_core.pose_choice import balanced_choice
+from ctlev_core.labels.label_sampling import balanced_choice
 from data_contracts.events import Events
 from data_contracts.labels import Labels
 

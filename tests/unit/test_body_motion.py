@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctlev_core.body_views import with_joints
 from ctlev_core.conditions import body_motion, normals
+from ctlev_core.labels.body_views import with_joints
 from ctlev_core.render import body_normals
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError

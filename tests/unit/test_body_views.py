@@ -7,10 +7,10 @@ import pytest
 
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.rotations import matrix_from_axis_angle
-from ctlev_core.body_views import FOCAL_PER_SIDE, from_new_side, with_joints
 from ctlev_core.geometry.camera import is_inside, project
 from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_TO_DHP19
 from ctlev_core.geometry.random_cameras import CameraRange, sample_camera
+from ctlev_core.labels.body_views import FOCAL_PER_SIDE, from_new_side, with_joints
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_labels
 

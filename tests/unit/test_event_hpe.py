@@ -11,7 +11,7 @@ import pytest
 
 from ctlev_core.datasets import event_hpe
 from ctlev_core.geometry.camera import project
-from ctlev_core.labelling import labels_at_windows
+from ctlev_core.labels.labelling import labels_at_windows
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels

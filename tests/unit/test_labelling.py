@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.labelling import has_label, labels_at_windows
+from ctlev_core.labels.labelling import has_label, labels_at_windows
 from data_contracts.labels import Labels
 
 

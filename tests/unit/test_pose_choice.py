@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.pose_choice import balanced_choice, surrounded
+from ctlev_core.labels.label_sampling import balanced_choice, surrounded
 
 LABELLED = st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from("rstu")), min_size=1, max_size=30)
 

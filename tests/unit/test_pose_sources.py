@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motion.clip import REST_PELVIS, MotionClip, take
 from ctlev_core.body.rotations import matrix_from_axis_angle
-from ctlev_core.body_views import with_joints
 from ctlev_core.dataset_files.pose_sources import (
     PoseSourceOptions,
     choose_times,
@@ -23,6 +22,7 @@ from ctlev_core.dataset_files.pose_sources import (
 )
 from ctlev_core.geometry.camera import Camera, is_inside, project
 from ctlev_core.geometry.joint_sets import SMPL_JOINTS
+from ctlev_core.labels.body_views import with_joints
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 

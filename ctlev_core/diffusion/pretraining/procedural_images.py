@@ -19,7 +19,6 @@ import numpy as np
 from ctlev_core.body.layer import joint_transforms, load_body
 from ctlev_core.body.motion.procedural import SEEN, UNSEEN, pose_at, sample_style
 from ctlev_core.body.rotations import matrix_from_euler
-from ctlev_core.body_views import labels_in_camera
 from ctlev_core.conditions import normals
 from ctlev_core.diffusion.pretraining.picture_styles import (
     DEFAULT_DIET,
@@ -32,6 +31,7 @@ from ctlev_core.diffusion.pretraining.picture_styles import (
 from ctlev_core.geometry.camera import is_inside, project
 from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_TO_DHP19
 from ctlev_core.geometry.random_cameras import CameraRange, sample_camera
+from ctlev_core.labels.body_views import labels_in_camera
 from ctlev_core.render.compositions import RELATIONS, all_compositions
 from ctlev_core.render.object_drawing import draw_composition, draw_object
 from ctlev_core.render.objects import COLOURS, OBJECTS

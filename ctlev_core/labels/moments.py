@@ -132,7 +132,7 @@ def follow_labels(
     """
     from ctlev_core.body.rigid_motion import motion_between, move_roots
     from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-    from ctlev_core.body_views import rest_pelvis
+    from ctlev_core.labels.body_views import rest_pelvis
 
     def placed(labels: Labels) -> tuple[np.ndarray, np.ndarray]:
         assert labels.smpl_pose is not None and labels.smpl_transl is not None

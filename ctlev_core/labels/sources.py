@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctlev_core import moments, plugins
+from ctlev_core import plugins
 from ctlev_core.events.image_resampling import resample_images
+from ctlev_core.labels import moments
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
