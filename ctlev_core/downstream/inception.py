@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import feature_files
+from ctlev_core.networks import feature_extractors
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.manifest import file_digest
@@ -46,9 +46,9 @@ def input_files(options: Options) -> list[Path]:
     if options.file is None or not options.file.is_file():
         raise DataError(f"inception: expected option `file` to be pt_inception-2015-12-05.pth, got {options.file}")
     digest = file_digest(options.file)
-    if digest != feature_files.INCEPTION_STATE_SHA256:
+    if digest != feature_extractors.INCEPTION_STATE_SHA256:
         raise DataError(
-            f"{options.file}: expected the published weights, SHA-256 {feature_files.INCEPTION_STATE_SHA256[:12]}, "
+            f"{options.file}: expected the published weights, SHA-256 {feature_extractors.INCEPTION_STATE_SHA256[:12]}, "
             f"got {digest[:12]}"
         )
     return [options.file]
@@ -63,10 +63,10 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
     from ctlev_core.networks.inception import load_inception
     from ctlev_core.supervised import resolve_device
 
-    feature_files.read_extractor(model, NAME)
+    feature_extractors.read_extractor(model, NAME)
     place: Any = resolve_device(device)
-    network = load_inception(model / feature_files.FILES_FOLDER / _FILE).to(place)
-    return feature_files.compute_features(frames, network, place, f"features of {model}")
+    network = load_inception(model / feature_extractors.FILES_FOLDER / _FILE).to(place)
+    return feature_extractors.compute_features(frames, network, place, f"features of {model}")
 
 
 def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
@@ -74,6 +74,6 @@ def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
     return "inception", {_FILE: file}
 
 
-name_score = feature_files.naming_of(NAME)
-predict = feature_files.prediction_of(features)
-train = feature_files.training_of(NAME, VERSION, _find_network, features)
+name_score = feature_extractors.naming_of(NAME)
+predict = feature_extractors.prediction_of(features)
+train = feature_extractors.training_of(NAME, VERSION, _find_network, features)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import feature_files
+from ctlev_core.networks import feature_extractors
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.manifest import file_digest
@@ -75,8 +75,8 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
 
     from ctlev_core.supervised import resolve_device
 
-    config = feature_files.read_extractor(model, NAME)
-    options, path, place = Options(**config["options"]), model / feature_files.FILES_FOLDER / _FILE, device
+    config = feature_extractors.read_extractor(model, NAME)
+    options, path, place = Options(**config["options"]), model / feature_extractors.FILES_FOLDER / _FILE, device
     try:
         network: Any = torch.jit.load(path, map_location=resolve_device(place)).eval()
     except (RuntimeError, ValueError) as error:
@@ -85,12 +85,12 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
     extra = {"return_features": True} if "return_features" in arguments else {}
 
     def run(images: torch.Tensor) -> torch.Tensor:
-        images = feature_files.resize_images(images, options.image_size)
+        images = feature_extractors.resize_images(images, options.image_size)
         if options.values in _CHANNELS:
-            images = feature_files.normalise(images, *_CHANNELS[options.values])
+            images = feature_extractors.normalise(images, *_CHANNELS[options.values])
         return network(images, **extra)
 
-    return feature_files.compute_features(frames, run, resolve_device(place), f"features of {path.parent.parent}")
+    return feature_extractors.compute_features(frames, run, resolve_device(place), f"features of {path.parent.parent}")
 
 
 def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
@@ -99,9 +99,9 @@ def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
 
 
 def _is_inception(path: Path) -> bool:
-    return file_digest(path) == feature_files.INCEPTION_SHA256
+    return file_digest(path) == feature_extractors.INCEPTION_SHA256
 
 
-name_score = feature_files.naming_of(NAME)
-predict = feature_files.prediction_of(features)
-train = feature_files.training_of(NAME, VERSION, _find_network, features)
+name_score = feature_extractors.naming_of(NAME)
+predict = feature_extractors.prediction_of(features)
+train = feature_extractors.training_of(NAME, VERSION, _find_network, features)

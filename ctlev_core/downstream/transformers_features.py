@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core import feature_files
+from ctlev_core.networks import feature_extractors
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 
@@ -77,18 +77,18 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
 
     from ctlev_core.supervised import resolve_device
 
-    feature_files.read_extractor(model, NAME)
-    folder = model / feature_files.FILES_FOLDER
+    feature_extractors.read_extractor(model, NAME)
+    folder = model / feature_extractors.FILES_FOLDER
     network, output = _load(folder)
     network.to(resolve_device(device))
     size, mean, std = _read_preprocessing(folder)
 
     def run(images: torch.Tensor) -> torch.Tensor:
         # Bicubic overshoots; pixels do not.
-        images = feature_files.resize_images(images, size).clamp(0, 255)
-        return network(pixel_values=feature_files.normalise(images, mean, std))[output]
+        images = feature_extractors.resize_images(images, size).clamp(0, 255)
+        return network(pixel_values=feature_extractors.normalise(images, mean, std))[output]
 
-    return feature_files.compute_features(frames, run, resolve_device(device), f"features of {model}")
+    return feature_extractors.compute_features(frames, run, resolve_device(device), f"features of {model}")
 
 
 def _find_network(options: Options) -> tuple[str, dict[str, Path]]:
@@ -147,6 +147,6 @@ def _load(folder: Path) -> tuple[Any, str]:
     return network.float().eval(), output
 
 
-name_score = feature_files.naming_of(NAME)
-predict = feature_files.prediction_of(features)
-train = feature_files.training_of(NAME, VERSION, _find_network, features)
+name_score = feature_extractors.naming_of(NAME)
+predict = feature_extractors.prediction_of(features)
+train = feature_extractors.training_of(NAME, VERSION, _find_network, features)

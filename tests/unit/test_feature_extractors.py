@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core import feature_files
 from ctlev_core.downstream import torchscript, transformers_features
+from ctlev_core.networks import feature_extractors
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 
@@ -116,7 +116,7 @@ def test_only_the_verified_inception_is_called_fid(tmp_path, monkeypatch):
     options = torchscript.Options(file=file, device="cpu")
     other = keep(torchscript, options, tmp_path, name="other")
     assert torchscript.name_score(other, "fd").startswith("fd_event_torchscript_")
-    monkeypatch.setattr(feature_files, "INCEPTION_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
+    monkeypatch.setattr(feature_extractors, "INCEPTION_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
     model = keep(torchscript, options, tmp_path)
     assert torchscript.name_score(model, "fd") == "fid" and torchscript.name_score(model, "kid") == "kid"
     assert torchscript.name_score(model, "coverage").startswith("coverage_event_inception_")
@@ -128,7 +128,7 @@ def test_only_the_verified_inception_is_called_fid(tmp_path, monkeypatch):
 
 
 def test_the_checksum_is_the_published_one():
-    assert feature_files.INCEPTION_SHA256.startswith("f58cb9b6") and len(feature_files.INCEPTION_SHA256) == 64
+    assert feature_extractors.INCEPTION_SHA256.startswith("f58cb9b6") and len(feature_extractors.INCEPTION_SHA256) == 64
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from ctlev_core import feature_files
 from ctlev_core.downstream import inception
+from ctlev_core.networks import feature_extractors
 from ctlev_core.networks.inception import InceptionFeatures, resize_as_tensorflow
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
@@ -93,7 +93,7 @@ def test_resizing_is_that_of_tensorflow_1(size):
 
 def test_only_the_published_weights_are_taken_and_called_fid(tmp_path, monkeypatch, network):
     """The real file is not here: another one stands in for it by its checksum."""
-    assert feature_files.INCEPTION_STATE_SHA256.startswith("6726825d")
+    assert feature_extractors.INCEPTION_STATE_SHA256.startswith("6726825d")
     file, frames = tmp_path / "weights.pth", np.random.default_rng(1).integers(0, 256, (2, 40, 32, 3)).astype(np.uint8)
     torch.save(network.state_dict(), file)
     options = inception.Options(file=file, device="cpu")
@@ -101,7 +101,7 @@ def test_only_the_published_weights_are_taken_and_called_fid(tmp_path, monkeypat
         inception.input_files(options)
     with pytest.raises(DataError, match=r"expected option `file` to be .* got None"):
         inception.input_files(inception.Options())
-    monkeypatch.setattr(feature_files, "INCEPTION_STATE_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
+    monkeypatch.setattr(feature_extractors, "INCEPTION_STATE_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
     places = {"out": tmp_path / "model", "work": tmp_path / "work"}
     inception.train(frames, Labels(("", ""), np.zeros(2, np.int64)), options, seed=0, **places)
     assert [inception.name_score(tmp_path / "model", score) for score in ("fd", "kid")] == ["fid", "kid"]
@@ -115,7 +115,7 @@ def test_only_the_published_weights_are_taken_and_called_fid(tmp_path, monkeypat
 def test_weights_of_another_network_are_refused(tmp_path, monkeypatch):
     file = tmp_path / "weights.pth"
     torch.save({"fc.weight": torch.zeros(2, 2)}, file)
-    monkeypatch.setattr(feature_files, "INCEPTION_STATE_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
+    monkeypatch.setattr(feature_extractors, "INCEPTION_STATE_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
     with pytest.raises(DataError, match="expected the state dictionary of the 2015 Inception network"):
         inception.train(
             np.zeros((1, 8, 8, 3), np.uint8), Labels(("",), np.zeros(1, np.int64)),
