@@ -16,5 +16,5 @@ class EventExport(Frozen):
     one_file: bool = Field(default=False, description="all streams one after another in one file, not a file each")
     gap_us: int = Field(default=100_000, ge=0, description="between two streams of one file")
     spread: Literal["uniform", "paced", "field"] = Field(
-        default="field", description="how events lie in their window (ctlev_core.event_streams)"
+        default="field", description="how events lie in their window (ctlev_core.postprocessing.event_streams)"
     )

@@ -14,12 +14,12 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from ctlev_core import plugins
-from ctlev_core.event_streams import TimeModel, fit_times, sample_streams
 from ctlev_core.events import files as event_files
 from ctlev_core.events.decoding import event_pieces
 from ctlev_core.events.image_grid import check_whole_counts, count_size, pixel_bins
 from ctlev_core.events.windows import spread
-from ctlev_core.image_counts import CountModel, estimate_counts, fit_counts
+from ctlev_core.postprocessing.event_streams import TimeModel, fit_times, sample_streams
+from ctlev_core.postprocessing.image_counts import CountModel, estimate_counts, fit_counts
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError

@@ -18,12 +18,12 @@ from tqdm import tqdm
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling.shards import SHARD
-from ctlev_core.dithering import dither_counts
 from ctlev_core.events import files
 from ctlev_core.events.image_grid import check_whole_counts
 from ctlev_core.events.windows import spread, window_around
-from ctlev_core.image_gate import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
 from ctlev_core.labels.sources import sensor_size_of
+from ctlev_core.postprocessing.rejection import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
+from ctlev_core.postprocessing.stochastic_rounding import dither_counts
 from ctlev_core.seeds import row_seeds
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows

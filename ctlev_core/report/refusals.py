@@ -1,4 +1,4 @@
-"""The section of the report that says which generated frames the gate refused; see `ctlev_core.image_gate`."""
+"""The section of the report that says which generated frames the gate refused; see `ctlev_core.postprocessing.rejection`."""
 
 from __future__ import annotations
 

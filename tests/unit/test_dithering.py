@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ctlev_core.dithering import dither_counts
 from ctlev_core.encodings import event_histogram
+from ctlev_core.postprocessing.stochastic_rounding import dither_counts
 
 RANDOM = np.random.default_rng(0)
 SEEDS = range(400)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.stats import kstest, spearmanr
 
 from ctlev_core import plugins
-from ctlev_core.event_streams import Spread, TimeModel, fit_times, sample_duration_us, sample_streams
 from ctlev_core.events import files
 from ctlev_core.events.windows import cut
+from ctlev_core.postprocessing.event_streams import Spread, TimeModel, fit_times, sample_duration_us, sample_streams
 from ctlev_core.realism.distances import estimate_distances, estimate_floor
 from ctlev_core.realism.summary import summarise_events
 from data_contracts.config import Windows

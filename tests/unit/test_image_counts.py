@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from ctlev_core import plugins
 from ctlev_core.events import files
 from ctlev_core.events.windows import cut
-from ctlev_core.image_count_kernels import find_scale_ranges, settle_saturated
-from ctlev_core.image_counts import estimate_counts, fit_counts
+from ctlev_core.postprocessing.image_count_kernels import find_scale_ranges, settle_saturated
+from ctlev_core.postprocessing.image_counts import estimate_counts, fit_counts
 from data_contracts.config import Windows
 from data_contracts.errors import DataError
 

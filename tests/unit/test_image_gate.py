@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core import plugins
-from ctlev_core.image_gate import find_causes, fit_gate, sample_until_accepted, seed_of_try
+from ctlev_core.postprocessing.rejection import find_causes, fit_gate, sample_until_accepted, seed_of_try
 from data_contracts.errors import DataError
 
 

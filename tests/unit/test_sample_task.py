@@ -12,7 +12,7 @@ from tiny_prior import make_data, shared_prior
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling import sampling
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.image_gate import find_causes, fit_gate, seed_of_try
+from ctlev_core.postprocessing.rejection import find_causes, fit_gate, seed_of_try
 from ctlev_core.seeds import row_seeds
 from data_contracts import tables
 from data_contracts.config import SamplingChoice

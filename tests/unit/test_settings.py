@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from ctlev_core import plugins
 from ctlev_core.encodings import event_histogram
-from ctlev_core.image_gate import GatedImages
 from ctlev_core.plugins import PluginError
+from ctlev_core.postprocessing.rejection import GatedImages
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
 from data_contracts.errors import DataError

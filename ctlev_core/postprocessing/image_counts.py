@@ -148,7 +148,7 @@ def estimate_counts(frames: np.ndarray, model: CountModel, *, seeds: Sequence[in
     Raises:
         ValueError: another shape or dtype, or another number of seeds.
     """
-    from ctlev_core import image_count_kernels as kernels
+    from ctlev_core.postprocessing import image_count_kernels as kernels
 
     if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
         raise ValueError(f"frames must be [N, H, W, 3] uint8, got {frames.shape} {frames.dtype}")
@@ -238,7 +238,7 @@ def _estimate(values: np.ndarray, frequencies: np.ndarray, model: CountModel, rn
 
 def _fitting_ranges(frequencies: np.ndarray, model: CountModel) -> list[tuple[float, float]]:
     """Ranges of full scales at which all values of an image are levels, the most probable ones first."""
-    from ctlev_core import image_count_kernels as kernels
+    from ctlev_core.postprocessing import image_count_kernels as kernels
 
     values = np.flatnonzero(frequencies[:255])
     values = values[values > 0]
@@ -306,7 +306,7 @@ def _counts_by_table(
     wanted: tuple[float, float],
 ) -> tuple[np.ndarray, bool]:
     """Counts [C, H, W] int64 by a table of values, and whether they have a full scale in the range wanted."""
-    from ctlev_core import image_count_kernels as kernels
+    from ctlev_core.postprocessing import image_count_kernels as kernels
 
     counts = np.empty(values.shape, np.int64)
     flat, saturated = counts.reshape(-1), np.empty(values.size, np.int64)

@@ -127,7 +127,7 @@ def sample_duration_us(num_events: int, model: TimeModel, rng: np.random.Generat
 
 
 def _sample(counts: np.ndarray, model: TimeModel, rng: np.random.Generator, spread: Spread) -> Events:
-    from ctlev_core import event_stream_kernels as kernels
+    from ctlev_core.postprocessing import event_stream_kernels as kernels
 
     height, width = counts.shape[1:]
     num_events = int(counts.sum(dtype=np.int64))
