@@ -3,7 +3,7 @@
 FOLDER/README.md                             what it is and how to read it
 FOLDER/labels.parquet                        one row an image (`IMAGES`); label columns that no row has are left out
 FOLDER/metadata.parquet                      the same table, under the name that `imagefolder` of `datasets` looks for
-FOLDER/provenance.json                       the record of every stage behind it (ctlev_core.provenance)
+FOLDER/provenance.json                       the record of every stage behind it (ctlev_core.provenance.records)
 FOLDER/images/000/synthetic_000000.png       RGB, 8 bit; 1,000 rows a sub-folder
 FOLDER/conditions/000/synthetic_000000.png   the condition image, for generators that are asked by one
 FOLDER/events/000/synthetic_000000.parquet   the image as an event stream, where that was asked for

@@ -15,7 +15,7 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from ctlev_core.export.dataset_card import Card, render_card
-from ctlev_core.provenance import Record, read_provenance, read_records, write_provenance
+from ctlev_core.provenance.records import Record, read_provenance, read_records, write_provenance
 from data_contracts.errors import DataError
 from data_contracts.image_folder import (
     CONDITIONS_FOLDER,

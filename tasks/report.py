@@ -13,7 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.paired_differences import share_of_gain
-from ctlev_core.provenance import Record, read_records, write_provenance
+from ctlev_core.provenance.records import Record, read_records, write_provenance
+from ctlev_core.provenance.scores import paired_samples, trace_scores
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from ctlev_core.report import pictures
@@ -40,7 +41,6 @@ from ctlev_core.report.summary import Figure, Summary, write_summary
 from ctlev_core.report.tables import Cell, Table, render_latex, render_markdown
 from ctlev_core.report.training_curves import prior_figures
 from ctlev_core.report.verdict import verdict
-from ctlev_core.traced_scores import paired_samples, trace_scores
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest
 from tasks.stage import Output, stage

@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
-from ctlev_core.provenance import Record, versions_of
+from ctlev_core.provenance.records import Record, versions_of
 from data_contracts.image_folder import IMAGES, is_empty
 from data_contracts.manifest import LABEL_COLUMNS
 

@@ -40,7 +40,7 @@ import torch
 from torch.utils.data import Dataset
 
 from ctlev_core.events import files
-from ctlev_core.provenance import read_records
+from ctlev_core.provenance.records import read_records
 from data_contracts import tables
 from data_contracts.errors import DataError
 from data_contracts.events import Events

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ctlev_core.provenance import Record, options_of, versions_of
+from ctlev_core.provenance.records import Record, options_of, versions_of
 from ctlev_core.report.tables import Cell, Table
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.traced_scores import PAIRED_SAMPLES
+from ctlev_core.provenance.scores import PAIRED_SAMPLES
 
 
 def samples_table(values: dict[str, np.ndarray], per_recording: int = 1, metric: str = "accuracy") -> pa.Table:

@@ -15,7 +15,7 @@ from generated_frames import REFUSED_ROW, make_generated, publish
 
 from ctlev_core.events import files
 from ctlev_core.export.event_dataset import EventDataset
-from ctlev_core.provenance import read_provenance
+from ctlev_core.provenance.records import read_provenance
 from data_contracts import image_folder, tables
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError, TableVersionError

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from ctlev_core.provenance import (
+from ctlev_core.provenance.records import (
     Record,
     behind,
     options_of,
@@ -17,9 +17,9 @@ from ctlev_core.provenance import (
     versions_of,
     write_provenance,
 )
+from ctlev_core.provenance.scores import TRACED_SCORES, paired_samples, trace_scores
 from ctlev_core.report.costs import cost_table, options_table, versions_table
 from ctlev_core.run_comparison import Run, compare_runs, find_run, read_run
-from ctlev_core.traced_scores import TRACED_SCORES, paired_samples, trace_scores
 from data_contracts import tables
 from data_contracts.errors import DataError
 

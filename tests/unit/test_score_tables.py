@@ -5,6 +5,7 @@ import pyarrow as pa
 import pytest
 
 from ctlev_core.paired_differences import Difference
+from ctlev_core.provenance.scores import paired_samples
 from ctlev_core.report.html import Curves
 from ctlev_core.report.scaling import ScalePoint, scaling_figure, scaling_points
 from ctlev_core.report.score_tables import (
@@ -16,7 +17,6 @@ from ctlev_core.report.score_tables import (
     score_tables,
 )
 from ctlev_core.report.verdict import verdict
-from ctlev_core.traced_scores import paired_samples
 
 METRIC = "mpjpe2d_px"
 NAMES = [f"s{number}" for number in range(40)]

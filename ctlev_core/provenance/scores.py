@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.provenance import Record, behind, digest_of, options_of, versions_of
+from ctlev_core.provenance.records import Record, behind, digest_of, options_of, versions_of
 from data_contracts import tables
 from data_contracts.tables import Column, TableSchema
 
