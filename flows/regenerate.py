@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.report.refusals import count_refusals
-from ctlev_core.version_gates import check_gates
+from ctlev_core.report.version_gates import check_gates
 from data_contracts.config import Frozen
 from data_contracts.experiment import LABELS_OF
 from data_contracts.manifest import ManifestRef, read_manifest

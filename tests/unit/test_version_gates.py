@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from ctlev_core.version_gates import check_gates
+from ctlev_core.report.version_gates import check_gates
 from data_contracts.errors import DataError
 from data_contracts.regeneration import Gates, Regeneration
 
