@@ -17,7 +17,7 @@ from prefect import Flow
 from prefect.logging import get_run_logger
 
 from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
-from ctlev_core.report.report_files import publish_report
+from ctlev_core.report.page.report_files import publish_report
 from flows import baselines as of_baselines
 from flows import compare as of_compare
 from flows import evaluate as of_evaluate

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 from ctlev_core import plugins
-from ctlev_core.report.report_files import publish_report
+from ctlev_core.report.page.report_files import publish_report
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from data_contracts.study import Study

@@ -23,12 +23,13 @@ from ctlev_core.report.copies import copy_sections
 from ctlev_core.report.costs import cost_table, options_table, versions_table
 from ctlev_core.report.data_split import told_split
 from ctlev_core.report.distances import floor_tables
-from ctlev_core.report.html import Curves, Folded, Section, render_report
 from ctlev_core.report.nearest_classes import nearest_sections
+from ctlev_core.report.page.html import Curves, Folded, Section, render_report
+from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, PROVENANCE
+from ctlev_core.report.page.tables import Cell, Table, render_latex, render_markdown
 from ctlev_core.report.paper_numbers import paper_section
 from ctlev_core.report.realism import realism_sections
 from ctlev_core.report.refusals import refusal_sections
-from ctlev_core.report.report_files import LATEX, MARKDOWN, PAGE, PROVENANCE
 from ctlev_core.report.scaling import scaling_figure, scaling_points
 from ctlev_core.report.score_tables import (
     PairedScores,
@@ -38,7 +39,6 @@ from ctlev_core.report.score_tables import (
     trained_rows,
 )
 from ctlev_core.report.summary import Figure, Summary, write_summary
-from ctlev_core.report.tables import Cell, Table, render_latex, render_markdown
 from ctlev_core.report.training_curves import prior_figures
 from ctlev_core.report.verdict import verdict
 from data_contracts import tables

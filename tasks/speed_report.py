@@ -8,8 +8,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.report.html import render_report
-from ctlev_core.report.report_files import PAGE
+from ctlev_core.report.page.html import render_report
+from ctlev_core.report.page.report_files import PAGE
 from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
 from ctlev_core.report.speed_vs_error import SpeedPage
 from data_contracts import tables

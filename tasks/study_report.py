@@ -9,9 +9,10 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.report.html import Folded, Links, Text, render_report
+from ctlev_core.report.page.html import Folded, Links, Text, render_report
+from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, published_files
+from ctlev_core.report.page.tables import render_latex, render_markdown
 from ctlev_core.report.pooled import Group, pool_parts, pooled_sections, pooled_tables, pooled_verdict
-from ctlev_core.report.report_files import LATEX, MARKDOWN, PAGE, published_files
 from ctlev_core.report.score_tables import PairedScores
 from ctlev_core.report.speed_summary import read_speed_summary
 from ctlev_core.report.study import (
@@ -26,7 +27,6 @@ from ctlev_core.report.study import (
     study_words,
 )
 from ctlev_core.report.summary import read_summary
-from ctlev_core.report.tables import render_latex, render_markdown
 from data_contracts import tables
 from data_contracts.manifest import Manifest
 from data_contracts.study import SPEED_VS_ERROR

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctlev_core.events.windows import spread
-from ctlev_core.report.html import ImageGrid, Section, Table
+from ctlev_core.report.page.html import ImageGrid, Section, Table
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest
 

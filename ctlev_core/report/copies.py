@@ -7,7 +7,7 @@ from typing import Any
 
 from ctlev_core.copy_check import CLOSEST_PAIRS
 from ctlev_core.intervals import score_text
-from ctlev_core.report.html import ImageGrid, Section, Table
+from ctlev_core.report.page.html import ImageGrid, Section, Table
 from data_contracts.manifest import Manifest
 
 _CAPTION = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ctlev_core.provenance.records import Record, options_of, versions_of
-from ctlev_core.report.tables import Cell, Table
+from ctlev_core.report.page.tables import Cell, Table
 
 
 def cost_table(records: Sequence[Record]) -> Table:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ctlev_core.feature_distances import DISTANCE_ESTIMATES
 from ctlev_core.intervals import score_text
-from ctlev_core.report.tables import Cell, Table
+from ctlev_core.report.page.tables import Cell, Table
 from data_contracts.manifest import Manifest
 
 _CAPTION = (

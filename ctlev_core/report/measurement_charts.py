@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.report.html import Curves
+from ctlev_core.report.page.html import Curves
 
 REFERENCE_LINE, CONVERGED_LINE = "reference", "converged"
 """Names of the settings that others are compared with."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ctlev_core.report.tables import Cell, Table
+from ctlev_core.report.page.tables import Cell, Table
 from data_contracts.manifest import Manifest
 
 _CAPTION = (

@@ -6,8 +6,8 @@ with Stable Diffusion as the prior. Bold is the paper's; it gives no intervals.
 
 from __future__ import annotations
 
-from ctlev_core.report.html import Folded
-from ctlev_core.report.tables import Table
+from ctlev_core.report.page.html import Folded
+from ctlev_core.report.page.tables import Table
 
 REAL, BOTH = "original training data", "Ours + original training data"
 

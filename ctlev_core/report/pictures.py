@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ctlev_core.events.windows import spread
-from ctlev_core.report.html import Animation, ImageGrid, Step
+from ctlev_core.report.page.html import Animation, ImageGrid, Step
 from data_contracts.manifest import Manifest
 
 GRID_COLUMNS = 10

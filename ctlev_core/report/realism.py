@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.realism.summary import AXES
-from ctlev_core.report.html import Curves, Section, Table
+from ctlev_core.report.page.html import Curves, Section, Table
 from ctlev_core.report.two_sample import two_sample_tables
 
 _HOW_TO_READ = (

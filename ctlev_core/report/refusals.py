@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ctlev_core.report.html import Section, Table
+from ctlev_core.report.page.html import Section, Table
 from data_contracts.manifest import Manifest
 
 _CAPTION = (

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ctlev_core.report.html import Curves
+from ctlev_core.report.page.html import Curves
 from ctlev_core.report.score_tables import interval_over_trainings, trained_rows
 
 

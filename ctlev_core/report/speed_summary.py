@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctlev_core.report.html import Curves, Table
+from ctlev_core.report.page.html import Curves, Table
 from data_contracts.errors import DataError
 
 SUMMARY_FILE = "summary.json"

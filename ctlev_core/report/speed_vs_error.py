@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.events.windows import spread
-from ctlev_core.report.html import Curves, ImageGrid, Section, Table
 from ctlev_core.report.measurement_charts import (
     CONVERGED_LINE,
     REFERENCE_LINE,
@@ -20,6 +19,7 @@ from ctlev_core.report.measurement_charts import (
     lines_of,
     rows_of,
 )
+from ctlev_core.report.page.html import Curves, ImageGrid, Section, Table
 from ctlev_core.report.solver_studies import exact_score_sections, precision_sections
 from ctlev_core.report.speed_realism import realism_table
 from ctlev_core.sampling_errors import (

@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ctlev_core.report.html import Animation, Curves, ImageGrid, Step
+from ctlev_core.report.page.html import Animation, Curves, ImageGrid, Step
 from data_contracts.errors import DataError
 
 SUMMARY_FILE = "summary.json"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ctlev_core.report.html import Curves
+from ctlev_core.report.page.html import Curves
 from ctlev_core.report.score_tables import interval_over_trainings
 from data_contracts.experiment import LABELS_OF
 

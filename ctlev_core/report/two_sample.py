@@ -7,7 +7,7 @@ from typing import Any
 
 from ctlev_core.intervals import score_text
 from ctlev_core.realism.two_sample import MIN_FRAMES
-from ctlev_core.report.tables import Cell, Table
+from ctlev_core.report.page.tables import Cell, Table
 
 _CAPTION = (
     "A small network learns from half of the recordings which of two sets a frame is from. Area: under the ROC curve "

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.report.figures import animation_webp, curves_svg, image_grid_png, series_style
-from ctlev_core.report.html import Animation, Curves, Folded, ImageGrid, Step, Table, Text, render_report
-from ctlev_core.report.tables import format_column
+from ctlev_core.report.page.figures import animation_webp, curves_svg, image_grid_png, series_style
+from ctlev_core.report.page.html import Animation, Curves, Folded, ImageGrid, Step, Table, Text, render_report
+from ctlev_core.report.page.tables import format_column
 
 HOSTILE = "<script>alert(\"1\")</script> & 'x' http://example.org"
 VOID = {"meta", "img", "br"}

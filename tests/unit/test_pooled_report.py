@@ -11,7 +11,7 @@ from report_artefacts import SETTINGS, Experiment
 from ctlev_core.paired_differences import Difference
 from ctlev_core.plugins import PluginError
 from ctlev_core.pooled_scores import DrawsDiffer
-from ctlev_core.report.tables import split_number
+from ctlev_core.report.page.tables import split_number
 from ctlev_core.report.verdict import in_range
 from data_contracts.manifest import Manifest, ManifestRef
 from data_contracts.study import Study

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ctlev_core.report.html import Curves, Table, render_report
+from ctlev_core.report.page.html import Curves, Table, render_report
 from ctlev_core.report.realism import realism_sections
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.report.html import Table
+from ctlev_core.report.page.html import Table
 from ctlev_core.report.refusals import Refusals, count_refusals, refusal_sections
 from data_contracts import tables
 from data_contracts.labels import Labels

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctlev_core.report.page.tables import Table, latex_table, markdown_table, render_latex, render_markdown
 from ctlev_core.report.paper_numbers import TABLES
-from ctlev_core.report.tables import Table, latex_table, markdown_table, render_latex, render_markdown
 
 MIXED = Table(
     "Does it help? 95 %",

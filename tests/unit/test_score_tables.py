@@ -6,7 +6,7 @@ import pytest
 
 from ctlev_core.paired_differences import Difference
 from ctlev_core.provenance.scores import paired_samples
-from ctlev_core.report.html import Curves
+from ctlev_core.report.page.html import Curves
 from ctlev_core.report.scaling import ScalePoint, scaling_figure, scaling_points
 from ctlev_core.report.score_tables import (
     PairedScores,

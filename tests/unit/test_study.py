@@ -13,8 +13,9 @@ from report_artefacts import SETTINGS, Experiment
 from ctlev_core.datasets import studio_objects
 from ctlev_core.paired_differences import Difference
 from ctlev_core.plugins import PluginError, load_options
-from ctlev_core.report.html import Animation, Curves, ImageGrid, Step
-from ctlev_core.report.report_files import publish_report
+from ctlev_core.report.page.html import Animation, Curves, ImageGrid, Step
+from ctlev_core.report.page.report_files import publish_report
+from ctlev_core.report.page.tables import Table
 from ctlev_core.report.score_tables import PairedScores
 from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
 from ctlev_core.report.study import (
@@ -27,7 +28,6 @@ from ctlev_core.report.study import (
     study_words,
 )
 from ctlev_core.report.summary import SUMMARY_FILE, Summary, read_summary, write_summary
-from ctlev_core.report.tables import Table
 from ctlev_core.run_comparison import read_run
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment as Options

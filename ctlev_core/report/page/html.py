@@ -14,9 +14,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ctlev_core.report import figures
-from ctlev_core.report.style import SCRIPT, STYLE
-from ctlev_core.report.tables import Table, format_table, split_number
+from ctlev_core.report.page import figures
+from ctlev_core.report.page.style import SCRIPT, STYLE
+from ctlev_core.report.page.tables import Table, format_table, split_number
 
 
 @dataclass(frozen=True)
