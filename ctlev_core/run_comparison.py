@@ -29,8 +29,8 @@ from ctlev_core.paired_differences import (
 from ctlev_core.provenance.records import Record, options_of, read_provenance, versions_of
 from ctlev_core.provenance.scores import PAIRED_SAMPLES, TRACED_SCORES
 from ctlev_core.report.page.tables import Cell, Table
-from ctlev_core.report.score_tables import cell_text, interval_over_trainings
-from ctlev_core.report.verdict import lower_is_better
+from ctlev_core.report.sections.score_tables import cell_text, interval_over_trainings
+from ctlev_core.report.sections.verdict import lower_is_better
 from data_contracts.errors import DataError
 from data_contracts.tables import TableSchema, check_table
 

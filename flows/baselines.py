@@ -6,7 +6,7 @@ import sys
 from functools import partial
 
 from ctlev_core import plugins
-from ctlev_core.report.refusals import count_refusals
+from ctlev_core.report.sections.refusals import count_refusals
 from data_contracts.config import Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef, read_manifest

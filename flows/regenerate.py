@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.report.refusals import count_refusals
+from ctlev_core.report.sections.refusals import count_refusals
 from ctlev_core.report.version_gates import check_gates
 from data_contracts.config import Frozen
 from data_contracts.experiment import LABELS_OF

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ctlev_core.report.refusals import count_refusals
+from ctlev_core.report.sections.refusals import count_refusals
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.synthesis import Synthesis

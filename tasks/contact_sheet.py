@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from ctlev_core.report.contact_sheet import contact_sheet_sections
 from ctlev_core.report.page.html import render_report
+from ctlev_core.report.sections.contact_sheet import contact_sheet_sections
 from data_contracts import tables
 from data_contracts.manifest import Manifest, ManifestRef
 from tasks.stage import Output, stage

@@ -17,30 +17,30 @@ from ctlev_core.provenance.records import Record, read_records, write_provenance
 from ctlev_core.provenance.scores import paired_samples, trace_scores
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
-from ctlev_core.report import pictures
-from ctlev_core.report.contact_sheet import contact_sheet_sections
-from ctlev_core.report.copies import copy_sections
-from ctlev_core.report.costs import cost_table, options_table, versions_table
-from ctlev_core.report.data_split import told_split
-from ctlev_core.report.distances import floor_tables
-from ctlev_core.report.nearest_classes import nearest_sections
 from ctlev_core.report.page.html import Curves, Folded, Section, render_report
 from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, PROVENANCE
 from ctlev_core.report.page.tables import Cell, Table, render_latex, render_markdown
 from ctlev_core.report.paper_numbers import paper_section
-from ctlev_core.report.realism import realism_sections
-from ctlev_core.report.refusals import refusal_sections
-from ctlev_core.report.scaling import scaling_figure, scaling_points
-from ctlev_core.report.score_tables import (
+from ctlev_core.report.sections import pictures
+from ctlev_core.report.sections.contact_sheet import contact_sheet_sections
+from ctlev_core.report.sections.copies import copy_sections
+from ctlev_core.report.sections.costs import cost_table, options_table, versions_table
+from ctlev_core.report.sections.data_split import told_split
+from ctlev_core.report.sections.distances import floor_tables
+from ctlev_core.report.sections.nearest_classes import nearest_sections
+from ctlev_core.report.sections.realism import realism_sections
+from ctlev_core.report.sections.refusals import refusal_sections
+from ctlev_core.report.sections.scaling import scaling_figure, scaling_points
+from ctlev_core.report.sections.score_tables import (
     PairedScores,
     baseline_tables,
     group_tables,
     score_tables,
     trained_rows,
 )
+from ctlev_core.report.sections.training_curves import prior_figures
+from ctlev_core.report.sections.verdict import verdict
 from ctlev_core.report.summary import Figure, Summary, write_summary
-from ctlev_core.report.training_curves import prior_figures
-from ctlev_core.report.verdict import verdict
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest
 from tasks.stage import Output, stage

@@ -13,7 +13,7 @@ from ctlev_core.report.page.html import Folded, Links, Text, render_report
 from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, published_files
 from ctlev_core.report.page.tables import render_latex, render_markdown
 from ctlev_core.report.pooled import Group, pool_parts, pooled_sections, pooled_tables, pooled_verdict
-from ctlev_core.report.score_tables import PairedScores
+from ctlev_core.report.sections.score_tables import PairedScores
 from ctlev_core.report.speed_summary import read_speed_summary
 from ctlev_core.report.study import (
     Part,

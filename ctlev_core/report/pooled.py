@@ -20,8 +20,8 @@ from ctlev_core.paired_differences import Difference
 from ctlev_core.pooled_scores import PooledScores, pool_values
 from ctlev_core.report.page.html import Curves, Folded, Section
 from ctlev_core.report.page.tables import Cell, Table
+from ctlev_core.report.sections.verdict import in_range, in_words, lower_is_better, made_better
 from ctlev_core.report.study import Part
-from ctlev_core.report.verdict import in_range, in_words, lower_is_better, made_better
 from data_contracts.experiment import LABELS_OF
 
 REAL, OWN, BOTH = "real", "synthetic", "real+synthetic"

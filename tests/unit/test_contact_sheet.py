@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ctlev_core.report import contact_sheet
+from ctlev_core.report.sections import contact_sheet
 from data_contracts.labels import Labels
 
 

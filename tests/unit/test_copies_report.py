@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.report.copies import copy_sections
 from ctlev_core.report.page.html import ImageGrid, Table
+from ctlev_core.report.sections.copies import copy_sections
 
 FRAMES = np.arange(4 * 8 * 8 * 3, dtype=np.uint8).reshape(4, 8, 8, 3)
 

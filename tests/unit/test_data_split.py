@@ -2,7 +2,7 @@
 
 import pytest
 
-from ctlev_core.report.data_split import told_split
+from ctlev_core.report.sections.data_split import told_split
 
 
 @pytest.mark.parametrize(

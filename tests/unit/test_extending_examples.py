@@ -18,7 +18,7 @@ from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.labels.labelling import labels_at_windows, labels_in_image
-from ctlev_core.report import verdict
+from ctlev_core.report.sections import verdict
 from data_contracts.config import Frozen, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, check_events

@@ -12,7 +12,7 @@ from ctlev_core.paired_differences import Difference
 from ctlev_core.plugins import PluginError
 from ctlev_core.pooled_scores import DrawsDiffer
 from ctlev_core.report.page.tables import split_number
-from ctlev_core.report.verdict import in_range
+from ctlev_core.report.sections.verdict import in_range
 from data_contracts.manifest import Manifest, ManifestRef
 from data_contracts.study import Study
 from flows.studies import load_study

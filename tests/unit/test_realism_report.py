@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ctlev_core.report.page.html import Curves, Table, render_report
-from ctlev_core.report.realism import realism_sections
+from ctlev_core.report.sections.realism import realism_sections
 
 
 def row(group: str, setting: str, metric: str, value: float, low: float | None = None, high: float | None = None):

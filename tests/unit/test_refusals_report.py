@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core.report.page.html import Table
-from ctlev_core.report.refusals import Refusals, count_refusals, refusal_sections
+from ctlev_core.report.sections.refusals import Refusals, count_refusals, refusal_sections
 from data_contracts import tables
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, label_columns, read_manifest, write_manifest

@@ -7,8 +7,8 @@ import pytest
 from ctlev_core.paired_differences import Difference
 from ctlev_core.provenance.scores import paired_samples
 from ctlev_core.report.page.html import Curves
-from ctlev_core.report.scaling import ScalePoint, scaling_figure, scaling_points
-from ctlev_core.report.score_tables import (
+from ctlev_core.report.sections.scaling import ScalePoint, scaling_figure, scaling_points
+from ctlev_core.report.sections.score_tables import (
     PairedScores,
     baseline_tables,
     cell_text,
@@ -16,7 +16,7 @@ from ctlev_core.report.score_tables import (
     interval_over_trainings,
     score_tables,
 )
-from ctlev_core.report.verdict import verdict
+from ctlev_core.report.sections.verdict import verdict
 
 METRIC = "mpjpe2d_px"
 NAMES = [f"s{number}" for number in range(40)]

@@ -16,7 +16,7 @@ from ctlev_core.plugins import PluginError, load_options
 from ctlev_core.report.page.html import Animation, Curves, ImageGrid, Step
 from ctlev_core.report.page.report_files import publish_report
 from ctlev_core.report.page.tables import Table
-from ctlev_core.report.score_tables import PairedScores
+from ctlev_core.report.sections.score_tables import PairedScores
 from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
 from ctlev_core.report.study import (
     Part,

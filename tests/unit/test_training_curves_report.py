@@ -2,7 +2,7 @@
 
 import pytest
 
-from ctlev_core.report.training_curves import PRE_TRAINED, RANDOM, prior_figures
+from ctlev_core.report.sections.training_curves import PRE_TRAINED, RANDOM, prior_figures
 
 
 def row(setting, metric, value, task="pose2d", group="all", low=None, high=None):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ctlev_core.report.page.html import Curves
-from ctlev_core.report.score_tables import interval_over_trainings
+from ctlev_core.report.sections.score_tables import interval_over_trainings
 from data_contracts.experiment import LABELS_OF
 
 FEWEST_AMOUNTS = 2

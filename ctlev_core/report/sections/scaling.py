@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ctlev_core.report.page.html import Curves
-from ctlev_core.report.score_tables import interval_over_trainings, trained_rows
+from ctlev_core.report.sections.score_tables import interval_over_trainings, trained_rows
 
 
 @dataclass(frozen=True)

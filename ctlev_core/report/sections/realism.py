@@ -9,7 +9,7 @@ import numpy as np
 
 from ctlev_core.realism.summary import AXES
 from ctlev_core.report.page.html import Curves, Section, Table
-from ctlev_core.report.two_sample import two_sample_tables
+from ctlev_core.report.sections.two_sample import two_sample_tables
 
 _HOW_TO_READ = (
     "Means over recordings, in brackets 95 % intervals under resampling of recordings. Distance: magnitude of the "
