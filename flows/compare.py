@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ctlev_core.report.page.html import render_report
 from ctlev_core.report.page.tables import Table, markdown_table
-from ctlev_core.run_comparison import Run, compare_runs, find_run, read_run
+from ctlev_core.report.studies.run_comparison import Run, compare_runs, find_run, read_run
 from data_contracts.errors import DataError
 from flows.settings import HOME, flow
 

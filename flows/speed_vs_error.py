@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions
 from ctlev_core.plugins import PluginError, validate_options
-from ctlev_core.report.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
+from ctlev_core.report.studies.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
 from data_contracts.config import DownstreamChoice, SamplingChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef

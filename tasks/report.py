@@ -20,7 +20,6 @@ from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from ctlev_core.report.page.html import Curves, Folded, Section, render_report
 from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, PROVENANCE
 from ctlev_core.report.page.tables import Cell, Table, render_latex, render_markdown
-from ctlev_core.report.paper_numbers import paper_section
 from ctlev_core.report.sections import pictures
 from ctlev_core.report.sections.contact_sheet import contact_sheet_sections
 from ctlev_core.report.sections.copies import copy_sections
@@ -40,7 +39,8 @@ from ctlev_core.report.sections.score_tables import (
 )
 from ctlev_core.report.sections.training_curves import prior_figures
 from ctlev_core.report.sections.verdict import verdict
-from ctlev_core.report.summary import Figure, Summary, write_summary
+from ctlev_core.report.studies.paper_numbers import paper_section
+from ctlev_core.report.studies.summary import Figure, Summary, write_summary
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest
 from tasks.stage import Output, stage

@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 
 from ctlev_core.report.page.html import render_report
 from ctlev_core.report.page.report_files import PAGE
-from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
-from ctlev_core.report.speed_vs_error import SpeedPage
+from ctlev_core.report.studies.speed_summary import SpeedSummary, write_speed_summary
+from ctlev_core.report.studies.speed_vs_error import SpeedPage
 from data_contracts import tables
 from data_contracts.manifest import Manifest, ManifestRef
 from data_contracts.speed_vs_error import SamplerSetting

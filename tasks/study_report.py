@@ -12,10 +12,10 @@ import pyarrow.parquet as pq
 from ctlev_core.report.page.html import Folded, Links, Text, render_report
 from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, published_files
 from ctlev_core.report.page.tables import render_latex, render_markdown
-from ctlev_core.report.pooled import Group, pool_parts, pooled_sections, pooled_tables, pooled_verdict
 from ctlev_core.report.sections.score_tables import PairedScores
-from ctlev_core.report.speed_summary import read_speed_summary
-from ctlev_core.report.study import (
+from ctlev_core.report.studies.pooled import Group, pool_parts, pooled_sections, pooled_tables, pooled_verdict
+from ctlev_core.report.studies.speed_summary import read_speed_summary
+from ctlev_core.report.studies.study import (
     Part,
     distances_table,
     speed_sections,
@@ -26,7 +26,7 @@ from ctlev_core.report.study import (
     study_verdict,
     study_words,
 )
-from ctlev_core.report.summary import read_summary
+from ctlev_core.report.studies.summary import read_summary
 from data_contracts import tables
 from data_contracts.manifest import Manifest
 from data_contracts.study import SPEED_VS_ERROR

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 from pooled_tables import samples_table
 
 from ctlev_core.report.page.html import ImageGrid, Step
-from ctlev_core.report.summary import Summary, write_summary
+from ctlev_core.report.studies.summary import Summary, write_summary
 from data_contracts import tables
 from data_contracts.manifest import Manifest, ManifestRef
 from tasks.stage import Output

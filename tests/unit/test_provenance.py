@@ -19,7 +19,7 @@ from ctlev_core.provenance.records import (
 )
 from ctlev_core.provenance.scores import TRACED_SCORES, paired_samples, trace_scores
 from ctlev_core.report.sections.costs import cost_table, options_table, versions_table
-from ctlev_core.run_comparison import Run, compare_runs, find_run, read_run
+from ctlev_core.report.studies.run_comparison import Run, compare_runs, find_run, read_run
 from data_contracts import tables
 from data_contracts.errors import DataError
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctlev_core.report.page.tables import Table, latex_table, markdown_table, render_latex, render_markdown
-from ctlev_core.report.paper_numbers import TABLES
+from ctlev_core.report.studies.paper_numbers import TABLES
 
 MIXED = Table(
     "Does it help? 95 %",

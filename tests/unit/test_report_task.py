@@ -9,7 +9,7 @@ from ctlev_core.provenance.records import read_provenance
 from ctlev_core.provenance.scores import PAIRED_SAMPLES, TRACED_SCORES
 from ctlev_core.report.page.report_files import publish_report
 from ctlev_core.report.sections.pictures import evenly_by_class, runs, sample_grid, steps
-from ctlev_core.run_comparison import compare_runs, read_run
+from ctlev_core.report.studies.run_comparison import compare_runs, read_run
 from data_contracts.manifest import ManifestRef
 from data_contracts.tables import check_table
 from tasks.report import report

@@ -5,10 +5,10 @@ import re
 import numpy as np
 import pytest
 
-from ctlev_core.report.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
 from ctlev_core.report.page.html import Curves, render_report
-from ctlev_core.report.speed_summary import SUMMARY_FILE, SpeedSummary, read_speed_summary, write_speed_summary
-from ctlev_core.report.speed_vs_error import SpeedPage, recommend
+from ctlev_core.report.studies.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
+from ctlev_core.report.studies.speed_summary import SUMMARY_FILE, SpeedSummary, read_speed_summary, write_speed_summary
+from ctlev_core.report.studies.speed_vs_error import SpeedPage, recommend
 from ctlev_core.sampling_errors import (
     CONTROLNET,
     CONVERGED,

@@ -17,8 +17,9 @@ from ctlev_core.report.page.html import Animation, Curves, ImageGrid, Step
 from ctlev_core.report.page.report_files import publish_report
 from ctlev_core.report.page.tables import Table
 from ctlev_core.report.sections.score_tables import PairedScores
-from ctlev_core.report.speed_summary import SpeedSummary, write_speed_summary
-from ctlev_core.report.study import (
+from ctlev_core.report.studies.run_comparison import read_run
+from ctlev_core.report.studies.speed_summary import SpeedSummary, write_speed_summary
+from ctlev_core.report.studies.study import (
     Part,
     distances_table,
     study_overview,
@@ -27,8 +28,7 @@ from ctlev_core.report.study import (
     study_verdict,
     study_words,
 )
-from ctlev_core.report.summary import SUMMARY_FILE, Summary, read_summary, write_summary
-from ctlev_core.run_comparison import read_run
+from ctlev_core.report.studies.summary import SUMMARY_FILE, Summary, read_summary, write_summary
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment as Options
 from data_contracts.manifest import Manifest, ManifestRef

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.events.windows import spread
-from ctlev_core.report.measurement_charts import (
+from ctlev_core.report.page.html import Curves, ImageGrid, Section, Table
+from ctlev_core.report.studies.measurement_charts import (
     CONVERGED_LINE,
     REFERENCE_LINE,
     Row,
@@ -19,9 +20,8 @@ from ctlev_core.report.measurement_charts import (
     lines_of,
     rows_of,
 )
-from ctlev_core.report.page.html import Curves, ImageGrid, Section, Table
-from ctlev_core.report.solver_studies import exact_score_sections, precision_sections
-from ctlev_core.report.speed_realism import realism_table
+from ctlev_core.report.studies.solver_studies import exact_score_sections, precision_sections
+from ctlev_core.report.studies.speed_realism import realism_table
 from ctlev_core.sampling_errors import (
     CONTROLNET,
     CONVERGED,

@@ -9,13 +9,13 @@ from functools import cached_property
 from typing import Any
 
 from ctlev_core.paired_differences import Difference
-from ctlev_core.report import paper_numbers
 from ctlev_core.report.page.html import Folded, Section, Text
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import PairedScores, cell_text, score_tables, trained_rows
 from ctlev_core.report.sections.verdict import in_words, lower_is_better, made_better
-from ctlev_core.report.speed_summary import SpeedSummary
-from ctlev_core.report.summary import Figure, Summary
+from ctlev_core.report.studies import paper_numbers
+from ctlev_core.report.studies.speed_summary import SpeedSummary
+from ctlev_core.report.studies.summary import Figure, Summary
 
 Row = dict[str, Any]
 _QUESTIONS = (

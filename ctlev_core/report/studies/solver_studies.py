@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ctlev_core.report.measurement_charts import Row, chart, find_row, lines_of, rows_of
 from ctlev_core.report.page.html import Section, Table
+from ctlev_core.report.studies.measurement_charts import Row, chart, find_row, lines_of, rows_of
 from ctlev_core.sampling_errors import (
     CPU,
     EXACT,

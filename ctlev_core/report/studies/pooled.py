@@ -21,7 +21,7 @@ from ctlev_core.pooled_scores import PooledScores, pool_values
 from ctlev_core.report.page.html import Curves, Folded, Section
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.verdict import in_range, in_words, lower_is_better, made_better
-from ctlev_core.report.study import Part
+from ctlev_core.report.studies.study import Part
 from data_contracts.experiment import LABELS_OF
 
 REAL, OWN, BOTH = "real", "synthetic", "real+synthetic"
