@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg
 
-from ctlev_core.frechet import frechet_distance, frechet_distance_of_gaussians, frechet_distance_of_statistics
-from ctlev_core.frechet_extended import refined_frechet_distance
-from ctlev_core.gaussian_factors import FeatureStream
+from ctlev_core.scoring.frechet import frechet_distance, frechet_distance_of_gaussians, frechet_distance_of_statistics
+from ctlev_core.scoring.frechet_extended import refined_frechet_distance
+from ctlev_core.scoring.gaussians import FeatureStream
 
 Distance = Callable[[np.ndarray, np.ndarray], float]
 STREAM_ROWS = 64

@@ -7,7 +7,7 @@ from typing import Any
 
 from ctlev_core import plugins
 from ctlev_core.plugins import PluginError
-from ctlev_core.score_requirements import check_dataset
+from ctlev_core.scoring.checks import check_dataset
 from data_contracts.config import Choice, ConditionChoice, DatasetChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment

@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.copy_check import CLOSEST_PAIRS, CopyCheck, check_copies, small_pictures
 from ctlev_core.events.windows import spread
+from ctlev_core.scoring.memorisation import CLOSEST_PAIRS, CopyCheck, check_copies, small_pictures
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
 from data_contracts.errors import DataError

@@ -20,9 +20,9 @@ from ctlev_core.feature_distances import (
 )
 from ctlev_core.frame_sequences import name_recordings
 from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap, ratio_bootstrap
-from ctlev_core.joint_errors import quotients
-from ctlev_core.score_groups import Group, class_groups, origin_groups, subject_groups
-from ctlev_core.score_requirements import check_distances, check_frames, check_metrics
+from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
+from ctlev_core.scoring.pose import quotients
+from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, subject_groups
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
@@ -68,7 +68,7 @@ def score_model(
 
     Classes that real training frames show, those that only the label-only recordings of `poses` have, and those
     that neither has are groups of their own: what synthetic data adds is in the second. So are subjects of whom there
-    is nothing to learn from, beside others, and each of a few subjects (`ctlev_core.score_groups`). Beside the table
+    is nothing to learn from, beside others, and each of a few subjects (`ctlev_core.scoring.subsets`). Beside the table
     lie the scores of the single samples, from which two models can be compared in pairs. A setting that starts with
     `SHUFFLED` gives every frame the labels of another.
 

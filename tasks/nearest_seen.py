@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.zero_shot import nearest_seen_classes
+from ctlev_core.scoring.zero_shot import nearest_seen_classes
 from data_contracts import tables
 from data_contracts.config import GeneratorChoice
 from data_contracts.manifest import Manifest

@@ -5,7 +5,7 @@ precision 0, and one that is predicted but never a target has recall 0. The pape
 precision, without saying how the classes are averaged.
 
 Calibration is the expected calibration error of Guo et al. (ICML 2017), over bins of equal width of the highest
-probability. `ctlev_core.classification_scores` has the scores of each class, the confusion matrix and the bins.
+probability. `ctlev_core.scoring.classification` has the scores of each class, the confusion matrix and the bins.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.classification_scores import calibrate, class_scores, read_guesses
+from ctlev_core.scoring.classification import calibrate, class_scores, read_guesses
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.frechet import frechet_distance
-from ctlev_core.gaussian_factors import check_features
+from ctlev_core.scoring.frechet import frechet_distance
+from ctlev_core.scoring.gaussians import check_features
 from data_contracts.config import Frozen
 
 VERSION = 1

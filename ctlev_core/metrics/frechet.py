@@ -1,4 +1,4 @@
-"""Frechet distance between the features of two sets of images; see `ctlev_core.frechet` for the formula.
+"""Frechet distance between the features of two sets of images; see `ctlev_core.scoring.frechet` for the formula.
 
 The features come from the caller, who has to name the extractor beside the score: distances under different
 extractors do not compare, and only Inception's may be called FID. Values of sets of different sizes do not compare
@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, field_serializer
 
-from ctlev_core.frechet import frechet_distance_of_gaussians
-from ctlev_core.frechet_extended import refined_frechet_distance
-from ctlev_core.gaussian_factors import GaussianFactor, fit_gaussian, gaussian_from_statistics, read_statistics
 from ctlev_core.remembered_files import remembered_digest
+from ctlev_core.scoring.frechet import frechet_distance_of_gaussians
+from ctlev_core.scoring.frechet_extended import refined_frechet_distance
+from ctlev_core.scoring.gaussians import GaussianFactor, fit_gaussian, gaussian_from_statistics, read_statistics
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 

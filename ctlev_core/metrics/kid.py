@@ -1,4 +1,4 @@
-"""Kernel inception distance between the features of two sets of images; see `ctlev_core.kernel_distance`.
+"""Kernel inception distance between the features of two sets of images; see `ctlev_core.scoring.kid`.
 
 Unbiased, so that sets of different and small sizes compare; it may be negative, and is given as it is. The features
 come from the caller, who has to name the extractor beside the score.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field, field_validator
 
-from ctlev_core.kernel_distance import kernel_distance
+from ctlev_core.scoring.kid import kernel_distance
 from data_contracts.config import Frozen
 
 VERSION = 2

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.joint_errors import Counted, Sums, compute_joint_errors_px, quotients, row_means, row_sums
+from ctlev_core.scoring.pose import Counted, Sums, compute_joint_errors_px, quotients, row_means, row_sums
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 

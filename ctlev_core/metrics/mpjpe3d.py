@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.joint_errors import (
+from ctlev_core.scoring.pose import (
     Alignment,
     Sums,
     compute_joint_errors_mm,

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
-from ctlev_core.joint_errors import Sums, compute_joint_errors_px, quotients, row_means
+from ctlev_core.scoring.pose import Sums, compute_joint_errors_px, quotients, row_means
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 

@@ -3,7 +3,7 @@
 The threshold is in px, or a fraction of a length of the labelled person. A joint exactly at the threshold is correct.
 Source: Yang & Ramanan, Articulated Human Detection with Flexible Mixtures of Parts, TPAMI 2013 (bounding box); Sapp &
 Taskar, MODEC, CVPR 2013 (torso: left shoulder to right hip); Andriluka et al., CVPR 2014 (PCKh: a threshold of 0.5 with
-the normaliser `head`, see `ctlev_core.body_lengths` for what is a head here).
+the normaliser `head`, see `ctlev_core.scoring.body_lengths` for what is a head here).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.body_lengths import head_length, torso_length
-from ctlev_core.joint_errors import Sums, check_length, compute_joint_errors_px, quotients
+from ctlev_core.scoring.body_lengths import head_length, torso_length
+from ctlev_core.scoring.pose import Sums, check_length, compute_joint_errors_px, quotients
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from pydantic import Field, PositiveFloat
 
-from ctlev_core.body_lengths import head_length
-from ctlev_core.joint_errors import (
+from ctlev_core.scoring.body_lengths import head_length
+from ctlev_core.scoring.pose import (
     Alignment,
     Sums,
     check_length,

@@ -1,4 +1,4 @@
-"""Precision, recall, density and coverage of features; see `ctlev_core.neighbour_scores` for what they are.
+"""Precision, recall, density and coverage of features; see `ctlev_core.scoring.prdc` for what they are.
 
 They tell apart what one distance mixes: images unlike any real one (precision, density) and real ones that nothing
 resembles (recall, coverage). They depend on the sizes of both sets.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.neighbour_scores import neighbour_scores
+from ctlev_core.scoring.prdc import neighbour_scores
 from data_contracts.config import Frozen
 
 VERSION = 1

@@ -5,7 +5,7 @@ called positive where the class has the highest probability of all. With a two-c
 else, that is a binary classifier as in the paper; with a model of all held-out classes it is one against the rest.
 
 Accuracy is given as expected for as many negatives as positives, drawn at random: the mean of the shares of positives
-and negatives told right (`ctlev_core.zero_shot`). Chance is 0.5, whatever the numbers of images are. The paper does not
+and negatives told right (`ctlev_core.scoring.zero_shot`). Chance is 0.5, whatever the numbers of images are. The paper does not
 say how it draws negatives.
 """
 
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.classification_scores import read_guesses
-from ctlev_core.zero_shot import balanced_accuracy
+from ctlev_core.scoring.classification import read_guesses
+from ctlev_core.scoring.zero_shot import balanced_accuracy
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 

@@ -8,8 +8,8 @@ import pytest
 from flow_scripts import artefacts, run_script
 
 from ctlev_core.downstream import classifier
-from ctlev_core.frechet import frechet_distance
 from ctlev_core.generators import controlnet
+from ctlev_core.scoring.frechet import frechet_distance
 from ctlev_core.seeds import row_seeds
 from data_contracts.labels import Conditions
 

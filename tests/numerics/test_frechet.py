@@ -6,7 +6,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.frechet import frechet_distance
+from ctlev_core.scoring.frechet import frechet_distance
 
 
 def distance_by_sqrtm(a: np.ndarray, b: np.ndarray) -> float:

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.frechet import frechet_distance, frechet_distance_of_gaussians, frechet_distance_of_statistics
-from ctlev_core.frechet_extended import refined_frechet_distance
-from ctlev_core.gaussian_factors import FeatureStream, fit_gaussian, gaussian_from_statistics, read_statistics
+from ctlev_core.scoring.frechet import frechet_distance, frechet_distance_of_gaussians, frechet_distance_of_statistics
+from ctlev_core.scoring.frechet_extended import refined_frechet_distance
+from ctlev_core.scoring.gaussians import FeatureStream, fit_gaussian, gaussian_from_statistics, read_statistics
 from data_contracts.errors import DataError
 
 mpmath = pytest.importorskip("mpmath")

@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.copy_check import CLOSEST_PAIRS
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
+from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
 from data_contracts import tables
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, ManifestRef, label_columns, read_manifest, write_manifest

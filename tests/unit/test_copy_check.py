@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core import copy_check
-from ctlev_core.copy_check import check_copies, nearest_rows, small_pictures
+from ctlev_core.scoring import memorisation
+from ctlev_core.scoring.memorisation import check_copies, nearest_rows, small_pictures
 
 
 def slow_nearest(rows, references, row_groups=None, reference_groups=None):
@@ -55,7 +55,7 @@ def test_blocks_change_nothing(monkeypatch):
     rng = np.random.default_rng(0)
     rows, references = rng.standard_normal((50, 5)), rng.standard_normal((40, 5))
     expected = nearest_rows(rows, references)
-    monkeypatch.setattr(copy_check, "_BLOCK_NUMBERS", 90)
+    monkeypatch.setattr(memorisation, "_BLOCK_NUMBERS", 90)
     for found, wanted in zip(nearest_rows(rows, references), expected, strict=True):
         np.testing.assert_array_equal(found, wanted)
 

@@ -8,8 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from ctlev_core import plugins
-from ctlev_core.copy_check import CLOSEST_PAIRS
 from ctlev_core.events import files
+from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError

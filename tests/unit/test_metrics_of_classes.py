@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn import metrics as sklearn_metrics
 
-from ctlev_core.classification_scores import calibrate, class_scores, confusion_matrix, read_guesses
 from ctlev_core.metrics import classification, zero_shot
-from ctlev_core.zero_shot import balanced_accuracy, balanced_rows, nearest_seen_classes
+from ctlev_core.scoring.classification import calibrate, class_scores, confusion_matrix, read_guesses
+from ctlev_core.scoring.zero_shot import balanced_accuracy, balanced_rows, nearest_seen_classes
 from data_contracts.labels import Labels
 
 ZERO: Any = {"zero_division": 0}

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from ctlev_core.downstream import classifier
-from ctlev_core.score_groups import MAX_SINGLE_SUBJECTS, class_groups, subject_groups
+from ctlev_core.scoring.subsets import MAX_SINGLE_SUBJECTS, class_groups, subject_groups
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError

@@ -11,7 +11,7 @@ from ctlev_core import plugin_contracts, plugins
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.metrics import pve
 from ctlev_core.plugins import PluginError
-from ctlev_core.score_requirements import check_dataset, check_distances, check_frames, check_labels, check_metrics
+from ctlev_core.scoring.checks import check_dataset, check_distances, check_frames, check_labels, check_metrics
 from data_contracts import tables
 from data_contracts.config import DatasetChoice, DownstreamChoice, MetricChoice, cache_material
 from data_contracts.errors import DataError

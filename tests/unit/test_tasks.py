@@ -7,10 +7,10 @@ import pyarrow as pa
 import pytest
 
 from ctlev_core import plugins
-from ctlev_core.joint_errors import quotients
 from ctlev_core.labels.body_views import with_joints
 from ctlev_core.metrics import mpjpe2d, mpjpe3d, oks, pck2d
 from ctlev_core.report.sections.verdict import Difference, lower_is_better, verdict
+from ctlev_core.scoring.pose import quotients
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 from data_contracts.manifest import concat_labels

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.gaussian_factors import check_features, check_same_width
+from ctlev_core.scoring.gaussians import check_features, check_same_width
 
 _BLOCK_NUMBERS = 4_000_000
 

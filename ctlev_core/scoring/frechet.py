@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.gaussian_factors import (
+from ctlev_core.scoring.gaussians import (
     GaussianFactor,
     check_features,
     check_same_width,

@@ -5,7 +5,7 @@ a millionth of their size is then wrong by 1e-10 of itself. Here the roots are c
 x86. The orthogonal matrix between them may stay as it comes from float64: at the minimum the distance does not change
 with it to first order.
 
-Source: Procrustes form and notation as in `ctlev_core.frechet`; Golub & Van Loan, Matrix Computations, 2013, section
+Source: Procrustes form and notation as in `ctlev_core.scoring.frechet`; Golub & Van Loan, Matrix Computations, 2013, section
 5.2 (Householder QR).
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.frechet import frechet_distance
+from ctlev_core.scoring.frechet import frechet_distance
 
 CLOSE = 1e-6
 """Distances below this share of the summed variances are wrong by more than about 1e-13 in float64."""
@@ -22,7 +22,7 @@ MAX_WORK = 2 * 10**8
 
 
 def refined_frechet_distance(features_a: np.ndarray, features_b: np.ndarray) -> float:
-    """`ctlev_core.frechet.frechet_distance`, with more digits where two sets nearly coincide and are not too large.
+    """`ctlev_core.scoring.frechet.frechet_distance`, with more digits where two sets nearly coincide and are not too large.
 
     Args:
         features_a: [N, D] real numbers, N >= 2.

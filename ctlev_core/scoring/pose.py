@@ -112,7 +112,7 @@ def hip_indices(joint_set: str) -> list[int]:
 
 
 def check_length(length: Callable[[np.ndarray, str], np.ndarray], joint_set: str) -> None:
-    """Raise `ValueError` unless the set has the joints of a length of `ctlev_core.body_lengths`."""
+    """Raise `ValueError` unless the set has the joints of a length of `ctlev_core.scoring.body_lengths`."""
     count = len(JOINT_SETS[joint_set].joints) if joint_set in JOINT_SETS else 0
     length(np.empty((0, count, 3)), joint_set)
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.gaussian_factors import check_features, check_same_width
+from ctlev_core.scoring.gaussians import check_features, check_same_width
 from data_contracts.tables import Column, TableSchema
 
 CLOSEST_PAIRS = TableSchema(

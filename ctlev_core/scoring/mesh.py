@@ -10,7 +10,7 @@ import numpy as np
 
 from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from ctlev_core.geometry.procrustes import RELATIVE_SIZE
-from ctlev_core.joint_errors import Alignment
+from ctlev_core.scoring.pose import Alignment
 from data_contracts.labels import Labels
 
 _ROWS_AT_ONCE = 16
