@@ -25,8 +25,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
-from ctlev_core.sensor import PRESETS, PixelMaps, Sensor, SensorOptions, sample_pixel_maps, simulate_events
+from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
+from ctlev_core.sensor.dvs_pixel import PRESETS, PixelMaps, Sensor, SensorOptions, sample_pixel_maps, simulate_events
 
 IDEAL = PRESETS["ideal"].model_copy(update={"log_floor": 1e-4})
 STEPS_US = (20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)

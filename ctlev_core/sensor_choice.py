@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ctlev_core.sensor_options import PRESETS, SensorOptions, read_preset
+from ctlev_core.sensor.options import PRESETS, SensorOptions, read_preset
 
 SUFFIXES = (".yaml", ".yml")
 

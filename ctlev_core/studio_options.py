@@ -58,7 +58,8 @@ class Options(Frozen):
         default=2, ge=1, description="Individual sensors of each camera, with their own mismatch and hot pixels."
     )
     sensor_preset: Annotated[str, AfterValidator(check_sensor_preset)] = Field(
-        default="noisy", description="A key of `ctlev_core.sensor.PRESETS`, or a YAML file such as calibration writes."
+        default="noisy",
+        description="A key of `ctlev_core.sensor.dvs_pixel.PRESETS`, or a YAML file such as calibration writes.",
     )
     noise: float = Field(
         default=1.0, ge=0, description="Factor on the sensor's mismatch, leak, shot noise and number of hot pixels."

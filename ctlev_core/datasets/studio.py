@@ -119,8 +119,8 @@ def read_events(recording: Recording, options: Options) -> Events:
         DataError: the recording is not one of the studio with these options, carries labels only, or has more than
             `max_events`.
     """
-    from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
-    from ctlev_core.sensor import EventBudgetError
+    from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
+    from ctlev_core.sensor.dvs_pixel import EventBudgetError
 
     if not recording.has_events:
         raise DataError(f"studio recording {recording.recording_id!r} has no events")

@@ -89,7 +89,8 @@ class Options(Frozen):
         default=(0.55, 0.85), description="smallest and largest, as a share of the sensor's shorter side"
     )
     sensor_preset: Annotated[str, AfterValidator(check_sensor_preset)] = Field(
-        default="noisy", description="a key of `ctlev_core.sensor.PRESETS`, or a YAML file with a sensor's options"
+        default="noisy",
+        description="a key of `ctlev_core.sensor.dvs_pixel.PRESETS`, or a YAML file with a sensor's options",
     )
     num_sensors: int = Field(default=2, ge=1, description="individual sensors of that kind, with their own mismatch")
     noise: float = Field(
@@ -156,7 +157,7 @@ def read_events(recording: Recording, options: Options) -> Events:
     Raises:
         DataError: the recording is not one of this set with these options, or carries labels only.
     """
-    from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
+    from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
 
     screen = moving_screen(recording, options)
     entropy = _entropy(recording, options)

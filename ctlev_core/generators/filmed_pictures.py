@@ -2,7 +2,7 @@
 
 Source: N-MNIST and N-Caltech101 (Orchard et al., Converting Static Image Datasets to Spiking Neuromorphic Datasets
 Using Saccades, Frontiers in Neuroscience 2015) were recorded so: a pan-tilt unit moves an ATIS along a closed triangle,
-three saccades of about 100 ms, before a monitor that shows one picture. Pixels are those of `ctlev_core.sensor`.
+three saccades of about 100 ms, before a monitor that shows one picture. Pixels are those of `ctlev_core.sensor.dvs_pixel`.
 Nothing is learnt from real frames, but `calibrate` fits to recordings what their makers could have measured:
 thresholds, noise, hot pixels, refractory time, size and place of the picture, and whether it is brighter or darker than
 its ground.
@@ -14,7 +14,7 @@ those of a dark digit on a bright ground, `negative`. Whether the monitor showed
 leaks towards OFF and calls it 1, events do not tell; it makes no difference to them.
 
 How we differ: the picture moves as on a plane (a pan of a degree or so does that to first order); the monitor does not
-flicker; a pixel is silent for its refractory time by ESIM's rule (`ctlev_core.sensor`).
+flicker; a pixel is silent for its refractory time by ESIM's rule (`ctlev_core.sensor.dvs_pixel`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from data_contracts.events import Events, SensorSize
 from data_contracts.labels import Conditions
 
 if TYPE_CHECKING:
-    from ctlev_core.sensor_options import PixelMaps, SensorOptions
+    from ctlev_core.sensor.options import PixelMaps, SensorOptions
 
 VERSION = 1
 WHERE = "generator 'filmed_pictures'"
@@ -199,7 +199,7 @@ def sample_events(
 def calibrate(
     recordings: Iterable[Events], class_names: Sequence[str], conditions: Conditions, options: SampleOptions
 ) -> tuple[SampleOptions, dict[str, float]]:
-    """Fit what the options leave open to recordings of such pictures; see `ctlev_core.picture_calibration`.
+    """Fit what the options leave open to recordings of such pictures; see `ctlev_core.sensor.picture_calibration`.
 
     Args:
         recordings: whole recordings of the same sensor size, two or more are enough; read one by one.
@@ -211,7 +211,7 @@ def calibrate(
     Raises:
         DataError: no recording has events.
     """
-    from ctlev_core.picture_calibration import fit
+    from ctlev_core.sensor.picture_calibration import fit
 
     def simulate(rows: np.ndarray, size: SensorSize, update: dict) -> Iterator[Events]:
         tried = options.model_copy(update=update)
@@ -240,7 +240,7 @@ def frame_times_us(options: SampleOptions) -> np.ndarray:
 def _film(image: np.ndarray, row: int, sensor_size: SensorSize, options: SampleOptions, seed: int) -> Events:
     """The events of one picture."""
     from ctlev_core.render.panned_picture import pan
-    from ctlev_core.sensor import Sensor, join
+    from ctlev_core.sensor.dvs_pixel import Sensor, join
 
     times_us, moved_px = _frames(options.path_us, options.path_px, options.max_displacement_px)
     rng = np.random.default_rng(seed)
@@ -281,7 +281,7 @@ def _light(image: np.ndarray, options: SampleOptions) -> tuple[np.ndarray, float
 @functools.lru_cache(maxsize=4)
 def _sensor(sensor_size: SensorSize, options: SampleOptions) -> tuple[SensorOptions, PixelMaps]:
     """The kind of sensor, and the pixels of the one among them that all recordings are made with."""
-    from ctlev_core.sensor_options import SensorOptions, sample_pixel_maps
+    from ctlev_core.sensor.options import SensorOptions, sample_pixel_maps
 
     assert options.threshold is not None and options.threshold_off is not None
     kind = SensorOptions(

@@ -118,8 +118,8 @@ def _film(
     motions: BodyMotions, row: int, sensor_size: SensorSize, options: SampleOptions, seed: int, body: BodyModel
 ) -> Events:
     """The events of one row."""
-    from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
-    from ctlev_core.sensor import PRESETS
+    from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
+    from ctlev_core.sensor.dvs_pixel import PRESETS
 
     scene = _scene(motions, row, sensor_size, options, seed, body)
     start_us, stop_us = (int(time_us) for time_us in motions.t_us[row, [0, -1]])

@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from ctlev_core.adaptive_rendering import Patch
 from ctlev_core.body.layer import BodyModel, pose_offsets
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ctlev_core.render.motion_bound import (
@@ -18,6 +17,7 @@ from ctlev_core.render.motion_bound import (
     bound_turning,
 )
 from ctlev_core.render.scene import BodyPainter, Camera, Light, Subject
+from ctlev_core.sensor.adaptive_rendering import Patch
 from data_contracts.errors import DataError
 
 SEGMENTS_AT_ONCE = 64
@@ -27,7 +27,7 @@ SEGMENTS_AT_ONCE = 64
 class MovingBody:
     """A textured, lit body that moves between key poses before a still camera.
 
-    It is what `ctlev_core.adaptive_rendering.simulate_rendered` asks for pictures. Between two key poses each joint
+    It is what `ctlev_core.sensor.adaptive_rendering.simulate_rendered` asks for pictures. Between two key poses each joint
     turns about a fixed axis at constant speed, the shorter way, and the body shifts at constant speed; before the first
     and after the last it rests. An instance keeps pictures to draw on, so that several threads must not share it.
 

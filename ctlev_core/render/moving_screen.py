@@ -19,7 +19,7 @@ from data_contracts.events import SensorSize
 
 
 class MovingScreen:
-    """Pictures of a screen along a camera's path, for `ctlev_core.adaptive_rendering.simulate_rendered`.
+    """Pictures of a screen along a camera's path, for `ctlev_core.sensor.adaptive_rendering.simulate_rendered`.
 
     Args:
         screen: [h, w] linear intensity of the texels; the path starts from its middle.

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.sensor import (
+from ctlev_core.sensor.dvs_pixel import (
     PRESETS,
     EventBudgetError,
     Sensor,

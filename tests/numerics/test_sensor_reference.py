@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from ctlev_core.sensor import PRESETS, Sensor, SensorOptions, sample_pixel_maps, simulate_events
+from ctlev_core.sensor.dvs_pixel import PRESETS, Sensor, SensorOptions, sample_pixel_maps, simulate_events
 
 mp.dps = 40
 REAL_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "real"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ctlev_core.adaptive_rendering import Patch, RenderingOptions, simulate_rendered
-from ctlev_core.sensor import PRESETS, EventBudgetError, Sensor, SensorOptions, simulate_events
+from ctlev_core.sensor.adaptive_rendering import Patch, RenderingOptions, simulate_rendered
+from ctlev_core.sensor.dvs_pixel import PRESETS, EventBudgetError, Sensor, SensorOptions, simulate_events
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 

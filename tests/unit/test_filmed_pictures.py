@@ -9,7 +9,7 @@ from ctlev_core.events import files as event_files
 from ctlev_core.generators import filmed_pictures
 from ctlev_core.generators.filmed_pictures import UNCALIBRATED, SampleOptions, calibrate, frame_times_us, sample_events
 from ctlev_core.render.panned_picture import pan
-from ctlev_core.sensor import EventBudgetError
+from ctlev_core.sensor.dvs_pixel import EventBudgetError
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 from data_contracts.labels import Conditions

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from ctlev_core.adaptive_rendering import RenderingOptions, simulate_rendered
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.motion.procedural import pose_at, sample_style
 from ctlev_core.geometry.camera import camera_from_intrinsics, is_inside, orbit_rotation
@@ -25,7 +24,8 @@ from ctlev_core.render.scene import (
     sample_light,
     sample_subject,
 )
-from ctlev_core.sensor import PRESETS
+from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
+from ctlev_core.sensor.dvs_pixel import PRESETS
 from data_contracts.errors import DataError
 
 SIZE = (48, 36)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ctlev_core.plugins import PluginError
-from ctlev_core.sensor_options import read_preset as read_sensor_preset
+from ctlev_core.sensor.options import read_preset as read_sensor_preset
 from data_contracts.errors import DataError
 from flows.command_line import apply_override, read_preset
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ctlev_core.realism.summary import summarise_events
-from ctlev_core.sensor import PRESETS, SensorOptions, read_preset, sample_pixel_maps, simulate_events
-from ctlev_core.sensor_calibration import calibrate, main
+from ctlev_core.sensor.calibration import calibrate, main
+from ctlev_core.sensor.dvs_pixel import PRESETS, SensorOptions, read_preset, sample_pixel_maps, simulate_events
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 

@@ -9,7 +9,7 @@ from ctlev_core.body.layer import BUNDLED_BODY, load_body, pose_vertices
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.generators import smpl_esim
 from ctlev_core.render.normals import render_normals
-from ctlev_core.sensor import PRESETS, EventBudgetError, simulate_events
+from ctlev_core.sensor.dvs_pixel import PRESETS, EventBudgetError, simulate_events
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 from data_contracts.labels import BodyMotions, Conditions

@@ -12,7 +12,7 @@ from ctlev_core.body.layer import joint_transforms
 from ctlev_core.body.motion.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.datasets import studio
 from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_TO_DHP19
-from ctlev_core.sensor import PRESETS, EventBudgetError, simulate_events
+from ctlev_core.sensor.dvs_pixel import PRESETS, EventBudgetError, simulate_events
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 from data_contracts.labels import check_image_track, check_labels

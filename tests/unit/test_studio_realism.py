@@ -16,8 +16,8 @@ from ctlev_core import plugins
 from ctlev_core.events.files import read_events_file
 from ctlev_core.realism.distances import mean_distributions, wasserstein
 from ctlev_core.realism.summary import AXES, summarise_events
-from ctlev_core.sensor import PRESETS
-from ctlev_core.sensor_calibration import calibrate
+from ctlev_core.sensor.calibration import calibrate
+from ctlev_core.sensor.dvs_pixel import PRESETS
 from data_contracts.config import DatasetChoice
 
 PRESET = Path(__file__).resolve().parents[2] / "flows" / "presets" / "studio_person.yaml"

@@ -1,6 +1,6 @@
 """What a recording tells of the sensor that made it, written as a preset for the DVS pixel model.
 
-    python -m ctlev_core.sensor_calibration recording.aedat4 --out preset.yaml
+    python -m ctlev_core.sensor.calibration recording.aedat4 --out preset.yaml
 
 Events alone do not tell everything. What is measured, and from what:
 
@@ -39,7 +39,7 @@ import numpy as np
 
 from ctlev_core.realism import kernels
 from ctlev_core.realism.summary import HOT_FACTOR, HOT_MIN_EVENTS, RADIUS_US
-from ctlev_core.sensor_options import PRESETS, SensorOptions
+from ctlev_core.sensor.options import PRESETS, SensorOptions
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -250,10 +250,10 @@ def _measure_refractory(events: Events, base: SensorOptions, found: dict, measur
 
 
 def write_preset(path: Path, calibration: Calibration, recording: str) -> None:
-    """Write a YAML file that `ctlev_core.sensor.read_preset` reads, with what is measured and assumed as comments."""
+    """Write a YAML file that `ctlev_core.sensor.dvs_pixel.read_preset` reads, with what is measured and assumed as comments."""
     import yaml
 
-    lines = [f"# Sensor preset, estimated from {recording} by ctlev_core.sensor_calibration.", "# Measured:"]
+    lines = [f"# Sensor preset, estimated from {recording} by ctlev_core.sensor.calibration.", "# Measured:"]
     lines += [f"#   {name}: {value:.6g}" for name, value in calibration.measured.items()]
     lines += ["# Assumed, from the base preset:"]
     lines += [f"#   {name}: {reason}" for name, reason in calibration.assumed.items()]
@@ -264,10 +264,10 @@ def write_preset(path: Path, calibration: Calibration, recording: str) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """The command line."""
     from ctlev_core.events.files import read_events_file
-    from ctlev_core.sensor_options import read_preset
+    from ctlev_core.sensor.options import read_preset
 
     parser = argparse.ArgumentParser(
-        prog="python -m ctlev_core.sensor_calibration",
+        prog="python -m ctlev_core.sensor.calibration",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.sensor import EventBudgetError, Sensor, SensorOptions, join
+from ctlev_core.sensor.dvs_pixel import EventBudgetError, Sensor, SensorOptions, join
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events

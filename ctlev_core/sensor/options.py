@@ -92,7 +92,7 @@ PRESETS = {
         rate_spread=0.5,
         hot_pixel_fraction=0.0008,
     ),
-    # A DVXplorer indoors: what `ctlev_core.sensor_calibration` estimates, on the base `noisy`, from one recording of
+    # A DVXplorer indoors: what `ctlev_core.sensor.calibration` estimates, on the base `noisy`, from one recording of
     # 0.59 s of a person before such a camera, 320 x 240 px. Measured are leak, shot noise, its spread over pixels, hot
     # pixels, and the shortest interval, which is this sensor's period of readout rather than the silence of a pixel.
     # Thresholds, bandwidth and `log_floor` cannot be told from events and are those of `noisy`.
@@ -152,7 +152,7 @@ def sample_pixel_maps(sensor_size: SensorSize, options: SensorOptions, seed: int
 
 
 def read_preset(path: Path) -> SensorOptions:
-    """A kind of sensor from a YAML file of `SensorOptions`, such as `ctlev_core.sensor_calibration` writes.
+    """A kind of sensor from a YAML file of `SensorOptions`, such as `ctlev_core.sensor.calibration` writes.
 
     Raises:
         DataError: the file cannot be read, is not a table of options, or an option is unknown or out of range.

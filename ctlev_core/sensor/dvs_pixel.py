@@ -29,8 +29,8 @@ from __future__ import annotations
 import numpy as np
 
 from ctlev_core import sensor_columns
-from ctlev_core import sensor_kernels as kernels
-from ctlev_core.sensor_options import PRESETS, PixelMaps, SensorOptions, read_preset, sample_pixel_maps
+from ctlev_core.sensor import kernels
+from ctlev_core.sensor.options import PRESETS, PixelMaps, SensorOptions, read_preset, sample_pixel_maps
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
