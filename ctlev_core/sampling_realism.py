@@ -9,7 +9,7 @@ import numpy as np
 from ctlev_core.realism.distances import estimate_numbers
 from ctlev_core.realism.summary import summarise_frames
 from ctlev_core.realism.two_sample import C2ST, MIN_FRAMES, TwoSampleTest, compare_frames, compare_halves
-from ctlev_core.sampling_errors import HELD_OUT, OF_HALVES, Measurement
+from ctlev_core.statistics.sampling_errors import HELD_OUT, OF_HALVES, Measurement
 
 STATISTICS = ("active_pixel_share", "isolated_pixel_share")
 

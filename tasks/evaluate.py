@@ -11,18 +11,18 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.feature_distances import (
+from ctlev_core.frame_sequences import name_recordings
+from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
+from ctlev_core.scoring.pose import quotients
+from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, subject_groups
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, cluster_bootstrap, ratio_bootstrap
+from ctlev_core.statistics.feature_distances import (
     DISTANCE_ESTIMATES,
     DistanceEstimate,
     estimate_distances,
     estimates_table,
     name_distance,
 )
-from ctlev_core.frame_sequences import name_recordings
-from ctlev_core.intervals import MIN_RECORDINGS, cluster_bootstrap, ratio_bootstrap
-from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
-from ctlev_core.scoring.pose import quotients
-from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, subject_groups
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError

@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.paired_differences import share_of_gain
 from ctlev_core.provenance.records import Record, read_records, write_provenance
 from ctlev_core.provenance.scores import paired_samples, trace_scores
 from ctlev_core.realism.distances import DISTRIBUTIONS
@@ -41,6 +40,7 @@ from ctlev_core.report.sections.training_curves import prior_figures
 from ctlev_core.report.sections.verdict import verdict
 from ctlev_core.report.studies.paper_numbers import paper_section
 from ctlev_core.report.studies.summary import Figure, Summary, write_summary
+from ctlev_core.statistics.paired_differences import share_of_gain
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest
 from tasks.stage import Output, stage

@@ -13,7 +13,9 @@ import pyarrow as pa
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import STOCHASTIC
 from ctlev_core.events.windows import spread
-from ctlev_core.sampling_errors import (
+from ctlev_core.sampling_realism import realism_of_real, realism_of_samples
+from ctlev_core.seeds import row_seeds
+from ctlev_core.statistics.sampling_errors import (
     CPU,
     EXACT,
     FLOAT64,
@@ -30,8 +32,6 @@ from ctlev_core.sampling_errors import (
     label_error,
     pixel_error,
 )
-from ctlev_core.sampling_realism import realism_of_real, realism_of_samples
-from ctlev_core.seeds import row_seeds
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice, SamplingChoice
 from data_contracts.labels import Conditions

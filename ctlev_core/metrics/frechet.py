@@ -2,7 +2,7 @@
 
 The features come from the caller, who has to name the extractor beside the score: distances under different
 extractors do not compare, and only Inception's may be called FID. Values of sets of different sizes do not compare
-either; `fd_infinity` and `kid` do. How sure a value is says `ctlev_core.feature_distances`.
+either; `fd_infinity` and `kid` do. How sure a value is says `ctlev_core.statistics.feature_distances`.
 
 Instead of the real training frames, a file may be the reference: mean and covariance of features of a published set, as
 pytorch-fid writes them. It does not say which extractor they are from, nor of how many images: that has to be known.

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.intervals import MIN_RECORDINGS
 from ctlev_core.realism.summary import AXES, Summary
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from data_contracts.tables import Column, TableSchema
 
 DISTRIBUTIONS = TableSchema(

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.intervals import MIN_RECORDINGS
 from ctlev_core.realism.roc import HeldOut, interval_of_mean_area
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from data_contracts.tables import Column, TableSchema
 
 C2ST = "c2st"

@@ -41,7 +41,7 @@ def frechet_distance(features_a: np.ndarray, features_b: np.ndarray, *, toleranc
     """Squared Frechet distance between the Gaussians fitted to two sets of features; 0 for identical sets.
 
     Covariances are the unbiased ones (n - 1). The estimate is biased upwards for small sets: give n and d beside it
-    (`ctlev_core.feature_distances`).
+    (`ctlev_core.statistics.feature_distances`).
 
     Args:
         features_a: [N, D] real numbers, N >= 2.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.feature_distances import DISTANCE_ESTIMATES, estimate_distances, estimates_table
 from ctlev_core.metrics import frechet
 from ctlev_core.report.sections.distances import floor_tables
+from ctlev_core.statistics.feature_distances import DISTANCE_ESTIMATES, estimate_distances, estimates_table
 
 
 class Scores:

@@ -4,8 +4,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, precision_score, recall_score
 
-from ctlev_core.intervals import bootstrap_interval, cluster_bootstrap, compute_spread, ratio_bootstrap, score_text
 from ctlev_core.metrics import classification, frechet, mpjpe2d, oks, pck2d
+from ctlev_core.statistics.bootstrap import (
+    bootstrap_interval,
+    cluster_bootstrap,
+    compute_spread,
+    ratio_bootstrap,
+    score_text,
+)
 from data_contracts.labels import Labels
 
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.feature_distances import DISTANCE_ESTIMATES, estimate_distances, estimates_table
 from ctlev_core.metrics import fd_infinity, frechet, kid, prdc
 from ctlev_core.scoring.frechet import frechet_distance
 from ctlev_core.scoring.kid import kernel_distance
 from ctlev_core.scoring.prdc import neighbour_scores
+from ctlev_core.statistics.feature_distances import DISTANCE_ESTIMATES, estimate_distances, estimates_table
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.tables import check_table

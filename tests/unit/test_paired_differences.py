@@ -5,8 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctlev_core.intervals import bootstrap_interval
-from ctlev_core.paired_differences import Difference, Trainings, paired_difference, share_of_gain, unpaired_difference
+from ctlev_core.statistics.bootstrap import bootstrap_interval
+from ctlev_core.statistics.paired_differences import (
+    Difference,
+    Trainings,
+    paired_difference,
+    share_of_gain,
+    unpaired_difference,
+)
 
 
 def trainings(values, recordings=None, digest="d"):

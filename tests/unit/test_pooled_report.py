@@ -8,11 +8,11 @@ import pytest
 from pooled_study import DRAWS, NUM_GENERATORS, pooled_groups, write_pooled_study
 from report_artefacts import SETTINGS, Experiment
 
-from ctlev_core.paired_differences import Difference
 from ctlev_core.plugins import PluginError
-from ctlev_core.pooled_scores import DrawsDiffer
 from ctlev_core.report.page.tables import split_number
 from ctlev_core.report.sections.verdict import in_range
+from ctlev_core.statistics.paired_differences import Difference
+from ctlev_core.statistics.pooled_scores import DrawsDiffer
 from data_contracts.manifest import Manifest, ManifestRef
 from data_contracts.study import Study
 from flows.studies import load_study

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from pooled_tables import samples_table, simulate_draws
 
-from ctlev_core.pooled_scores import DrawsDiffer, PooledScores, pool_values
+from ctlev_core.statistics.pooled_scores import DrawsDiffer, PooledScores, pool_values
 
 REAL, SYNTHETIC = "real", "real+synthetic"
 EFFECTS = {REAL: 0.5, SYNTHETIC: 0.6}
@@ -74,7 +74,7 @@ def test_without_a_spread_between_draws_that_of_trainings_is_covered():
 )
 def test_intervals_of_three_draws_cover_the_truth(monkeypatch, spread):
     """Nominal 95 %. On these 300 studies each, differences: 97, 96 and 96 %; scores: 98, 97 and 98 %."""
-    monkeypatch.setattr("ctlev_core.pooled_scores.NUM_RESAMPLES", 1000)
+    monkeypatch.setattr("ctlev_core.statistics.pooled_scores.NUM_RESAMPLES", 1000)
     random, runs = np.random.default_rng(11), 300
     covered = np.zeros(2)
     for run in range(runs):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import sqrtm
 
-from ctlev_core.sampling_errors import (
+from ctlev_core.statistics.sampling_errors import (
     CONVERGED,
     CPU,
     EXCESS,

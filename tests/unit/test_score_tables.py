@@ -4,7 +4,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from ctlev_core.paired_differences import Difference
 from ctlev_core.provenance.scores import paired_samples
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.scaling import ScalePoint, scaling_figure, scaling_points
@@ -17,6 +16,7 @@ from ctlev_core.report.sections.score_tables import (
     score_tables,
 )
 from ctlev_core.report.sections.verdict import verdict
+from ctlev_core.statistics.paired_differences import Difference
 
 METRIC = "mpjpe2d_px"
 NAMES = [f"s{number}" for number in range(40)]

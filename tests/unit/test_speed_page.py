@@ -9,7 +9,7 @@ from ctlev_core.report.page.html import Curves, render_report
 from ctlev_core.report.studies.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
 from ctlev_core.report.studies.speed_summary import SUMMARY_FILE, SpeedSummary, read_speed_summary, write_speed_summary
 from ctlev_core.report.studies.speed_vs_error import SpeedPage, recommend
-from ctlev_core.sampling_errors import (
+from ctlev_core.statistics.sampling_errors import (
     CONTROLNET,
     CONVERGED,
     EXCESS,

@@ -11,7 +11,6 @@ import yaml
 from report_artefacts import SETTINGS, Experiment
 
 from ctlev_core.datasets import studio_objects
-from ctlev_core.paired_differences import Difference
 from ctlev_core.plugins import PluginError, load_options
 from ctlev_core.report.page.html import Animation, Curves, ImageGrid, Step
 from ctlev_core.report.page.report_files import publish_report
@@ -29,6 +28,7 @@ from ctlev_core.report.studies.study import (
     study_words,
 )
 from ctlev_core.report.studies.summary import SUMMARY_FILE, Summary, read_summary, write_summary
+from ctlev_core.statistics.paired_differences import Difference
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment as Options
 from data_contracts.manifest import Manifest, ManifestRef

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ctlev_core.intervals import score_text
 from ctlev_core.report.page.html import ImageGrid, Section, Table
 from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
+from ctlev_core.statistics.bootstrap import score_text
 from data_contracts.manifest import Manifest
 
 _CAPTION = (

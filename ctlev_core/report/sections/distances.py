@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ctlev_core.feature_distances import DISTANCE_ESTIMATES
-from ctlev_core.intervals import score_text
 from ctlev_core.report.page.tables import Cell, Table
+from ctlev_core.statistics.bootstrap import score_text
+from ctlev_core.statistics.feature_distances import DISTANCE_ESTIMATES
 from data_contracts.manifest import Manifest
 
 _CAPTION = (

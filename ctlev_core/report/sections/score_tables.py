@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.intervals import score_text
-from ctlev_core.paired_differences import Difference, Trainings, paired_difference, read_trainings
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.verdict import in_words, lower_is_better
+from ctlev_core.statistics.bootstrap import score_text
+from ctlev_core.statistics.paired_differences import Difference, Trainings, paired_difference, read_trainings
 from data_contracts.experiment import LABELS_OF, SHUFFLED
 
 Row = dict[str, Any]

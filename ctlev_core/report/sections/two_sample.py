@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ctlev_core.intervals import score_text
 from ctlev_core.realism.two_sample import MIN_FRAMES
 from ctlev_core.report.page.tables import Cell, Table
+from ctlev_core.statistics.bootstrap import score_text
 
 _CAPTION = (
     "A small network learns from half of the recordings which of two sets a frame is from. Area: under the ROC curve "

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.intervals import score_text
-from ctlev_core.paired_differences import Difference
+from ctlev_core.statistics.bootstrap import score_text
+from ctlev_core.statistics.paired_differences import Difference
 
 __all__ = ["Difference", "lower_is_better", "made_better", "verdict"]
 from data_contracts.experiment import LABELS_OF, SHUFFLED

@@ -15,13 +15,13 @@ from functools import cached_property
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.intervals import score_text
-from ctlev_core.paired_differences import Difference
-from ctlev_core.pooled_scores import PooledScores, pool_values
 from ctlev_core.report.page.html import Curves, Folded, Section
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.verdict import in_range, in_words, lower_is_better, made_better
 from ctlev_core.report.studies.study import Part
+from ctlev_core.statistics.bootstrap import score_text
+from ctlev_core.statistics.paired_differences import Difference
+from ctlev_core.statistics.pooled_scores import PooledScores, pool_values
 from data_contracts.experiment import LABELS_OF
 
 REAL, OWN, BOTH = "real", "synthetic", "real+synthetic"

@@ -19,18 +19,18 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.paired_differences import (
+from ctlev_core.provenance.records import Record, options_of, read_provenance, versions_of
+from ctlev_core.provenance.scores import PAIRED_SAMPLES, TRACED_SCORES
+from ctlev_core.report.page.tables import Cell, Table
+from ctlev_core.report.sections.score_tables import cell_text, interval_over_trainings
+from ctlev_core.report.sections.verdict import lower_is_better
+from ctlev_core.statistics.paired_differences import (
     Difference,
     Trainings,
     paired_difference,
     read_trainings,
     unpaired_difference,
 )
-from ctlev_core.provenance.records import Record, options_of, read_provenance, versions_of
-from ctlev_core.provenance.scores import PAIRED_SAMPLES, TRACED_SCORES
-from ctlev_core.report.page.tables import Cell, Table
-from ctlev_core.report.sections.score_tables import cell_text, interval_over_trainings
-from ctlev_core.report.sections.verdict import lower_is_better
 from data_contracts.errors import DataError
 from data_contracts.tables import TableSchema, check_table
 

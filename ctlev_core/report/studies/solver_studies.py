@@ -7,7 +7,7 @@ from typing import Any
 
 from ctlev_core.report.page.html import Section, Table
 from ctlev_core.report.studies.measurement_charts import Row, chart, find_row, lines_of, rows_of
-from ctlev_core.sampling_errors import (
+from ctlev_core.statistics.sampling_errors import (
     CPU,
     EXACT,
     FLOAT64,

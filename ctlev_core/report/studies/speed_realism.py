@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from ctlev_core.intervals import score_text
 from ctlev_core.realism.two_sample import C2ST, MIN_FRAMES
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.studies.measurement_charts import REFERENCE_LINE, Row, find_row
-from ctlev_core.sampling_errors import HELD_OUT, OF_HALVES
 from ctlev_core.sampling_realism import STATISTICS
+from ctlev_core.statistics.bootstrap import score_text
+from ctlev_core.statistics.sampling_errors import HELD_OUT, OF_HALVES
 
 _CAPTION = (
     "c2st: area under the ROC curve of a small network that tells the frames from held-out real ones; 0.5 = it cannot, "

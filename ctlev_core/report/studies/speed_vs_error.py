@@ -22,7 +22,7 @@ from ctlev_core.report.studies.measurement_charts import (
 )
 from ctlev_core.report.studies.solver_studies import exact_score_sections, precision_sections
 from ctlev_core.report.studies.speed_realism import realism_table
-from ctlev_core.sampling_errors import (
+from ctlev_core.statistics.sampling_errors import (
     CONTROLNET,
     CONVERGED,
     CPU,

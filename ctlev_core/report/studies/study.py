@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from ctlev_core.paired_differences import Difference
 from ctlev_core.report.page.html import Folded, Section, Text
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import PairedScores, cell_text, score_tables, trained_rows
@@ -16,6 +15,7 @@ from ctlev_core.report.sections.verdict import in_words, lower_is_better, made_b
 from ctlev_core.report.studies import paper_numbers
 from ctlev_core.report.studies.speed_summary import SpeedSummary
 from ctlev_core.report.studies.summary import Figure, Summary
+from ctlev_core.statistics.paired_differences import Difference
 
 Row = dict[str, Any]
 _QUESTIONS = (

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctlev_core import plugins
-from ctlev_core.feature_distances import DistanceEstimate, estimate_distances
-from ctlev_core.intervals import MIN_RECORDINGS, bootstrap_interval
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, bootstrap_interval
+from ctlev_core.statistics.feature_distances import DistanceEstimate, estimate_distances
 from data_contracts.labels import Labels
 
 HELD_OUT, REFERENCE, CONVERGED, LABELS = "held-out real frames", "reference", "converged solution", "labels asked for"

@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.intervals import MIN_RECORDINGS
 from ctlev_core.plugins import Plugin
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from data_contracts.tables import Column, TableSchema
 
 DISTANCE_ESTIMATES = TableSchema(

@@ -35,8 +35,8 @@ import numpy as np
 import pyarrow as pa
 from scipy.stats import t as student
 
-from ctlev_core.intervals import MIN_RECORDINGS
-from ctlev_core.paired_differences import NUM_RESAMPLES, Difference
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
+from ctlev_core.statistics.paired_differences import NUM_RESAMPLES, Difference
 from data_contracts.errors import DataError
 from data_contracts.experiment import LABELS_OF, SHUFFLED
 

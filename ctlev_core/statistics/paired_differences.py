@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.intervals import MIN_RECORDINGS, score_text
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, score_text
 
 NUM_RESAMPLES = 4000
 _CHUNK_NUMBERS = 4_000_000
