@@ -22,7 +22,7 @@ import numpy as np
 
 from ctlev_core.body.motion.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.sensor_choice import read_sensor, sensor_preset_files
-from ctlev_core.studio_options import Options
+from ctlev_core.studio.options import Options
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
@@ -30,8 +30,8 @@ from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_lab
 if TYPE_CHECKING:
     from ctlev_core.body.motion.procedural import MotionStyle
     from ctlev_core.geometry.camera import Camera
-    from ctlev_core.render.moving_body import MovingBody
-    from ctlev_core.render.scene import Subject
+    from ctlev_core.studio.moving_body import MovingBody
+    from ctlev_core.studio.scene import Subject
 
 __all__ = [
     "MOTIONS_OF_SPLIT", "SPLIT_NAMES", "VERSION", "Options", "list_recordings", "read_events", "read_intensity_frames",
@@ -202,7 +202,7 @@ def _camera(entropy: list[int], number: int, count: int, joints: np.ndarray, opt
 
 def _subject(recording: Recording, entropy: list[int], options: Options) -> Subject:
     """The person; a subject looks the same in all recordings, and a stranger is seen once."""
-    from ctlev_core.render.scene import sample_subject
+    from ctlev_core.studio.scene import sample_subject
 
     is_stranger = recording.subject.startswith("stranger")
     number = entropy[1:] if is_stranger else [int(recording.subject.removeprefix("subject"))]
@@ -212,8 +212,8 @@ def _subject(recording: Recording, entropy: list[int], options: Options) -> Subj
 def _film(recording: Recording, options: Options) -> MovingBody:
     """The person in motion, under a light and before a wall drawn at random."""
     from ctlev_core.body.motion.procedural import pose_at
-    from ctlev_core.render.moving_body import MovingBody
-    from ctlev_core.render.scene import sample_background, sample_light
+    from ctlev_core.studio.moving_body import MovingBody
+    from ctlev_core.studio.scene import sample_background, sample_light
 
     performance = _perform(recording, options)
     *entropy, number = _entropy(recording, options)

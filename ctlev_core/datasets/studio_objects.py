@@ -23,21 +23,21 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator
 
-from ctlev_core.render.camera_paths import Motion, sample_camera_path
-from ctlev_core.render.objects import COLOURS, NAMES, OBJECTS
 from ctlev_core.sensor_choice import check_sensor_preset, read_sensor, sensor_preset_files
+from ctlev_core.studio.camera_paths import Motion, sample_camera_path
+from ctlev_core.studio.objects import COLOURS, NAMES, OBJECTS
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording
 
 if TYPE_CHECKING:
-    from ctlev_core.render.moving_screen import MovingScreen
+    from ctlev_core.studio.moving_screen import MovingScreen
 
 VERSION = 1
 
 CLASSES = tuple(NAMES)
-"""The ordinary classes, nouns of `ctlev_core.render.objects.OBJECTS` with outlines of their own."""
+"""The ordinary classes, nouns of `ctlev_core.studio.objects.OBJECTS` with outlines of their own."""
 
 UNSEEN = ("banana", "bird", "book", "bottle", "bridge", "bus", "camera", "hat", "heart", "mushroom")
 """The zero-shot classes: other nouns, which look like none of the ordinary ones. Each has one name."""
@@ -54,7 +54,7 @@ COMPOSITIONS = (
     "moon with tower",
     "star on house",
 )
-"""Harder zero-shot classes, compositions of `ctlev_core.render.compositions`; two differ in the arrangement alone."""
+"""Harder zero-shot classes, compositions of `ctlev_core.studio.compositions`; two differ in the arrangement alone."""
 
 HELD_OUT = UNSEEN + COMPOSITIONS
 
@@ -196,7 +196,7 @@ def moving_screen(recording: Recording, options: Options) -> MovingScreen:
     Raises:
         DataError: the recording is not one of this set with these options, or carries labels only.
     """
-    from ctlev_core.render.moving_screen import MovingScreen
+    from ctlev_core.studio.moving_screen import MovingScreen
 
     entropy = _entropy(recording, options)
     if not recording.has_events:
@@ -221,9 +221,9 @@ def _draw_screen(
     class_name: str, size: tuple[int, int], size_range: tuple[float, float], rng: np.random.Generator
 ) -> np.ndarray:
     """Linear intensity [h, w] of a drawing in the middle of a screen of `size` (width, height)."""
-    from ctlev_core.render.compositions import parse_composition
-    from ctlev_core.render.object_drawing import draw_composition, draw_object
-    from ctlev_core.render.scene import sample_background
+    from ctlev_core.studio.compositions import parse_composition
+    from ctlev_core.studio.object_drawing import draw_composition, draw_object
+    from ctlev_core.studio.scene import sample_background
 
     canvas = (sample_background(rng, size, colour=True) ** (1 / GAMMA) * 255).astype(np.uint8)
     colours = _visible_colours(canvas)

@@ -11,7 +11,7 @@ the other generators get.
 
 How we differ:
 
-- People, light and background are procedural (`ctlev_core.render.scene`) in place of scanned textures and photographs,
+- People, light and background are procedural (`ctlev_core.studio.scene`) in place of scanned textures and photographs,
   and the body is the bundled one unless a licensed SMPL file is given.
 - The next picture is due when something may have moved by `max_displacement_px`, as with ESIM's sampling by optic flow.
   There the flow is that of the last picture; here it is a bound over the interval to come. Between key poses joints
@@ -37,7 +37,7 @@ from data_contracts.labels import BodyMotions, Conditions, check_body_motions
 
 if TYPE_CHECKING:
     from ctlev_core.body.layer import BodyModel
-    from ctlev_core.render.moving_body import MovingBody
+    from ctlev_core.studio.moving_body import MovingBody
 
 VERSION = 1
 MIN_INTERVAL_US, MAX_INTERVAL_US = 100, 20_000
@@ -156,8 +156,8 @@ def _scene(
     """
     from ctlev_core.body.rotations import matrix_from_axis_angle
     from ctlev_core.geometry.camera import camera_from_intrinsics
-    from ctlev_core.render.moving_body import MovingBody
-    from ctlev_core.render.scene import sample_background, sample_light, sample_subject
+    from ctlev_core.studio.moving_body import MovingBody
+    from ctlev_core.studio.scene import sample_background, sample_light, sample_subject
 
     rng = np.random.default_rng(seed)
     subject = replace(sample_subject(rng, colour=False, body=body), betas=motions.smpl_betas[row])

@@ -10,8 +10,8 @@ from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_PRIOR, BUNDLED_
 from ctlev_core.diffusion.pretraining import picture_styles, procedural_images
 from ctlev_core.diffusion.pretraining.pretraining import Row, make_batch
 from ctlev_core.generators import stable_diffusion
-from ctlev_core.render.object_drawing import draw_object
-from ctlev_core.render.objects import NAMES, OBJECTS
+from ctlev_core.studio.object_drawing import draw_object
+from ctlev_core.studio.objects import NAMES, OBJECTS
 
 LINES = picture_styles.Diet(styles={"lines": 1.0})
 NOUNS = tuple(NAMES)

@@ -12,9 +12,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.motion.procedural import pose_at, sample_style
 from ctlev_core.geometry.camera import camera_from_intrinsics, is_inside, orbit_rotation
-from ctlev_core.render.moving_body import MovingBody
 from ctlev_core.render.rasteriser import NEAR_M, render_attributes
-from ctlev_core.render.scene import (
+from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
+from ctlev_core.sensor.dvs_pixel import PRESETS
+from ctlev_core.studio.moving_body import MovingBody
+from ctlev_core.studio.scene import (
     BOUNCE_LIGHT,
     SUPERSAMPLING,
     Camera,
@@ -24,8 +26,6 @@ from ctlev_core.render.scene import (
     sample_light,
     sample_subject,
 )
-from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
-from ctlev_core.sensor.dvs_pixel import PRESETS
 from data_contracts.errors import DataError
 
 SIZE = (48, 36)

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.render.camera_paths import MOTIONS, CameraPath, sample_camera_path
-from ctlev_core.render.moving_screen import MovingScreen
 from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
 from ctlev_core.sensor.options import SensorOptions
+from ctlev_core.studio.camera_paths import MOTIONS, CameraPath, sample_camera_path
+from ctlev_core.studio.moving_screen import MovingScreen
 from data_contracts.errors import DataError
 
 

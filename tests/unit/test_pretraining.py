@@ -11,9 +11,9 @@ from ctlev_core.diffusion.pretraining.architecture import WORD_GAIN, learn_merge
 from ctlev_core.diffusion.pretraining.picture_styles import Diet
 from ctlev_core.diffusion.pretraining.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
 from ctlev_core.diffusion.training.options import TrainingOptions
-from ctlev_core.render.compositions import RELATIONS, parse_composition
-from ctlev_core.render.object_drawing import draw_object
-from ctlev_core.render.objects import COLOURS, NAMES, OBJECTS
+from ctlev_core.studio.compositions import RELATIONS, parse_composition
+from ctlev_core.studio.object_drawing import draw_object
+from ctlev_core.studio.objects import COLOURS, NAMES, OBJECTS
 from data_contracts.errors import TrainingError
 
 TINY = PretrainingOptions(

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.labelled_pictures import StyleShares
-from ctlev_core.render.objects import NAMES
+from ctlev_core.studio.objects import NAMES
 from data_contracts.config import Frozen
 
 SAY_STYLE_SHARE = 0.6

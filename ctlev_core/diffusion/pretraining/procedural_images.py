@@ -2,7 +2,7 @@
 
 Half of the pictures are people: colour renderings of the procedural body in random poses and in poses of the procedural
 motions that are not held out for tests, with what a ControlNet is steered by: the skeleton in the manner of OpenPose,
-or the map of the body's normals. The others are everyday objects (`ctlev_core.render.objects`), alone or two together
+or the map of the body's normals. The others are everyday objects (`ctlev_core.studio.objects`), alone or two together
 as a `Composition` says, without such a condition. A scene is drawn once and shown in several styles: photograph, grey
 photograph, line drawing on black, coloured line drawing. A network that knows outlines needs far fewer event images to
 learn what an event camera sees.
@@ -32,11 +32,11 @@ from ctlev_core.geometry.camera import is_inside, project
 from ctlev_core.geometry.joint_sets import SMPL_JOINTS, SMPL_TO_DHP19
 from ctlev_core.geometry.random_cameras import CameraRange, sample_camera
 from ctlev_core.labels.body_views import labels_in_camera
-from ctlev_core.render.compositions import RELATIONS, all_compositions
-from ctlev_core.render.object_drawing import draw_composition, draw_object
-from ctlev_core.render.objects import COLOURS, OBJECTS
-from ctlev_core.render.scene import render_person, sample_background, sample_subject
 from ctlev_core.render.skeleton import draw_skeleton
+from ctlev_core.studio.compositions import RELATIONS, all_compositions
+from ctlev_core.studio.object_drawing import draw_composition, draw_object
+from ctlev_core.studio.objects import COLOURS, OBJECTS
+from ctlev_core.studio.scene import render_person, sample_background, sample_subject
 
 ConditionKind = Literal["skeleton", "normals"]
 MOTION_SHARE = 0.55

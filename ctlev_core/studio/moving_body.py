@@ -9,15 +9,15 @@ import numpy as np
 
 from ctlev_core.body.layer import BodyModel, pose_offsets
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from ctlev_core.render.motion_bound import (
+from ctlev_core.sensor.adaptive_rendering import Patch
+from ctlev_core.studio.motion_bound import (
     SEGMENT_TURN_RAD,
     bound_acceleration,
     bound_correctives,
     bound_speeds,
     bound_turning,
 )
-from ctlev_core.render.scene import BodyPainter, Camera, Light, Subject
-from ctlev_core.sensor.adaptive_rendering import Patch
+from ctlev_core.studio.scene import BodyPainter, Camera, Light, Subject
 from data_contracts.errors import DataError
 
 SEGMENTS_AT_ONCE = 64
@@ -126,7 +126,7 @@ class MovingBody:
         """A speed in px/s that no vertex in the picture exceeds between two times, start before stop.
 
         The interval touches short segments of time. In each, it is the largest mean speed of a projected vertex, plus
-        what the speed of a vertex may differ from its mean, for which `ctlev_core.render.motion_bound` has a bound.
+        what the speed of a vertex may differ from its mean, for which `ctlev_core.studio.motion_bound` has a bound.
         What moves outside of the picture, where no part of it can be seen, does not count.
         """
         ends_s, speeds_px_s = self._segments

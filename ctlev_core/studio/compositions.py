@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import permutations
 
-from ctlev_core.render.objects import OBJECTS
+from ctlev_core.studio.objects import OBJECTS
 
 RELATIONS = ("on", "with")
 """Words that the tokenizer of the bundled prior has as a whole."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.render.camera_paths import CameraPath
+from ctlev_core.studio.camera_paths import CameraPath
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
 

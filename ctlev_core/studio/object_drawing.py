@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ctlev_core.render.compositions import Composition
-from ctlev_core.render.objects import COLOURS, OBJECTS, Part
+from ctlev_core.studio.compositions import Composition
+from ctlev_core.studio.objects import COLOURS, OBJECTS, Part
 
 SUPERSAMPLING = 4
 LINE_SHARE = 0.9

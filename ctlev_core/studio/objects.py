@@ -2,7 +2,7 @@
 
 Every noun is a tuple of parts in a square of [-1, 1] x [-1, 1], x right and y down. A part is a filled polygon, a
 filled ellipse or a thick line, with a tone: 1 takes the object's colour, below 1 darkens it, above 1 lightens it.
-`ctlev_core.render.object_drawing` draws them.
+`ctlev_core.studio.object_drawing` draws them.
 """
 
 from __future__ import annotations
