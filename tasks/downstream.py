@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.frame_sequences import name_recordings
+from ctlev_core.supervised.frame_sequences import name_recordings
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
 from data_contracts.errors import DataError

@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.frame_sequences import name_recordings
 from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
 from ctlev_core.scoring.pose import quotients
 from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, subject_groups
@@ -23,6 +22,7 @@ from ctlev_core.statistics.feature_distances import (
     estimates_table,
     name_distance,
 )
+from ctlev_core.supervised.frame_sequences import name_recordings
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.networks.resnet_files import ARCHITECTURES, SMALL_CNN, check_batch, check_resnet_folder
-from ctlev_core.supervised_options import SupervisedOptions
+from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import History, Labels
@@ -94,22 +94,22 @@ def train(
     """
     import torch
 
-    from ctlev_core import supervised
-    from ctlev_core.supervised_training import train_model
-    from ctlev_core.training_rows import plan_rows
+    from ctlev_core.supervised import models
+    from ctlev_core.supervised.batches import plan_rows
+    from ctlev_core.supervised.loop import train_model
 
     classes, targets = _check_training_set(frames, labels, options)
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups, classes=targets)
-    weights = supervised.file_digests(input_files(options))
-    device = supervised.resolve_device(options.device)
-    model = supervised.build_seeded(lambda: _build_from_options(len(classes), options), seed).to(device)
+    weights = models.file_digests(input_files(options))
+    device = models.resolve_device(options.device)
+    model = models.build_seeded(lambda: _build_from_options(len(classes), options), seed).to(device)
 
     def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
         batch = frames[rows]
         if options.flip and generator is not None:
             mirror = generator.random(len(rows)) < 0.5
             batch = np.where(mirror[:, None, None, None], batch[:, :, ::-1], batch)
-        with supervised.mixed_precision(options, device):
+        with models.mixed_precision(options, device):
             logits = model(_to_input(torch.from_numpy(batch).to(device)))
         return torch.nn.functional.cross_entropy(logits.float(), torch.from_numpy(targets[rows]).to(device))
 
@@ -120,7 +120,7 @@ def train(
         options,
         seed=seed,
         work=work,
-        run_digest=supervised.digest(NAME, VERSION, cache_material(options), weights, seed, frames, targets),
+        run_digest=models.digest(NAME, VERSION, cache_material(options), weights, seed, frames, targets),
         description="train classifier",
     )
     config = {
@@ -132,7 +132,7 @@ def train(
         "weights": weights,
         "training": record,
     }
-    supervised.write_model(out, model, config)
+    models.write_model(out, model, config)
     return history
 
 
@@ -159,10 +159,10 @@ def predict_recordings(model: Path, frames: np.ndarray, recordings: Sequence[str
         frames: [N, H, W, 3] uint8.
         recordings: [N] the recording of each frame.
     """
-    from ctlev_core import supervised
+    from ctlev_core.supervised import models
 
     found = predict(model, frames)
-    if not supervised.read_config(model, NAME)["options"]["by_recording"]:
+    if not models.read_config(model, NAME)["options"]["by_recording"]:
         return found
     names, index = np.unique(np.asarray(recordings), return_inverse=True)
     sums = np.zeros((len(names), found["probability"].shape[1]))
@@ -178,7 +178,7 @@ def features(model: Path, frames: np.ndarray) -> np.ndarray:
 
 
 def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) -> tuple[tuple[str, ...], np.ndarray]:
-    from ctlev_core.supervised import check_frames
+    from ctlev_core.supervised.models import check_frames
 
     where = "train classifier"
     check_frames(frames, where)
@@ -223,19 +223,19 @@ def _num_features(shape: dict[str, Any]) -> int:
 
 
 def _read_model(folder: Path) -> tuple[Any, dict[str, Any]]:
-    from ctlev_core import supervised
+    from ctlev_core.supervised import models
 
-    config = supervised.read_config(folder, NAME)
+    config = models.read_config(folder, NAME)
     network = _build(config["shape"], len(config["classes"]), config["options"]["head_width"])
-    supervised.read_weights(folder, network)
-    return network.to(supervised.resolve_device("auto")), config
+    models.read_weights(folder, network)
+    return network.to(models.resolve_device("auto")), config
 
 
 def _run(network: Any, function: Any, frames: np.ndarray) -> np.ndarray:
-    from ctlev_core import supervised
+    from ctlev_core.supervised import models
 
-    supervised.check_frames(frames, "predict classifier")
-    batches = supervised.predict_in_batches(network, lambda images: function(_to_input(images)).cpu().numpy(), frames)
+    models.check_frames(frames, "predict classifier")
+    batches = models.predict_in_batches(network, lambda images: function(_to_input(images)).cpu().numpy(), frames)
     return np.concatenate(batches) if batches else np.zeros(0, np.float32)
 
 

@@ -61,7 +61,7 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
         DataError: the folder is of another model, its file has changed, or frames are no images.
     """
     from ctlev_core.networks.inception import load_inception
-    from ctlev_core.supervised import resolve_device
+    from ctlev_core.supervised.models import resolve_device
 
     feature_extractors.read_extractor(model, NAME)
     place: Any = resolve_device(device)

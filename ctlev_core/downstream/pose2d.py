@@ -17,7 +17,7 @@ from pydantic import Field
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.image_shifts import shift_images
-from ctlev_core.supervised_options import SupervisedOptions
+from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import History, Labels, check_labels
@@ -110,17 +110,17 @@ def train(
     Raises:
         DataError: shapes disagree, no joint of any row is visible inside the image, or the weights do not fit.
     """
-    from ctlev_core import supervised
     from ctlev_core.networks.dhp19 import load_published
-    from ctlev_core.supervised_training import train_model
-    from ctlev_core.training_rows import plan_rows
+    from ctlev_core.supervised import models
+    from ctlev_core.supervised.batches import plan_rows
+    from ctlev_core.supervised.loop import train_model
 
     joints2d, visible = _check_training_set(frames, labels, options)
-    weights = supervised.file_digests(input_files(options))
+    weights = models.file_digests(input_files(options))
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
     grey = _grey(frames)
-    device = supervised.resolve_device(options.device)
-    model: Any = supervised.build_seeded(lambda: _build(joints2d.shape[1], options), seed)
+    device = models.resolve_device(options.device)
+    model: Any = models.build_seeded(lambda: _build(joints2d.shape[1], options), seed)
     if options.weights:
         load_published(model, options.weights)
     model.to(device)
@@ -135,7 +135,7 @@ def train(
             if mirror is not None:
                 images, points, seen = _flip_half(images, points, seen, mirror, generator)
         inside = seen & _inside(points, grey.shape[1:])
-        with supervised.mixed_precision(options, device):
+        with models.mixed_precision(options, device):
             heatmaps = model(_to_input(torch.from_numpy(images).to(device)))
         points_tensor = torch.from_numpy(np.where(inside[..., None], points, 0).astype(np.float32)).to(device)
         return _heatmap_loss(heatmaps.float(), points_tensor, torch.from_numpy(inside).to(device), options)
@@ -147,10 +147,10 @@ def train(
         options,
         seed=seed,
         work=work,
-        run_digest=supervised.digest(NAME, VERSION, cache_material(options), weights, seed, grey, joints2d, visible),
+        run_digest=models.digest(NAME, VERSION, cache_material(options), weights, seed, grey, joints2d, visible),
         description="train pose2d",
     )
-    supervised.write_model(
+    models.write_model(
         out,
         model,
         {
@@ -176,15 +176,15 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
         `joints2d` [N, J, 2] float32, px, pixel centres at integer + 0.5, and `confidence` [N, J] float32, the highest
         value of the heatmap (of its softmax with the cross-entropy loss).
     """
-    from ctlev_core import supervised
+    from ctlev_core.supervised import models
 
-    supervised.check_frames(frames, "predict pose2d")
-    config = supervised.read_config(model, NAME)
+    models.check_frames(frames, "predict pose2d")
+    config = models.read_config(model, NAME)
     options = Options(**config["options"])
     network = _build(config["num_joints"], options)
-    supervised.read_weights(model, network)
-    network.to(supervised.resolve_device("auto"))
-    batches = supervised.predict_in_batches(
+    models.read_weights(model, network)
+    network.to(models.resolve_device("auto"))
+    batches = models.predict_in_batches(
         network, lambda images: _decode(network(_to_input(images)), options), _grey(frames)
     )
     joints2d = [points.cpu().numpy() for points, _ in batches] or [np.zeros((0, config["num_joints"], 2), np.float32)]
@@ -193,7 +193,7 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
 
 
 def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) -> tuple[np.ndarray, np.ndarray]:
-    from ctlev_core.supervised import check_frames
+    from ctlev_core.supervised.models import check_frames
 
     where = "train pose2d"
     check_frames(frames, where)

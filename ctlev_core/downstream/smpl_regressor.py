@@ -22,11 +22,11 @@ import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from ctlev_core.body.smpl_files import given_body_file
-from ctlev_core.body_samples import BodySamples, mirror_half, shift
-from ctlev_core.frame_sequences import find_sequences
 from ctlev_core.geometry.joint_sets import joint_indices
 from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
-from ctlev_core.supervised_options import SupervisedOptions
+from ctlev_core.supervised.augmentation import BodySamples, mirror_half, shift
+from ctlev_core.supervised.frame_sequences import find_sequences
+from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import History, Labels, check_labels
@@ -154,20 +154,20 @@ def train_sequences(
     """
     import torch
 
-    from ctlev_core import supervised
     from ctlev_core.networks.resnet import load_backbone
-    from ctlev_core.supervised_training import train_model
-    from ctlev_core.training_rows import plan_rows
+    from ctlev_core.supervised import models
+    from ctlev_core.supervised.batches import plan_rows
+    from ctlev_core.supervised.loop import train_model
 
     data = _check_training_set(frames, labels)
     check_batch(options.batch_size, frames.shape[1], frames.shape[2], f"train {NAME}")
-    weights = supervised.file_digests(input_files(options))
+    weights = models.file_digests(input_files(options))
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups or recordings)
     sets = [number for number, size in enumerate(parts) for _ in range(size)]
     apart = [names for names in (groups, sets) if names]
     sequences = find_sequences(len(frames), options.sequence_length, recordings, *apart)
-    device = supervised.resolve_device(options.device)
-    model: Any = supervised.build_seeded(lambda: _build(options), seed)
+    device = models.resolve_device(options.device)
+    model: Any = models.build_seeded(lambda: _build(options), seed)
     if options.weights:
         load_backbone(model.network, options.weights)
     model.start_from(*(torch.from_numpy(array).float() for array in (data.rotations, data.betas, data.transl)))
@@ -184,7 +184,7 @@ def train_sequences(
                 batch = mirror_half(batch, sequence, generator)
         images = _to_input(torch.from_numpy(np.ascontiguousarray(batch.frames)).to(device))
         wanted = [torch.from_numpy(array).float().to(device) for array in batch[1:]]
-        with supervised.mixed_precision(options, device):
+        with models.mixed_precision(options, device):
             found = model(images, torch.from_numpy(lengths))
         return _loss(found, wanted, body, frames.shape[2], options)
 
@@ -198,7 +198,7 @@ def train_sequences(
         options,
         seed=seed,
         work=work,
-        run_digest=supervised.digest(*identity),
+        run_digest=models.digest(*identity),
         description="train smpl_regressor",
     )
     config = {
@@ -212,7 +212,7 @@ def train_sequences(
     }
     if options.body is not None:  # so that the model needs no licensed file to predict
         config["skeleton"] = {name: getattr(body, name).tolist() for name in SKELETON}
-    supervised.write_model(out, model, config)
+    models.write_model(out, model, config)
     return history
 
 
@@ -237,15 +237,15 @@ def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]
     """
     import torch
 
-    from ctlev_core import supervised
     from ctlev_core.body.torch_rotations import axis_angle_from_matrix
+    from ctlev_core.supervised import models
 
-    supervised.check_frames(frames, f"predict {NAME}")
-    config = supervised.read_config(model, NAME)
+    models.check_frames(frames, f"predict {NAME}")
+    config = models.read_config(model, NAME)
     options = Options(**config["options"])
     network = _build(options)
-    supervised.read_weights(model, network)
-    device = supervised.resolve_device("auto")
+    models.read_weights(model, network)
+    device = models.resolve_device("auto")
     network.to(device)
     body = _skeleton()
     for name, values in config.get("skeleton", {}).items():
@@ -254,7 +254,7 @@ def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]
     indices = joint_indices("smpl", config["joint_set"])
     intrinsics = torch.tensor(config["intrinsics_px"], device=device)
     sequences = find_sequences(len(frames), options.sequence_length, recordings)
-    seen = supervised.predict_in_batches(network, lambda images: network.features(_to_input(images)).cpu(), frames)
+    seen = models.predict_in_batches(network, lambda images: network.features(_to_input(images)).cpu(), frames)
     features = torch.cat(seen) if seen else torch.zeros(0)
 
     def bodies(rows: torch.Tensor) -> list[torch.Tensor]:
@@ -265,7 +265,7 @@ def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]
         pose = axis_angle_from_matrix(found.rotations).flatten(1)
         return [pose, found.betas, found.transl, 1000 * joints, _project(joints, intrinsics)]
 
-    batches = supervised.predict_in_batches(network, bodies, np.arange(len(frames)))
+    batches = models.predict_in_batches(network, bodies, np.arange(len(frames)))
     count = len(indices)
     shapes = {
         "smpl_pose": (72,),
@@ -281,7 +281,7 @@ def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]
 
 def _check_training_set(frames: np.ndarray, labels: Labels) -> BodySamples:
     from ctlev_core.body.rotations import matrix_from_axis_angle
-    from ctlev_core.supervised import check_frames
+    from ctlev_core.supervised.models import check_frames
 
     where = f"train {NAME}"
     check_frames(frames, where)

@@ -75,7 +75,7 @@ def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarra
     """
     import torch
 
-    from ctlev_core.supervised import resolve_device
+    from ctlev_core.supervised.models import resolve_device
 
     feature_extractors.read_extractor(model, NAME)
     folder = model / feature_extractors.FILES_FOLDER

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ctlev_core.event_gan.event_images import Palette, frames_to_volumes, pairs_to_tensor
 from ctlev_core.event_gan.options import TrainingOptions
-from ctlev_core.training_rows import batch_rows
+from ctlev_core.supervised.batches import batch_rows
 
 # Entropy that keeps random streams apart.
 _SPLIT_STREAM, _BATCH_STREAM = 20, 21

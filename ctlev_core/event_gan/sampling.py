@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from ctlev_core import supervised
 from ctlev_core.event_gan.event_images import NUM_CHANNELS, Palette, pairs_to_tensor, volumes_to_frames
 from ctlev_core.event_gan.networks import EventVolumeUNet
 from ctlev_core.event_gan.options import SamplingOptions
+from ctlev_core.supervised import models
 from data_contracts.errors import DataError
 
 NAME = "event_gan"
@@ -54,7 +54,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint, arguments: dict[str, 
         "image_size": list(checkpoint.image_size),
         **record,
     }
-    supervised.write_model(folder, checkpoint.network, config)
+    models.write_model(folder, checkpoint.network, config)
 
 
 def load_checkpoint(folder: Path, device: str) -> Checkpoint:
@@ -64,16 +64,16 @@ def load_checkpoint(folder: Path, device: str) -> Checkpoint:
         DataError: there is no Event-GAN in the folder, or a damaged one.
     """
     try:
-        config = supervised.read_config(folder, NAME)
+        config = models.read_config(folder, NAME)
         network = EventVolumeUNet(NUM_CHANNELS[config["palette"]], **config["generator"])
-        supervised.read_weights(folder, network)
+        models.read_weights(folder, network)
         width, height = config["image_size"]
         checkpoint = Checkpoint(network, config["palette"], float(config["one_event"]), (int(width), int(height)))
     except DataError:
         raise
     except Exception as error:
         raise DataError(f"{folder}: the {NAME} model cannot be loaded: {error}") from error
-    network.eval().to(supervised.resolve_device(device))
+    network.eval().to(models.resolve_device(device))
     return checkpoint
 
 

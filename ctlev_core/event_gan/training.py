@@ -24,9 +24,9 @@ from ctlev_core.event_gan.local_statistics import local_statistics_error
 from ctlev_core.event_gan.networks import EventVolumeUNet, build_discriminator, generator_arguments
 from ctlev_core.event_gan.options import SamplingOptions, TrainingOptions
 from ctlev_core.event_gan.sampling import sample_frames
-from ctlev_core.supervised import build_seeded, resolve_device
-from ctlev_core.training_rows import batch_rows
-from ctlev_core.training_state import read_training_state, write_training_state
+from ctlev_core.supervised.batches import batch_rows
+from ctlev_core.supervised.checkpoints import read_training_state, write_training_state
+from ctlev_core.supervised.models import build_seeded, resolve_device
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 

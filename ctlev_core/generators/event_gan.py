@@ -62,8 +62,8 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
         DataError: frames are not event images, or do not fit the conditions, or those are not pairs.
         TrainingError: a loss is not finite, or `work` holds the state of another run.
     """
-    from ctlev_core import supervised
     from ctlev_core.event_gan import batches, event_images, networks, sampling, training
+    from ctlev_core.supervised import models
 
     pairs = event_images.check_pairs(conditions, "train Event-GAN")
     palette = event_images.check_event_images(frames, pairs, "train Event-GAN")
@@ -72,7 +72,7 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
     one_event = event_images.one_event_value(frames)
     data = batches.Pairs(pairs, frames, palette, one_event)
     material = cache_material(options)
-    identity = supervised.digest(sampling.NAME, VERSION, material, seed, frames, pairs)
+    identity = models.digest(sampling.NAME, VERSION, material, seed, frames, pairs)
     gan = training.train_generator(data, options, seed=seed, work=work, identity=identity)
     network = networks.without_spectral_norm(gan.finish())
     curves = gan.curves

@@ -184,7 +184,7 @@ def compute_features(
     """
     import torch
 
-    from ctlev_core.supervised import check_frames
+    from ctlev_core.supervised.models import check_frames
 
     check_frames(frames, where)
     if not len(frames):

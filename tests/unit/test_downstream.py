@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ctlev_core.downstream import classifier, pose2d
 from ctlev_core.geometry.joint_sets import JOINT_SETS
-from ctlev_core.training_rows import TrainingRows
+from ctlev_core.supervised.batches import TrainingRows
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import Labels
 

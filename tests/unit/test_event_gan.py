@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core import supervised, training_rows
 from ctlev_core.event_gan import batches, training
 from ctlev_core.event_gan.event_images import pairs_to_tensor
 from ctlev_core.generators import event_gan
+from ctlev_core.supervised import batches as training_rows
+from ctlev_core.supervised import models
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.labels import Conditions
 
@@ -346,7 +347,7 @@ def test_other_checkpoints_are_refused(tmp_path):
 
     with pytest.raises(DataError, match="found none"):
         sample(tmp_path / "nothing")
-    supervised.write_model(tmp_path / "other", torch.nn.Linear(2, 2), {"model": "classifier"})
+    models.write_model(tmp_path / "other", torch.nn.Linear(2, 2), {"model": "classifier"})
     with pytest.raises(DataError, match="expected a event_gan model, got 'classifier'"):
         sample(tmp_path / "other")
     whole = weights(model)

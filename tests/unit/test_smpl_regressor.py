@@ -7,11 +7,11 @@ import pytest
 
 from ctlev_core.body.layer import BUNDLED_BODY, joint_transforms, load_body
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from ctlev_core.body_samples import BodySamples, mirror_half, shift
 from ctlev_core.conditions import normals
 from ctlev_core.downstream import smpl_regressor
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.labels.body_views import with_joints
+from ctlev_core.supervised.augmentation import BodySamples, mirror_half, shift
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 

@@ -9,12 +9,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.body_samples import BodySamples, mirror_half, shift
 from ctlev_core.downstream import smpl_regressor
-from ctlev_core.frame_sequences import find_sequences, name_recordings
 from ctlev_core.networks.resnet_files import ARCHITECTURES
 from ctlev_core.networks.smpl_regressor import SmplRegressor
-from ctlev_core.training_rows import TrainingRows
+from ctlev_core.supervised.augmentation import BodySamples, mirror_half, shift
+from ctlev_core.supervised.batches import TrainingRows
+from ctlev_core.supervised.frame_sequences import find_sequences, name_recordings
 from data_contracts.config import cache_material
 from data_contracts.labels import Labels
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from ctlev_core import supervised, supervised_training
-from ctlev_core.supervised_options import SupervisedOptions
-from ctlev_core.supervised_training import learning_rate_at, train_model
-from ctlev_core.training_rows import plan_rows
+from ctlev_core.supervised import loop, models
+from ctlev_core.supervised.batches import plan_rows
+from ctlev_core.supervised.loop import learning_rate_at, train_model
+from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.errors import TrainingError
 
 COUNT = 24
@@ -21,7 +21,7 @@ FAST = {"learning_rate": 0.1, "warmup_steps": 0, "batch_size": 6, "weight_decay"
 def build():
     """A line behind batch normalisation, whose running means a careless step would spoil."""
     norm = torch.nn.BatchNorm1d(1)
-    return supervised.build_seeded(lambda: torch.nn.Sequential(norm, torch.nn.Linear(1, 1)), 0)
+    return models.build_seeded(lambda: torch.nn.Sequential(norm, torch.nn.Linear(1, 1)), 0)
 
 
 def squared_error(model, spoil=None):
@@ -173,8 +173,8 @@ def test_state_of_other_rows_is_not_continued_and_a_broken_one_is_named(tmp_path
 
 def test_saves_are_as_far_apart_as_asked(tmp_path, monkeypatch):
     clock, saved = iter(range(0, 10_000, 7)), []
-    monkeypatch.setattr(supervised_training.time, "monotonic", lambda: next(clock))
-    monkeypatch.setattr(supervised_training._Run, "save", lambda run, path: saved.append(run.state.step))
+    monkeypatch.setattr(loop.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(loop._Run, "save", lambda run, path: saved.append(run.state.step))
     train(tmp_path, {"num_steps": 12, "checkpoint_every_s": 20.0})
     # A look at the clock each step, 7 s apart, and one more after each save; none after the last step.
     assert saved == [3, 6, 9]
@@ -223,11 +223,11 @@ def test_whole_groups_are_held_back(tmp_path):
 def test_half_precision_trains_with_weights_and_losses_in_float32(tmp_path):
     options = SupervisedOptions(**FAST, num_steps=100, precision="bfloat16")
     device = torch.device("cpu")
-    model = supervised.build_seeded(lambda: torch.nn.Linear(1, 1), 0)
+    model = models.build_seeded(lambda: torch.nn.Linear(1, 1), 0)
     kinds = set()
 
     def compute_loss(rows, _):
-        with supervised.mixed_precision(options, device):
+        with models.mixed_precision(options, device):
             found = model(INPUTS[rows])
         kinds.add(found.dtype)
         return (found.float() - TARGETS[rows]).square().mean()

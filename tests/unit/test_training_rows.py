@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from ctlev_core.supervised_options import SupervisedOptions
-from ctlev_core.training_rows import batch_rows, plan_rows
+from ctlev_core.supervised.batches import batch_rows, plan_rows
+from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.errors import DataError
 
 

@@ -17,7 +17,7 @@ from torch.distributed.tensor import DTensor
 from ctlev_core.diffusion.training.fsdp import part_of, part_of_optimizer, whole
 from ctlev_core.diffusion.training.muon import Muon
 from ctlev_core.diffusion.training.options import TrainingOptions
-from ctlev_core.training_state import read_training_state, write_training_state
+from ctlev_core.supervised.checkpoints import read_training_state, write_training_state
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 

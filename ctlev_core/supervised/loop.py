@@ -19,16 +19,16 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from ctlev_core.supervised import digest
-from ctlev_core.supervised_options import SupervisedOptions
-from ctlev_core.training_rows import TrainingRows
-from ctlev_core.training_state import read_training_state, write_training_state
+from ctlev_core.supervised.batches import TrainingRows
+from ctlev_core.supervised.checkpoints import read_training_state, write_training_state
+from ctlev_core.supervised.models import digest
+from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.errors import TrainingError
 from data_contracts.labels import History
 
 CHECKPOINT_NAME = "training.pt"
 MAX_NON_FINITE = 10
-# Of the random streams of one seed; the others are those of `ctlev_core.training_rows`.
+# Of the random streams of one seed; the others are those of `ctlev_core.supervised.batches`.
 _STREAM_STEP = 1
 
 LossFunction = Callable[[np.ndarray, np.random.Generator | None], torch.Tensor]

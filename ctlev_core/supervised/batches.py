@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ctlev_core.supervised_options import SupervisedOptions
+from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.errors import DataError
 
 # Random streams of one seed; a stream never depends on how often another was used. Stream 1 is augmentation.

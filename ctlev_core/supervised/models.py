@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from ctlev_core.supervised_options import SupervisedOptions
+from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.errors import DataError
 from data_contracts.manifest import file_digest
 
