@@ -13,7 +13,7 @@ import pyarrow as pa
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import STOCHASTIC
 from ctlev_core.events.windows import spread
-from ctlev_core.sampling_realism import realism_of_real, realism_of_samples
+from ctlev_core.realism.sampling import realism_of_real, realism_of_samples
 from ctlev_core.seeds import row_seeds
 from ctlev_core.statistics.sampling_errors import (
     CPU,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ctlev_core.realism.sampling import realism_of_real, realism_of_samples
 from ctlev_core.realism.two_sample import MIN_FRAMES
 from ctlev_core.report.page.html import render_report
 from ctlev_core.report.studies.measurement_charts import REFERENCE_LINE
 from ctlev_core.report.studies.speed_realism import realism_table
-from ctlev_core.sampling_realism import realism_of_real, realism_of_samples
 from ctlev_core.statistics.sampling_errors import HELD_OUT
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from ctlev_core.realism.sampling import STATISTICS
 from ctlev_core.realism.two_sample import C2ST, MIN_FRAMES
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.studies.measurement_charts import REFERENCE_LINE, Row, find_row
-from ctlev_core.sampling_realism import STATISTICS
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.sampling_errors import HELD_OUT, OF_HALVES
 
