@@ -52,7 +52,7 @@ def base_model_options(experiment: Experiment) -> PretrainingOptions:
         DataError: there are no pictures.
     """
     from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
-    from ctlev_core.labelled_pictures import open_pictures
+    from ctlev_core.pictures.labelled_pictures import open_pictures
 
     options = validate_options(PretrainingOptions, experiment.base_model or {}, "base_model")
     if options.pictures.root is not None:

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.labelled_pictures import picture_files
+from ctlev_core.pictures.labelled_pictures import picture_files
 from data_contracts import tables
 from data_contracts.config import GeneratorChoice
 from data_contracts.errors import DataError

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # torch, which flows that pre-train nothing need not wait for
 
 def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     from ctlev_core.diffusion.pretraining.pretraining import start_folder
-    from ctlev_core.labelled_pictures import picture_files
+    from ctlev_core.pictures.labelled_pictures import picture_files
 
     options: PretrainingOptions = arguments["options"]
     start = start_folder(options)

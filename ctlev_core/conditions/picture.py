@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.labelled_pictures import LabelledPictures, PictureSource, open_pictures, picture_files
+from ctlev_core.pictures.labelled_pictures import LabelledPictures, PictureSource, open_pictures, picture_files
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, Labels
 
@@ -38,7 +38,7 @@ def input_files(options: Options) -> list[Path]:
     """The folder or file of the pictures; its content enters the cache key.
 
     Raises:
-        DataError: none is named, or it is none of the layouts of `ctlev_core.labelled_pictures`.
+        DataError: none is named, or it is none of the layouts of `ctlev_core.pictures.labelled_pictures`.
     """
     _open(options)
     return picture_files(options)

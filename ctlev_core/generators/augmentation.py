@@ -1,7 +1,7 @@
 """Baseline: ordinary augmentation, what everybody tries first. New frames are the training frames, moved about.
 
 Each new frame is a random training frame of the class that is asked for, shifted, turned and scaled at random
-(`ctlev_core.image_moves`), with a share of its active pixels dropped (EventDrop, Gu et al., IJCAI 2021, drops events;
+(`ctlev_core.pictures.image_moves`), with a share of its active pixels dropped (EventDrop, Gu et al., IJCAI 2021, drops events;
 of an image pixels are left) and, where wanted, its polarities exchanged. Nothing is learnt.
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.image_moves import Moves, move_image
+from ctlev_core.pictures.image_moves import Moves, move_image
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, History

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from ctlev_core.image_moves import Moves, move_image
-from ctlev_core.labelled_pictures import PictureOptions, move, open_pictures, read_picture
+from ctlev_core.pictures.image_moves import Moves, move_image
+from ctlev_core.pictures.labelled_pictures import PictureOptions, move, open_pictures, read_picture
 from data_contracts.errors import DataError
 
 

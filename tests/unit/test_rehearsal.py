@@ -15,8 +15,8 @@ from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions, dra
 from ctlev_core.diffusion.training import finetuning
 from ctlev_core.diffusion.training.finetuning import fine_tune, move_frames
 from ctlev_core.diffusion.training.options import FineTuningOptions, TrainingOptions
-from ctlev_core.image_moves import Moves
-from ctlev_core.labelled_pictures import PictureOptions
+from ctlev_core.pictures.image_moves import Moves
+from ctlev_core.pictures.labelled_pictures import PictureOptions
 from data_contracts.errors import DataError
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core import labelled_pictures
 from ctlev_core.diffusion.pretraining.picture_styles import Diet, Scene, apply_style
-from ctlev_core.labelled_pictures import LabelledPictures, PictureOptions
+from ctlev_core.pictures import labelled_pictures
+from ctlev_core.pictures.labelled_pictures import LabelledPictures, PictureOptions
 
 
 def picture_diet(options: PictureOptions) -> Diet:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.labelled_pictures import StyleShares
+from ctlev_core.pictures.labelled_pictures import StyleShares
 from ctlev_core.studio.objects import NAMES
 from data_contracts.config import Frozen
 

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
-from ctlev_core import labelled_pictures
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
 from ctlev_core.diffusion.patch_autoencoder import PATCH_PX, PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.pretrained.loading import (
@@ -40,7 +39,8 @@ from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
 from ctlev_core.diffusion.training.loop import run_training, sample_rows
 from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
-from ctlev_core.labelled_pictures import PictureOptions
+from ctlev_core.pictures import labelled_pictures
+from ctlev_core.pictures.labelled_pictures import PictureOptions
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
 from data_contracts.labels import History

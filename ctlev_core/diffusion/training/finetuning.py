@@ -37,7 +37,7 @@ from ctlev_core.diffusion.training.loop import check_run, run_training, sample_r
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.diffusion.training.tensorboard import picture_of_samples
 from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
-from ctlev_core.image_moves import move_image
+from ctlev_core.pictures.image_moves import move_image
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions

@@ -7,8 +7,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from ctlev_core.image_moves import Moves
-from ctlev_core.labelled_pictures import PictureOptions
+from ctlev_core.pictures.image_moves import Moves
+from ctlev_core.pictures.labelled_pictures import PictureOptions
 from data_contracts.config import RUN_SETTING, Frozen
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, field_validator
 
 from ctlev_core.dataset_files.trees import check_inside, list_folder
-from ctlev_core.image_moves import Moves, move_image
+from ctlev_core.pictures.image_moves import Moves, move_image
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 
