@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.decoding import prophesee
 from data_contracts.events import Events
 
@@ -59,9 +59,9 @@ def main() -> None:
 def find_recordings(path: Path | None) -> dict[str, Events]:
     """What is measured on, by name."""
     if path:
-        return {path.stem: files.read_events_file(path)}
+        return {path.stem: event_files.read_events_file(path)}
     if SPOT.is_file() and STREET.is_file():
-        return {"spot": files.read_events_file(SPOT), "street": files.read_events_file(STREET)}
+        return {"spot": event_files.read_events_file(SPOT), "street": event_files.read_events_file(STREET)}
     random = np.random.default_rng(0)
     n = 500_000
     x, y = (random.normal(size / 2, size / 8, n).clip(0, size - 1).astype(np.uint16) for size in (640, 480))
@@ -84,7 +84,7 @@ def tile(events: Events, num_events: int) -> Events:
 def readers(name: str, path: Path, events: Events) -> dict[str, tuple[Callable[[], Any], Callable[[Any], list]]]:
     """For every package that is installed: read the file, and the columns t, x, y, p of what was read."""
     found: dict[str, tuple[Callable[[], Any], Callable[[Any], list]]] = {
-        "ctlev": (lambda: files.read_events_file(path), lambda got: [getattr(got, key) for key in COLUMNS])
+        "ctlev": (lambda: event_files.read_events_file(path), lambda got: [getattr(got, key) for key in COLUMNS])
     }
     if importlib.util.find_spec("expelliarmus"):
         from expelliarmus import Wizard  # pyright: ignore[reportMissingImports]
@@ -205,7 +205,7 @@ def write_large(name: str, path: Path, events: Events, num_bytes: int) -> int:
     if name == "parquet":
         period = events.duration_us + 1
         copies = max(1, num_bytes // (4 * len(events)))  # about 4 bytes an event
-        files.write_event_chunks_parquet(
+        event_files.write_event_chunks_parquet(
             path,
             (Events(events.t + copy * period, events.x, events.y, events.p, events.sensor_size)
              for copy in range(copies)),

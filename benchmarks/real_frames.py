@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from ctlev_core.encodings import event_histogram
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 
 SIZES = (64, 256, 512)
 GAP_PX = 8
@@ -64,7 +64,7 @@ def counted(real: Path) -> Iterator[list[np.ndarray]]:
     chosen = [(sorted((real / "nmnist" / digit).glob("*.bin"))[0], 0) for digit in DIGITS]
     chosen += [(real / "events" / name, num_events) for name, num_events in RECORDINGS.items()]
     for path, num_events in chosen:
-        events = files.read_events_file(path)
+        events = event_files.read_events_file(path)
         starts = [0] if num_events == 0 else [0, len(events) - num_events]
         windows = np.array([[start, start + (num_events or len(events))] for start in starts])
         for window in windows:

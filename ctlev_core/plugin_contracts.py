@@ -400,7 +400,7 @@ class MetricOfSkeletons(Metric, Protocol):
     """A metric that needs certain joints: hips to align by, or a head to measure with."""
 
     def check_joint_set(self, joint_set: str, options: Any) -> None:
-        """Raise `ValueError` for a joint set, a key of `ctlev_core.geometry.joint_sets.JOINT_SETS` or empty, without them."""
+        """Raise `ValueError` for a joint set, a key of `geometry.joint_sets.JOINT_SETS` or empty, without them."""
         ...
 
 

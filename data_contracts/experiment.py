@@ -99,7 +99,7 @@ class Experiment(Frozen):
     max_tries: int = Field(
         3,
         ge=1,
-        description="samplings of a frame, until it passes ctlev_core.postprocessing.rejection; 1 = count refusals only",
+        description="samplings of a frame, until it passes postprocessing/rejection.py; 1 = count refusals only",
     )
     round_to_counts: bool = Field(
         False,

@@ -14,7 +14,7 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut_chunks, spread
 from ctlev_core.labels.labelling import has_label, labels_at_windows, labels_in_image
 from data_contracts import tables
@@ -237,7 +237,7 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
     path, at_once = source.file, _windows_at_once(plugin, _sensor_size(source.recording))
     for part in source.parts:
         start, stop = part["event_start"], part["event_stop"]
-        held = files.read_events_range(path, start, stop) if stop - start <= MAX_EVENTS else None
+        held = event_files.read_events_range(path, start, stop) if stop - start <= MAX_EVENTS else None
         if source.windows is None:
             ranges, labels = start + cut_chunks(_time_stamps(path, start, stop, held), windows), None
         else:
@@ -249,7 +249,7 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
         for rows in _groups(ranges, at_once):
             first, last = int(ranges[rows[0], 0]), int(ranges[rows[-1], 1])
             if held is None:
-                events = files.read_events_range(path, first, last)
+                events = event_files.read_events_range(path, first, last)
             else:
                 events = held.slice(first - start, last - start)
             local = ranges[rows] - first
@@ -272,7 +272,7 @@ def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iter
         yield held.t
         return
     for first in range(start, stop, MAX_EVENTS):
-        yield files.read_events_range(path, first, min(first + MAX_EVENTS, stop)).t
+        yield event_files.read_events_range(path, first, min(first + MAX_EVENTS, stop)).t
 
 
 def _windows_at_once(plugin: plugins.Plugin, sensor_size: tuple[int, int]) -> int:

@@ -13,7 +13,7 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.plugins import Plugin
 from data_contracts import tables
 from data_contracts.config import DatasetChoice
@@ -138,15 +138,15 @@ def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str
                 bar.update(len(piece))
 
     if finished.exists():  # by an earlier run that was interrupted
-        summary = files.Summary()
-        for piece in watched(files.read_event_chunks(finished)):
+        summary = event_files.Summary()
+        for piece in watched(event_files.read_event_chunks(finished)):
             summary.add(piece)
     else:
         if hasattr(plugin.module, "read_event_chunks"):
             pieces = plugin.module.read_event_chunks(recording, plugin.options)
         else:
             pieces = [check_events(plugin.module.read_events(recording, plugin.options), where)]
-        summary = files.write_event_chunks_parquet(finished, watched(pieces))
+        summary = event_files.write_event_chunks_parquet(finished, watched(pieces))
     if summary.num_events == 0 or summary.sensor_size is None:
         raise DataError(f"{where}: the recording holds no events")
     os.link(finished, attached)

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling.shards import SHARD
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.image_grid import check_whole_counts
 from ctlev_core.events.windows import spread, window_around
 from ctlev_core.labels.sources import sensor_size_of
@@ -185,7 +185,7 @@ def _calibrated(plugin: plugins.Plugin, recordings: Manifest, conditions: Manife
     if not ranges:
         raise DataError(f"{recordings.ref.path}: no training recording with events, which {plugin.name!r} is fitted to")
     chosen = [ranges[number] for number in spread(len(ranges), MAX_CALIBRATION)]
-    read = (files.read_events_range(path, start, stop) for _, path, start, stop in chosen)
+    read = (event_files.read_events_range(path, start, stop) for _, path, start, stop in chosen)
     names = [class_name for class_name, *_ in chosen]
     options, measured = plugin.module.calibrate(read, names, conditions_of(conditions), plugin.options)
     found = {"options": options.model_dump(mode="json"), "measured": measured}

@@ -1,10 +1,11 @@
 """Motions told in words; poses to sample from, without events: sentence to motion to condition to event frames.
 
-Each sentence is performed so many times, by the project's own small generator (`ctlev_core.body.text_to_motion.compose`), which
-knows a few dozen verbs and refuses sentences that it does not understand. Motions that a learned model such as MDM made
-elsewhere take its place with the option `results`: a file that it wrote, or a folder of such files, in any format of
-`ctlev_core/motions`. What they show is in the files (MDM's `results.npy` has the sentences), or in a text file of the
-same name beside them (HumanML3D: a line a caption, what follows `#` is not read), or else the file's name.
+Each sentence is performed so many times, by the project's own small generator
+(`ctlev_core.body.text_to_motion.compose`), which knows a few dozen verbs and refuses sentences that it does not
+understand. Motions that a learned model such as MDM made elsewhere take its place with the option `results`: a file
+that it wrote, or a folder of such files, in any format of `ctlev_core/motions`. What they show is in the files (MDM's
+`results.npy` has the sentences), or in a text file of the same name beside them (HumanML3D: a line a caption, what
+follows `#` is not read), or else the file's name.
 
 The class of a recording is its sentence. The camera is a virtual one (`ctlev_core.dataset_files.pose_sources`).
 

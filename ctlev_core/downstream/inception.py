@@ -48,8 +48,8 @@ def input_files(options: Options) -> list[Path]:
     digest = file_digest(options.file)
     if digest != feature_extractors.INCEPTION_STATE_SHA256:
         raise DataError(
-            f"{options.file}: expected the published weights, SHA-256 {feature_extractors.INCEPTION_STATE_SHA256[:12]}, "
-            f"got {digest[:12]}"
+            f"{options.file}: expected the published weights, SHA-256 "
+            f"{feature_extractors.INCEPTION_STATE_SHA256[:12]}, got {digest[:12]}"
         )
     return [options.file]
 

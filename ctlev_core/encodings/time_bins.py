@@ -4,7 +4,8 @@ What happens one after the other then lies beside one another, where a single hi
 an N-MNIST recording the three saccades, each of which shows the edges across its own direction. Polarity is discarded,
 for an image has three channels; what a direction of movement and a polarity say of an edge is much the same.
 
-Each window is cut into parts of equal duration, from its first event to its last (`ctlev_core.events.windows.time_bins`).
+Each window is cut into parts of equal duration, from its first event to its last
+(`ctlev_core.events.windows.time_bins`).
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ import pyarrow as pa
 import torch
 from torch.utils.data import Dataset
 
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.provenance.records import read_records
 from data_contracts import tables
 from data_contracts.errors import DataError
@@ -146,9 +146,9 @@ class EventDataset(Dataset[Sample]):
             raise DataError(f"{self.place}: holds no event streams; export it with --set 'export={{format: parquet}}'")
         path, start, stop = self.place / row["events_file"], row["event_start"], row["event_start"] + row["num_events"]
         if path.suffix == ".parquet":
-            events = files.read_events_range(path, start, stop)
+            events = event_files.read_events_range(path, start, stop)
         else:
-            events = files.read_events_file(path).slice(start, stop)
+            events = event_files.read_events_file(path).slice(start, stop)
         return replace(events, t=events.t - row["t_start_us"])
 
 

@@ -1,8 +1,8 @@
 """Baseline: ordinary augmentation, what everybody tries first. New frames are the training frames, moved about.
 
 Each new frame is a random training frame of the class that is asked for, shifted, turned and scaled at random
-(`ctlev_core.pictures.image_moves`), with a share of its active pixels dropped (EventDrop, Gu et al., IJCAI 2021, drops events;
-of an image pixels are left) and, where wanted, its polarities exchanged. Nothing is learnt.
+(`ctlev_core.pictures.image_moves`), with a share of its active pixels dropped (EventDrop, Gu et al., IJCAI 2021, drops
+events; of an image pixels are left) and, where wanted, its polarities exchanged. Nothing is learnt.
 """
 
 from __future__ import annotations

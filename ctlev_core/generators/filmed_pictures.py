@@ -2,10 +2,10 @@
 
 Source: N-MNIST and N-Caltech101 (Orchard et al., Converting Static Image Datasets to Spiking Neuromorphic Datasets
 Using Saccades, Frontiers in Neuroscience 2015) were recorded so: a pan-tilt unit moves an ATIS along a closed triangle,
-three saccades of about 100 ms, before a monitor that shows one picture. Pixels are those of `ctlev_core.sensor.dvs_pixel`.
-Nothing is learnt from real frames, but `calibrate` fits to recordings what their makers could have measured:
-thresholds, noise, hot pixels, refractory time, size and place of the picture, and whether it is brighter or darker than
-its ground.
+three saccades of about 100 ms, before a monitor that shows one picture. Pixels are those of
+`ctlev_core.sensor.dvs_pixel`. Nothing is learnt from real frames, but `calibrate` fits to recordings what their makers
+could have measured: thresholds, noise, hot pixels, refractory time, size and place of the picture, and whether it is
+brighter or darker than its ground.
 
 The default path was measured on 276 recordings of N-MNIST, as that which leaves their events least blurred when it is
 taken off them. The two motors do not run together: the tilt ends a saccade when the pan has hardly begun. In these

@@ -5,8 +5,8 @@ called positive where the class has the highest probability of all. With a two-c
 else, that is a binary classifier as in the paper; with a model of all held-out classes it is one against the rest.
 
 Accuracy is given as expected for as many negatives as positives, drawn at random: the mean of the shares of positives
-and negatives told right (`ctlev_core.scoring.zero_shot`). Chance is 0.5, whatever the numbers of images are. The paper does not
-say how it draws negatives.
+and negatives told right (`ctlev_core.scoring.zero_shot`). Chance is 0.5, whatever the numbers of images are. The paper
+does not say how it draws negatives.
 """
 
 from __future__ import annotations

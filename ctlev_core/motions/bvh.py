@@ -5,9 +5,9 @@ channels are degrees and turn one after the other, each about an axis that the o
 Position channels replace the OFFSET of their joint, axis by axis, which is how MotionBuilder and Blender write them.
 
 No BVH says its unit: CMU's conversions have 0.45 inches, others centimetres or metres. None is needed, for the motion
-is scaled to the legs of the body (`ctlev_core.body.motion.retargeting`). Up is the axis along which the rest pose stands, or
-the one along which the person stands while it moves, where that is plainly another one. A rest pose that is none, all
-bones along one axis as LAFAN1 has it, gives way to the frame in which the person stands straightest.
+is scaled to the legs of the body (`ctlev_core.body.motion.retargeting`). Up is the axis along which the rest pose
+stands, or the one along which the person stands while it moves, where that is plainly another one. A rest pose that is
+none, all bones along one axis as LAFAN1 has it, gives way to the frame in which the person stands straightest.
 
 Converters put the pose in which they calibrate, mostly a T, before the first frame (those of CMU's data do). It is no
 part of the motion and is left out: it is known by a joint that turns faster than any living one from it to the next

@@ -6,8 +6,8 @@
                                    num_repetitions
 
 y is up, and 20 frames a second are taken unless who reads it says another rate; the files say neither. The poses come
-from the positions in closed form (`ctlev_core.body.motion.inverse_kinematics`), after the person was scaled about the origin
-to have legs as long as the bundled body's; other bone lengths that differ move joints, but do not turn bones.
+from the positions in closed form (`ctlev_core.body.motion.inverse_kinematics`), after the person was scaled about the
+origin to have legs as long as the bundled body's; other bone lengths that differ move joints, but do not turn bones.
 
 [T, 24, 3] may be SMPL's rotations as well, which the format `smpl_arrays` reads: these are positions where bones have
 lengths such as a body's.

@@ -2,8 +2,8 @@
 
 A decoder spreads what it is unsure of: where every other real window has one event it gives half of one, and such
 values no real image has. Dithering keeps the expected count of each pixel, so that sparse noise stays as dense as it
-was; the most probable count, which `ctlev_core.postprocessing.image_counts` finds, would remove it. The number of events is that of a
-real window drawn at random: normalised images say nothing about it.
+was; the most probable count, which `ctlev_core.postprocessing.image_counts` finds, would remove it. The number of
+events is that of a real window drawn at random: normalised images say nothing about it.
 """
 
 from __future__ import annotations

@@ -79,7 +79,8 @@ def draw_skeleton(
     Args:
         joints2d: [J, 2] px of an image of `image_size`; pixel centres at integer + 0.5.
         visible: [J] bool.
-        joint_set: a key of `ctlev_core.geometry.joint_sets.JOINT_SETS`; see `openpose_sources` for what becomes of its joints.
+        joint_set: a key of `ctlev_core.geometry.joint_sets.JOINT_SETS`; see `openpose_sources` for what becomes of its
+            joints.
         image_size: (width, height) px.
         drawing: one of `DRAWINGS`.
         stick_width_px: of `openpose`, half the width of limbs and the radius of joints; None scales ControlNet's 4 px

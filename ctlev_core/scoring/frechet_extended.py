@@ -5,8 +5,8 @@ a millionth of their size is then wrong by 1e-10 of itself. Here the roots are c
 x86. The orthogonal matrix between them may stay as it comes from float64: at the minimum the distance does not change
 with it to first order.
 
-Source: Procrustes form and notation as in `ctlev_core.scoring.frechet`; Golub & Van Loan, Matrix Computations, 2013, section
-5.2 (Householder QR).
+Source: Procrustes form and notation as in `ctlev_core.scoring.frechet`; Golub & Van Loan, Matrix Computations, 2013,
+section 5.2 (Householder QR).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MAX_WORK = 2 * 10**8
 
 
 def refined_frechet_distance(features_a: np.ndarray, features_b: np.ndarray) -> float:
-    """`ctlev_core.scoring.frechet.frechet_distance`, with more digits where two sets nearly coincide and are not too large.
+    """`frechet.frechet_distance`, with more digits where two sets nearly coincide and are not too large.
 
     Args:
         features_a: [N, D] real numbers, N >= 2.

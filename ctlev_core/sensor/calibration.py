@@ -250,7 +250,7 @@ def _measure_refractory(events: Events, base: SensorOptions, found: dict, measur
 
 
 def write_preset(path: Path, calibration: Calibration, recording: str) -> None:
-    """Write a YAML file that `ctlev_core.sensor.dvs_pixel.read_preset` reads, with what is measured and assumed as comments."""
+    """Write a YAML file that `dvs_pixel.read_preset` reads, with what is measured and assumed as comments."""
     import yaml
 
     lines = [f"# Sensor preset, estimated from {recording} by ctlev_core.sensor.calibration.", "# Measured:"]

@@ -27,9 +27,9 @@ SEGMENTS_AT_ONCE = 64
 class MovingBody:
     """A textured, lit body that moves between key poses before a still camera.
 
-    It is what `ctlev_core.sensor.adaptive_rendering.simulate_rendered` asks for pictures. Between two key poses each joint
-    turns about a fixed axis at constant speed, the shorter way, and the body shifts at constant speed; before the first
-    and after the last it rests. An instance keeps pictures to draw on, so that several threads must not share it.
+    It is what `ctlev_core.sensor.adaptive_rendering.simulate_rendered` asks for pictures. Between two key poses each
+    joint turns about a fixed axis at constant speed, the shorter way, and the body shifts at constant speed; before the
+    first and after the last it rests. An instance keeps pictures to draw on, so that several threads must not share it.
 
     Args:
         subject: who moves; grey (one channel).

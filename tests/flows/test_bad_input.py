@@ -112,9 +112,9 @@ def parquet_recording(path, **changed):
     from ctlev_core.formats import parquet
 
     make_recording(path.with_suffix(".raw"))
-    from ctlev_core.events import files
+    from ctlev_core.events import files as event_files
 
-    events = files.read_events_file(path.with_suffix(".raw"))
+    events = event_files.read_events_file(path.with_suffix(".raw"))
     path.with_suffix(".raw").unlink()
     parquet.write(path, events)
     table = pq.read_table(path)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
@@ -26,7 +26,7 @@ def assert_events(events: Events, t=T, x=X, y=Y, p=P) -> None:
 
 def read_both_ways(path: Path) -> Events:
     """Found by content, read whole and in pieces of three, which must agree."""
-    module = files.find_format(path)
+    module = event_files.find_format(path)
     events = module.read(path)
     pieces = list(module.read_chunks(path, 3))
     assert all(len(piece) == 3 for piece in pieces[:-1])
@@ -37,7 +37,7 @@ def read_both_ways(path: Path) -> Events:
 
 
 def raises_both_ways(path: Path, match: str) -> None:
-    module = files.find_format(path)
+    module = event_files.find_format(path)
     with pytest.raises(DataError, match=match):
         module.read(path)
     with pytest.raises(DataError, match=match):

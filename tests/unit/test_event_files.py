@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
@@ -89,9 +89,9 @@ def test_write_then_read_whole_or_in_pieces(name, num_events, duration_us, piece
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"events{SUFFIXES.get(name, '')}"
         module.write(path, events)
-        assert files.find_format(path) is module
-        assert_same(files.read_events_file(path), events)
-        pieces = list(files.read_event_chunks(path, piece))
+        assert event_files.find_format(path) is module
+        assert_same(event_files.read_events_file(path), events)
+        pieces = list(event_files.read_event_chunks(path, piece))
     assert [len(part) for part in pieces[:-1]] == [piece] * (len(pieces) - 1)
     assert_same(event_pieces.concatenate(pieces), events)
 
@@ -104,16 +104,16 @@ def test_equal_events_in_large_blocks(name, tmp_path):
     events = Events(*(getattr(events, column)[order] for column in "txyp"), events.sensor_size)
     path = tmp_path / f"events{SUFFIXES.get(name, '')}"
     plugins.load("formats", name).write(path, events)
-    assert_same(files.read_events_file(path), events)
-    assert_same(event_pieces.concatenate(files.read_event_chunks(path, 40_001)), events)
+    assert_same(event_files.read_events_file(path), events)
+    assert_same(event_pieces.concatenate(event_files.read_event_chunks(path, 40_001)), events)
 
 
 @pytest.mark.parametrize("name", ["csv", "evt2", "evt3", "hdf5", "npz", "parquet"])
 def test_a_recording_without_events_is_one_empty_piece(name, tmp_path):
     plugins.load("formats", name).write(tmp_path / "events", make_events(0))
-    pieces = list(files.read_event_chunks(tmp_path / "events"))
+    pieces = list(event_files.read_event_chunks(tmp_path / "events"))
     assert [(len(piece), piece.sensor_size) for piece in pieces] == [(0, SIZE)]
-    assert_same(files.read_events_file(tmp_path / "events"), make_events(0))
+    assert_same(event_files.read_events_file(tmp_path / "events"), make_events(0))
 
 
 def test_evt3_vectors_save_words_and_keep_the_order(tmp_path):
@@ -134,14 +134,14 @@ def test_two_formats_that_claim_a_file_are_named(tmp_path, monkeypatch):
     plugins.load("formats", "evt2").write(path, make_events(3))
     monkeypatch.setattr(plugins.load("formats", "dat"), "sniff", lambda path: True)
     with pytest.raises(DataError, match="could be any of the formats dat, evt2; expected exactly one"):
-        files.find_format(path)
+        event_files.find_format(path)
 
 
 def test_formats_without_a_signature_are_asked_last(tmp_path, monkeypatch):
     path = tmp_path / "events"
     plugins.load("formats", "evt2").write(path, make_events(3))
     monkeypatch.setattr(plugins.load("formats", "csv"), "sniff", lambda path: True)
-    assert files.find_format(path).__name__.endswith(".evt2")
+    assert event_files.find_format(path).__name__.endswith(".evt2")
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings are not beside the project")
@@ -149,10 +149,12 @@ def test_formats_without_a_signature_are_asked_last(tmp_path, monkeypatch):
     "file", ["person/tonic_sample.aedat4", "street/expelliarmus_evt3.raw", "spot/expelliarmus_evt2.raw"]
 )
 def test_real_recordings_in_pieces(file, tmp_path):
-    events = files.read_events_file(REAL / file)
-    summary = files.write_event_chunks_parquet(tmp_path / "a.parquet", files.read_event_chunks(REAL / file, 10_007))
-    assert summary.result() == files.summarise(events)
-    assert_same(files.read_events_file(tmp_path / "a.parquet"), events)
+    events = event_files.read_events_file(REAL / file)
+    summary = event_files.write_event_chunks_parquet(
+        tmp_path / "a.parquet", event_files.read_event_chunks(REAL / file, 10_007)
+    )
+    assert summary.result() == event_files.summarise(events)
+    assert_same(event_files.read_events_file(tmp_path / "a.parquet"), events)
 
 
 def test_a_file_that_cannot_be_read_is_a_data_error(tmp_path, monkeypatch):
@@ -162,7 +164,7 @@ def test_a_file_that_cannot_be_read_is_a_data_error(tmp_path, monkeypatch):
     monkeypatch.setattr(plugins.load("formats", "evt2"), "sniff", refuse)
     (tmp_path / "a.raw").write_bytes(b"x")
     with pytest.raises(DataError, match=r"a\.raw: cannot be read: no permission"):
-        files.find_format(tmp_path / "a.raw")
+        event_files.find_format(tmp_path / "a.raw")
 
 
 # Pieces ------------------------------------------------------------------------------------------------------------
@@ -174,7 +176,7 @@ def test_pieces_that_do_not_join_are_an_error(tmp_path, monkeypatch):
 
     def give(*pieces):
         monkeypatch.setattr(module, "read_chunks", lambda path, num_events: iter(pieces))
-        return list(files.read_event_chunks(tmp_path / "a.raw"))
+        return list(event_files.read_event_chunks(tmp_path / "a.raw"))
 
     late, early = make_events(5), make_events(5)
     late.t[:], early.t[:] = 7, 6
@@ -207,9 +209,9 @@ def test_time_that_jumps_back_at_a_joint_is_found(name, tmp_path):
         content = path.read_bytes()
     path.write_bytes(content)
     with pytest.raises(DataError, match="t decreases at event 7: 70 us, then"):
-        list(files.read_event_chunks(path, 7))
+        list(event_files.read_event_chunks(path, 7))
     with pytest.raises(DataError, match="t decreases at event 7: 70 us, then"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 @settings(max_examples=30, deadline=None)
@@ -229,10 +231,10 @@ def test_regroup_keeps_events_and_order(lengths, size):
 
 def test_parquet_written_in_pieces_is_the_file_written_whole(tmp_path):
     events = make_events(600_000)
-    files.write_events_parquet(tmp_path / "whole.parquet", events)
+    event_files.write_events_parquet(tmp_path / "whole.parquet", events)
     pieces = event_pieces.regroup([events], 7_001)
-    summary = files.write_event_chunks_parquet(tmp_path / "pieces.parquet", pieces)
-    assert summary.result() == files.summarise(events)
+    summary = event_files.write_event_chunks_parquet(tmp_path / "pieces.parquet", pieces)
+    assert summary.result() == event_files.summarise(events)
     assert (tmp_path / "whole.parquet").read_bytes() == (tmp_path / "pieces.parquet").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["pieces.parquet", "whole.parquet"]
 
@@ -240,16 +242,16 @@ def test_parquet_written_in_pieces_is_the_file_written_whole(tmp_path):
 def test_a_stretch_of_a_parquet_file_is_the_slice(tmp_path):
     events = make_events(600_000)
     path = tmp_path / "a.parquet"
-    files.write_events_parquet(path, events)
+    event_files.write_events_parquet(path, events)
     group = pq.ParquetFile(path).metadata.row_group(0).num_rows
     for start, stop in [(0, 0), (0, 1), (group - 1, group + 1), (group, 2 * group), (599_999, 600_000), (0, 600_000)]:
-        assert_same(files.read_events_range(path, start, stop), events.slice(start, stop))
+        assert_same(event_files.read_events_range(path, start, stop), events.slice(start, stop))
     for start, stop in [(-1, 5), (5, 4), (0, 600_001)]:
         with pytest.raises(DataError, match="expected a range within 0 to 600000"):
-            files.read_events_range(path, start, stop)
+            event_files.read_events_range(path, start, stop)
     plugins.load("formats", "evt2").write(tmp_path / "a.raw", make_events(3))
     with pytest.raises(DataError, match="only parts of Parquet files can be read, got evt2"):
-        files.read_events_range(tmp_path / "a.raw", 0, 1)
+        event_files.read_events_range(tmp_path / "a.raw", 0, 1)
 
 
 def test_wrong_pieces_leave_no_file(tmp_path):
@@ -257,7 +259,7 @@ def test_wrong_pieces_leave_no_file(tmp_path):
     bad.x[3] = 640
     for pieces in ([good, bad], [good, good.slice(0, 1)], []):
         with pytest.raises(DataError, match="events to be written"):
-            files.write_event_chunks_parquet(tmp_path / "a.parquet", pieces)
+            event_files.write_event_chunks_parquet(tmp_path / "a.parquet", pieces)
         assert not list(tmp_path.iterdir())
 
 

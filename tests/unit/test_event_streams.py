@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import kstest, spearmanr
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut
 from ctlev_core.postprocessing.event_streams import Spread, TimeModel, fit_times, sample_duration_us, sample_streams
 from ctlev_core.realism.distances import estimate_distances, estimate_floor
@@ -186,7 +186,7 @@ def distances_of(spread: Spread, model: TimeModel, windows: list[Events]) -> dic
 def test_real_gaps_are_closer_to_the_real_person_than_uniform_times(real_recordings):
     """Other windows of the recording; the floor is the distance of halves of the real windows from one another."""
     (path,) = (real_recordings / "person").iterdir()
-    events = files.read_events_file(path)
+    events = event_files.read_events_file(path)
     windows = [events.slice(*window) for window in cut(events, Windows(num_events=7500)).tolist()]
     model = fit_times(windows[::2])
     uniform, field = (distances_of(spread, model, windows[1::2]) for spread in ("uniform", "field"))

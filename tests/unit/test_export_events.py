@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
@@ -46,8 +46,8 @@ def write_recordings(folder) -> Manifest:
     rows, parts = [], []
     for number in range(4):
         events, name = make_events(number), f"r{number}"
-        files.write_events_parquet(folder / f"{name}.parquet", events)
-        of_events = files.summarise(events)
+        event_files.write_events_parquet(folder / f"{name}.parquet", events)
+        of_events = event_files.summarise(events)
         rows.append(
             {
                 "recording_id": name, "subject": name, "class_name": "walk", "splits": "train",
@@ -118,7 +118,7 @@ def streams(made: Manifest) -> list[Events]:
     """The stream of each row, as a reader of the table finds it; times from the start of its window."""
     found = []
     for row in made.table.to_pylist():
-        events = files.read_events_file(made.path(row["file"]))
+        events = event_files.read_events_file(made.path(row["file"]))
         events = events.slice(row["event_start"], row["event_start"] + row["num_events"])
         if len(events):
             assert row["t_start_us"] <= events.t[0] and events.t[-1] == row["t_end_us"]

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from generated_frames import REFUSED_ROW, make_generated, publish
 
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.export.event_dataset import EventDataset
 from ctlev_core.provenance.records import read_provenance
 from data_contracts import image_folder, tables
@@ -227,14 +227,14 @@ def make_streams(made, home, one_file):
     for row, events in enumerate(streams):
         name = "events.parquet" if one_file else f"{row:06d}.parquet"
         if not one_file:
-            files.write_events_parquet(folder / name, events)
+            event_files.write_events_parquet(folder / name, events)
             start = start_us = 0
         last_us = start_us + int(events.t[-1])
         rows.append((f"events/{name}", start, len(events), start_us, last_us))
         start, start_us = start + len(events), last_us + 100
     if one_file:
         moved = [Events(e.t + r[3], e.x, e.y, e.p, e.sensor_size) for e, r in zip(streams, rows, strict=True)]
-        files.write_event_chunks_parquet(folder / "events.parquet", moved)
+        event_files.write_event_chunks_parquet(folder / "events.parquet", moved)
     names = ("file", "event_start", "num_events", "t_start_us", "t_end_us")
     columns = {name: [row[number] for row in rows] for number, name in enumerate(names)}
     columns |= {

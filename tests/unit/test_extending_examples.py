@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ctlev_core import plugin_contracts, plugins
-from ctlev_core.body.motion import files as event_files
+from ctlev_core.body.motion import files as motion_files
 from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut
 from ctlev_core.geometry.joint_sets import JOINT_SETS
@@ -214,12 +214,12 @@ def test_the_format_is_found_and_read_whole_and_in_pieces(tmp_path):
 def test_the_motion_format_is_found_and_read(tmp_path):
     path = tmp_path / "turn.json"
     path.write_text('{"turntable": 1, "rate_hz": 10, "root": [[0, 0, 0, 1, 2, 3], [0, 1.5, 0, 1, 2, 4]]}')
-    clip = files.read_motion(path)
+    clip = motion_files.read_motion(path)
     np.testing.assert_array_equal(clip.pose[:, :3], [[0, 0, 0], [0, 1.5, 0]])
     assert not clip.pose[:, 3:].any() and clip.transl[1].tolist() == [1, 2, 4] and clip.time_s.tolist() == [0, 0.1]
     path.write_text('{"turntable": 1, "rate_hz": 0, "root": []}')
     with pytest.raises(DataError, match="expected root"):
-        files.read_motion(path)
+        motion_files.read_motion(path)
 
 
 def test_the_encoding_marks_the_pixels_with_events():

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from data_contracts.errors import DataError
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "events"
@@ -42,10 +42,10 @@ SIZE = (640, 480)
 )
 def test_real_recordings_give_the_published_numbers(path, format_name, sensor_size, expected):
     # Counts and durations on which several independent decoders agree (for EVT3's times: the specification).
-    assert files.find_format(path).__name__.endswith(f".{format_name}")
-    events = files.read_events_file(path)
+    assert event_files.find_format(path).__name__.endswith(f".{format_name}")
+    events = event_files.read_events_file(path)
     names = ("num_events", "duration_us", "t_first_us", "t_last_us", "num_positive", "num_negative")
-    got = files.summarise(events)
+    got = event_files.summarise(events)
     assert {name: got[name] for name, value in zip(names, expected, strict=True) if value is not None} == {
         name: value for name, value in zip(names, expected, strict=True) if value is not None
     }
@@ -56,9 +56,9 @@ def test_real_recordings_give_the_published_numbers(path, format_name, sensor_si
 @needs_real
 @pytest.mark.parametrize("name", WRITABLE)
 def test_a_real_recording_survives_every_format(name, tmp_path):
-    events = files.read_events_file(REAL_EVT3)
+    events = event_files.read_events_file(REAL_EVT3)
     plugins.load("formats", name).write(tmp_path / "copy", events)
-    again = files.read_events_file(tmp_path / "copy")
+    again = event_files.read_events_file(tmp_path / "copy")
     assert to_rows(again) == to_rows(events)
     assert again.sensor_size == events.sensor_size
 
@@ -70,7 +70,7 @@ def test_a_cut_aedat4_is_an_error_not_a_shorter_recording(keep, tmp_path):
     path = tmp_path / "cut.aedat4"
     path.write_bytes(content[: max(int(keep * len(content)), 12)])
     with pytest.raises(DataError, match=r"cut\.aedat4: not a complete AEDAT 4 file"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 @needs_real
@@ -81,7 +81,7 @@ def test_a_corrupt_aedat4_names_the_file(first, tmp_path):
     path = tmp_path / "corrupt.aedat4"
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"corrupt\.aedat4: not a complete AEDAT 4 file"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 # Round trips -------------------------------------------------------------------------------------------------------
@@ -120,9 +120,9 @@ def test_writers_refuse_events_that_break_their_promises(name, tmp_path):
 
 def test_write_events_parquet_leaves_only_the_finished_file(tmp_path):
     events = make_events([(1, 2, 3, 1)])
-    files.write_events_parquet(tmp_path / "a.parquet", events)
+    event_files.write_events_parquet(tmp_path / "a.parquet", events)
     assert [path.name for path in tmp_path.iterdir()] == ["a.parquet"]
-    assert to_rows(files.read_events_file(tmp_path / "a.parquet")) == [(1, 2, 3, 1)]
+    assert to_rows(event_files.read_events_file(tmp_path / "a.parquet")) == [(1, 2, 3, 1)]
 
 
 # Broken files ------------------------------------------------------------------------------------------------------
@@ -154,20 +154,20 @@ def test_an_unknown_file_lists_the_known_formats(content, tmp_path):
     path = tmp_path / "a.raw"
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"a\.raw: not an event file.*aedat4 \(\.aedat4\).*evt3 \(\.raw, \.evt3\)"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 def test_the_content_decides_not_the_suffix(tmp_path):
     path = tmp_path / "misnamed.aedat4"
     plugins.load("formats", "parquet").write(path, make_events([(0, 0, 0, 1)]))
-    assert files.find_format(path).__name__ == "ctlev_core.formats.parquet"
+    assert event_files.find_format(path).__name__ == "ctlev_core.formats.parquet"
 
 
 def test_a_missing_file_and_a_folder_are_errors(tmp_path):
     with pytest.raises(DataError, match="got nothing there"):
-        files.find_format(tmp_path / "absent.raw")
+        event_files.find_format(tmp_path / "absent.raw")
     with pytest.raises(DataError, match="got a folder"):
-        files.find_format(tmp_path)
+        event_files.find_format(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_parquet_with_other_content_is_an_error(change, message, tmp_path):
     plugins.load("formats", "parquet").write(path, make_events([(1, 0, 0, 1), (2, 7, 0, 1)]))
     pq.write_table(change(pq.read_table(path)), path)
     with pytest.raises(DataError, match=message):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 def test_a_cut_parquet_file_is_an_error(tmp_path):
@@ -197,18 +197,18 @@ def test_a_cut_parquet_file_is_an_error(tmp_path):
     plugins.load("formats", "parquet").write(path, make_events([(1, 0, 0, 1)]))
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(DataError, match=r"a\.parquet: not a complete Parquet file"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 def test_parquet_in_a_folder_named_like_a_partition_has_no_extra_column(tmp_path):
     path = tmp_path / "class=person" / "a.parquet"
     path.parent.mkdir()
     plugins.load("formats", "parquet").write(path, make_events([(1, 2, 3, 0)]))
-    assert to_rows(files.read_events_file(path)) == [(1, 2, 3, 0)]
+    assert to_rows(event_files.read_events_file(path)) == [(1, 2, 3, 0)]
 
 
 def test_summary_of_a_few_events_and_of_none():
-    assert files.summarise(make_events([(7, 0, 0, 1), (7, 1, 0, 0), (10, 2, 0, 1)])) == {
+    assert event_files.summarise(make_events([(7, 0, 0, 1), (7, 1, 0, 0), (10, 2, 0, 1)])) == {
         "num_events": 3,
         "duration_us": 3,
         "t_first_us": 7,
@@ -216,4 +216,4 @@ def test_summary_of_a_few_events_and_of_none():
         "num_positive": 2,
         "num_negative": 1,
     }
-    assert set(files.summarise(make_events([])).values()) == {0}
+    assert set(event_files.summarise(make_events([])).values()) == {0}

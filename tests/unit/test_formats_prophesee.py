@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.decoding import prophesee, prophesee_decoding, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
@@ -113,7 +113,7 @@ def decode(encoding: str, words: list[int], block: int = 1 << 30) -> list[tuple[
 def test_real_words_decode_as_in_the_slow_decoder(path, slow):
     encoding = prophesee.read_header(path).encoding
     words = np.frombuffer(path.read_bytes()[prophesee.read_header(path).size :], prophesee.WORD_DTYPES[encoding])
-    assert to_rows(files.read_events_file(path)) == slow(words.tolist())
+    assert to_rows(event_files.read_events_file(path)) == slow(words.tolist())
 
 
 # Words, one rule at a time --------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ def test_written_vectors_decode_to_the_same_events_in_fewer_words(tmp_path_facto
     plugins.load("formats", "evt3").write(path, make_events(rows))
     words = np.fromfile(path, "<u2", offset=prophesee.read_header(path).size).tolist()
     assert slow_evt3(words) == rows
-    assert to_rows(files.read_events_file(path)) == rows
+    assert to_rows(event_files.read_events_file(path)) == rows
     kinds = [word >> 12 for word in words]
     singles = sum(kind in (0, 6, 8) for kind in kinds) + len(rows)
     assert len(words) <= singles
@@ -262,7 +262,7 @@ ONE_EVENT = {"EVT2": [0x80000000, 0x10000000 | 9 << 11 | 8], "EVT3": [0x8000, 0x
 )
 def test_sensor_size_from_the_header(encoding, header, expected, tmp_path):
     path = write_raw(tmp_path / "a.raw", encoding, ONE_EVENT[encoding], header.format(encoding))
-    events = files.read_events_file(path)
+    events = event_files.read_events_file(path)
     assert events.sensor_size == expected
     assert to_rows(events) == [(0, 9, 8, 1)]
 
@@ -280,9 +280,9 @@ def test_sensor_size_from_the_coordinates(x, y, expected, tmp_path):
     path = write_raw(tmp_path / "a.raw", "EVT2", [0x80000000, x << 11 | y], header="")
     if expected is None:
         with pytest.raises(DataError, match="x = 1280, y = 0 px fit none of the known sensors 304 x 240"):
-            files.read_events_file(path)
+            event_files.read_events_file(path)
     else:
-        assert files.read_events_file(path).sensor_size == expected
+        assert event_files.read_events_file(path).sensor_size == expected
 
 
 @pytest.mark.parametrize("encoding", ["EVT2", "EVT3"])
@@ -290,15 +290,15 @@ def test_headers_of_any_length_leave_the_words_readable(encoding, tmp_path):
     for padding in range(4):  # words then start on every alignment
         header = "% end" + " " * padding + "\n"
         path = write_raw(tmp_path / f"{padding}.raw", encoding, ONE_EVENT[encoding], header)
-        assert to_rows(files.read_events_file(path)) == [(0, 9, 8, 1)]
+        assert to_rows(event_files.read_events_file(path)) == [(0, 9, 8, 1)]
 
 
 def test_a_valid_file_without_events_is_empty(tmp_path):
     path = write_raw(tmp_path / "a.raw", "EVT3", [0x8000, 0x6001])
-    assert len(files.read_events_file(path)) == 0
+    assert len(event_files.read_events_file(path)) == 0
     path = write_raw(tmp_path / "b.raw", "EVT3", [0x8000, 0x6001], header="")
     with pytest.raises(DataError, match=r"b\.raw: neither the header nor any event tells the sensor size"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 # Broken files ------------------------------------------------------------------------------------------------------
@@ -308,7 +308,7 @@ def test_a_valid_file_without_events_is_empty(tmp_path):
 def test_a_header_without_words_is_an_error(encoding, tmp_path):
     path = write_raw(tmp_path / "a.raw", encoding, [])
     with pytest.raises(DataError, match=rf"a\.raw: the file ends after its 29-byte header, expected {encoding} words"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 @pytest.mark.parametrize(("encoding", "cuts"), [("EVT2", (1, 2, 3)), ("EVT3", (1,))])
@@ -318,13 +318,13 @@ def test_a_file_cut_inside_a_word_is_an_error(encoding, cuts, tmp_path):
     for cut in cuts:
         path.write_bytes(content[:-cut])
         with pytest.raises(DataError, match=r"a\.raw: cut inside a word"):
-            files.read_events_file(path)
+            event_files.read_events_file(path)
 
 
 def test_time_that_runs_backwards_names_the_event(tmp_path):
     path = write_raw(tmp_path / "a.raw", "EVT3", [0x8010, 0x0000, 0x2001, 0x800F, 0x2002])
     with pytest.raises(DataError, match=r"a\.raw: t decreases at event 1: 65536 us, then 61440 us"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 def test_a_vector_that_runs_off_the_sensor_is_an_error_and_does_not_wrap(tmp_path):
@@ -332,10 +332,10 @@ def test_a_vector_that_runs_off_the_sensor_is_an_error_and_does_not_wrap(tmp_pat
     words = [0x8000, 0x0000, 0x3000, *[0x4000] * 5500, 0x4001]
     path = write_raw(tmp_path / "a.raw", "EVT3", words)
     with pytest.raises(DataError, match=r"a\.raw: x must be below 640, got 65535 at event 0"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 def test_big_endian_words_are_refused(tmp_path):
     path = write_raw(tmp_path / "a.raw", "EVT3", [0x8000], "% endianness big\n% geometry 640x480\n")
     with pytest.raises(DataError, match="expected little-endian words, the header says 'big'"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)

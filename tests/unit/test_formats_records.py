@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.decoding import event_pieces, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
@@ -65,7 +65,7 @@ def write_dat(path: Path, rows: list[Row], header: str = SIZED, kind: int = 12, 
 def test_dat_of_both_event_types(kind, tmp_path):
     rows = [(0, 0, 0, 0), (7, 303, 239, 1), (7, 5, 6, 1)]
     path = write_dat(tmp_path / "a.dat", rows, kind=kind)
-    assert files.find_format(path).__name__.endswith(".dat")
+    assert event_files.find_format(path).__name__.endswith(".dat")
     events = read_both_ways(path, "dat")
     assert to_rows(events) == rows
     assert events.sensor_size == (304, 240)
@@ -112,7 +112,7 @@ def test_dat_broken_files(tmp_path):
     raises_both_ways(write_dat(path, [(0, 0, 0, 0)], kind=40), "dat", r"got type 40 \(external trigger\)")
     path.write_bytes(SIZED.encode())
     with pytest.raises(DataError, match="not an event file"):
-        files.find_format(path)
+        event_files.find_format(path)
 
 
 def test_dat_writer_refuses_gaps_a_reader_could_not_count(tmp_path):
@@ -179,7 +179,7 @@ def test_atis_is_recognised_by_plausible_times_alone(tmp_path):
     random = np.random.default_rng(0)
     times = np.sort(random.integers(0, 300_000, 5000)).tolist()
     path = write_atis(tmp_path / "a.anything", [(t, 5, 6, 1) for t in times])
-    assert files.find_format(path) is module
+    assert event_files.find_format(path) is module
     shuffled = random.permutation(times).tolist()
     for content in (
         write_atis(path, [(t, 5, 6, 1) for t in shuffled]).read_bytes(),
@@ -193,7 +193,7 @@ def test_atis_is_recognised_by_plausible_times_alone(tmp_path):
     times[1000] = times[999] - 1  # one slip is for `read` to name
     write_atis(path, [(t, 5, 6, 1) for t in times])
     with pytest.raises(DataError, match="t decreases at event 1000"):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
     few = write_atis(tmp_path / "few.bin", [(0, 5, 200, 1)])
     assert module.sniff(few)
     assert not module.sniff(few.rename(tmp_path / "few.dat"))
@@ -215,7 +215,7 @@ def davis(x: int, y: int, p: int, camera: int = 0) -> int:
 def test_aedat2_image_is_turned_upright(tmp_path):
     path = write_aedat2(tmp_path / "a.aedat", [(davis(0, 0, 1), 3), (davis(239, 179, 0), 3), (davis(1, 2, 0), 4)])
     events = read_both_ways(path, "aedat2")
-    assert files.find_format(path).__name__.endswith(".aedat2")
+    assert event_files.find_format(path).__name__.endswith(".aedat2")
     assert events.sensor_size == (240, 180)
     assert to_rows(events) == [(3, 239, 179, 1), (3, 0, 0, 0), (4, 238, 177, 0)]
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.recfunctions import repack_fields
 
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.decoding import event_tables
 from data_contracts.errors import DataError
 
@@ -132,7 +132,7 @@ def test_pickled_objects_are_refused_and_never_run(tmp_path):
     raises_both_ways(tmp_path / "b.npz", "sensor_size.*Python objects, which only a pickle can hold")
     (tmp_path / "c.npy").write_bytes(pickle.dumps(Trap()))
     with pytest.raises(DataError, match="not an event file"):
-        files.read_events_file(tmp_path / "c.npy")
+        event_files.read_events_file(tmp_path / "c.npy")
     assert RAN == []
 
 
@@ -142,7 +142,7 @@ def test_a_cut_npy_is_an_error(cut, tmp_path):
     content = (tmp_path / "a.npy").read_bytes()
     (tmp_path / "a.npy").write_bytes(content[:cut])
     with pytest.raises(DataError, match=r"a\.npy: not (a complete NumPy|an event) file"):
-        files.read_events_file(tmp_path / "a.npy")
+        event_files.read_events_file(tmp_path / "a.npy")
 
 
 def test_npy_of_another_shape_is_an_error(tmp_path):
@@ -187,7 +187,7 @@ def test_npz_with_other_content_is_an_error(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("letter.txt", "hello")
     with pytest.raises(DataError, match="not an event file"):
-        files.find_format(path)
+        event_files.find_format(path)
 
 
 def test_a_damaged_npz_is_an_error(tmp_path):
@@ -216,7 +216,7 @@ def test_a_column_that_says_microseconds_holds_microseconds(tmp_path):
             file[f"events/{name}"] = values
     (tmp_path / "d.csv").write_text("x,y,time_us,p\n1,1,1000.0,1\n2,2,2000,0\n")
     for name in ("a.npz", "b.npy", "c.h5", "d.csv"):
-        assert files.read_events_file(tmp_path / name).t.tolist() == [1000, 2000]
+        assert event_files.read_events_file(tmp_path / name).t.tolist() == [1000, 2000]
     (tmp_path / "e.csv").write_text("x,y,time_us,p\n1,1,1000.5,1\n")
     raises_both_ways(tmp_path / "e.csv", "not a whole number")
     np.savez(tmp_path / "f.npz", t_us=-t, x=x, y=x, p=p)

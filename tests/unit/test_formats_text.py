@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from data_contracts.errors import DataError
 
 SECONDS = "".join(f"{t / 1e6:.9f} {x} {y} {p}\n" for t, x, y, p in zip(T, X, Y, P, strict=True))
@@ -75,7 +75,7 @@ def test_wrong_text_names_the_row(text, message, tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(text)
     with pytest.raises(DataError, match=message):
-        files.read_events_file(path)
+        event_files.read_events_file(path)
 
 
 def test_text_is_parsed_the_same_across_blocks(tmp_path, monkeypatch):

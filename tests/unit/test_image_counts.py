@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core import plugins
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut
 from ctlev_core.postprocessing.image_count_kernels import find_scale_ranges, settle_saturated
 from ctlev_core.postprocessing.image_counts import estimate_counts, fit_counts
@@ -123,7 +123,7 @@ def test_black_white_and_random_images(options):
 
 def test_the_real_person_comes_back_exactly(real_recordings):
     (path,) = (real_recordings / "person").iterdir()
-    events = files.read_events_file(path)
+    events = event_files.read_events_file(path)
     for options in ALL_OPTIONS:
         for num_events in (500, 7500):
             counts = ENCODING.encode(events, cut(events, Windows(num_events=num_events, max_windows=12)), options)

@@ -18,7 +18,7 @@ from test_smpl_arrays import mdm_parameters
 
 from ctlev_core import plugins
 from ctlev_core.body.layer import load_body, pose_vertices
-from ctlev_core.body.motion import files
+from ctlev_core.body.motion import files as clip_files
 from ctlev_core.body.motion.clip import MotionClip, move_world
 from ctlev_core.body.motion.ground_level import put_feet_on_ground
 from ctlev_core.body.rotations import matrix_from_axis_angle
@@ -221,11 +221,11 @@ def test_a_file_that_two_formats_claim_is_refused(tmp_path, monkeypatch):
     write_bvh(tmp_path / "a.bvh", *standing())
     monkeypatch.setattr(plugins.load("motions", "deepmimic"), "sniff", lambda path: True)
     with pytest.raises(DataError, match=r"a\.bvh: could be any of the formats bvh, deepmimic"):
-        files.read_motion(tmp_path / "a.bvh")
+        clip_files.read_motion(tmp_path / "a.bvh")
     with pytest.raises(DataError, match="expected a motion file, got nothing there"):
-        files.read_motion(tmp_path / "absent.bvh")
+        clip_files.read_motion(tmp_path / "absent.bvh")
     with pytest.raises(DataError, match="expected a motion file, got a folder"):
-        files.read_motion(tmp_path)
+        clip_files.read_motion(tmp_path)
 
 
 def test_the_options_say_what_is_wrong():

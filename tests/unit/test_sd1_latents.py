@@ -23,7 +23,7 @@ from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.training.finetuning import fine_tune
 from ctlev_core.diffusion.training.latent_cache import cache_latents, check_cache
 from ctlev_core.diffusion.training.options import FineTuningOptions
-from ctlev_core.events import files
+from ctlev_core.events import files as event_files
 from ctlev_core.events.image_resampling import resample_images
 from data_contracts.config import EncodingChoice
 from data_contracts.labels import Conditions
@@ -53,7 +53,7 @@ def onto_512_px(images: np.ndarray) -> np.ndarray:
 
 def drawn(folder: str, num_events: int) -> np.ndarray:
     encoding = plugins.load_options(EncodingChoice(name="event_histogram"))
-    events = files.read_events_file(min((REAL_DATA / folder).iterdir()))
+    events = event_files.read_events_file(min((REAL_DATA / folder).iterdir()))
     first = (len(events) - num_events) // 2
     window = np.array([[first, first + num_events]])
     return encoding.module.render_image(encoding.module.encode(events, window, encoding.options), encoding.options)

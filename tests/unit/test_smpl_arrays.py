@@ -10,7 +10,7 @@ import pytest
 from motion_writers import smpl_positions
 from scipy.spatial.transform import Rotation
 
-from ctlev_core.body.motion import files
+from ctlev_core.body.motion import files as motion_files
 from ctlev_core.body.motion.clip import REST_PELVIS, MotionClip, take
 from ctlev_core.motions import smpl_arrays
 from ctlev_core.safe_files import numpy_files
@@ -89,7 +89,7 @@ def test_every_layout_is_the_same_motion(layout, num_frames, dtype, tmp_path):
 def test_the_rate_is_what_the_file_says_or_else_the_caller(tmp_path):
     np.save(tmp_path / "a.npy", flat())
     np.testing.assert_allclose(smpl_arrays.read(tmp_path / "a.npy", 50.0).time_s, np.arange(NUM_FRAMES) / 50)
-    np.testing.assert_allclose(files.read_motion(tmp_path / "a.npy", 10.0).time_s, np.arange(NUM_FRAMES) / 10)
+    np.testing.assert_allclose(motion_files.read_motion(tmp_path / "a.npy", 10.0).time_s, np.arange(NUM_FRAMES) / 10)
     for name in ("fps", "mocap_framerate"):
         np.savez(tmp_path / "a.npz", poses=flat(), **{name: np.array(60)})
         np.testing.assert_allclose(smpl_arrays.read(tmp_path / "a.npz", 50.0).time_s, np.arange(NUM_FRAMES) / 60)
@@ -102,7 +102,7 @@ def test_named_arrays(names, tmp_path):
     pose_name, transl_name, betas_name = names
     arrays = {pose_name: poses(), transl_name: transl(), betas_name: BETAS}
     np.savez(tmp_path / "a.npz", **arrays, unrelated=np.array([{}], object))
-    assert files.find_format(tmp_path / "a.npz") is smpl_arrays
+    assert motion_files.find_format(tmp_path / "a.npz") is smpl_arrays
     check(smpl_arrays.read(tmp_path / "a.npz"), NUM_FRAMES, True, True)
     np.savez_compressed(tmp_path / "a.npz", **{**arrays, betas_name: shapes()})
     check(smpl_arrays.read(tmp_path / "a.npz"), NUM_FRAMES, True, True)
@@ -132,7 +132,7 @@ def mdm_parameters() -> dict:
 
 def test_the_dictionary_of_mdm(tmp_path):
     np.save(tmp_path / "a.npy", mdm_parameters(), allow_pickle=True)
-    assert files.find_format(tmp_path / "a.npy") is smpl_arrays
+    assert motion_files.find_format(tmp_path / "a.npy") is smpl_arrays
     clip = smpl_arrays.read(tmp_path / "a.npy")
     check(clip, NUM_FRAMES, True, False)
     assert clip.caption == "a person jumps"
@@ -161,7 +161,7 @@ def test_code_in_a_pickle_is_not_run(tmp_path):
     for loaded in ({"thetas": RunsCode(f"touch {mark}")}, RunsCode(f"touch {mark}; : thetas")):
         np.save(tmp_path / "a.npy", np.array(loaded, object), allow_pickle=True)
         with pytest.raises(DataError, match=r"a\.npy: refused: it names (posix|nt)\.system"):
-            files.read_motion(tmp_path / "a.npy")
+            motion_files.read_motion(tmp_path / "a.npy")
     assert not mark.exists()
 
 

@@ -1,4 +1,4 @@
-"""The section of the report that says which generated frames the gate refused; see `ctlev_core.postprocessing.rejection`."""
+"""The section of the report that says which generated frames the gate refused; see `postprocessing/rejection.py`."""
 
 from __future__ import annotations
 
