@@ -17,7 +17,7 @@ from ctlev_core.diffusion.pretrained.single_file import (
 from ctlev_core.safe_files.tensor_files import check_finite
 from data_contracts.errors import DataError
 
-BUNDLED_PRIOR = Path(__file__).resolve().parents[1] / "priors" / "small"
+BUNDLED_PRIOR = Path(__file__).resolve().parents[2] / "priors" / "small"
 """Of people, and a little of things: what ControlNets steer."""
 BUNDLED_OBJECT_PRIOR = BUNDLED_PRIOR.with_name("small_objects")
 """The same networks without ControlNet, taught the names of things: for the text route."""

@@ -83,7 +83,7 @@ def child_environment(environment: Mapping[str, str], count: int) -> dict[str, s
         for name, value in environment.items()
         if name not in LAUNCHER_VARIABLES and not name.startswith(LAUNCHER_PREFIXES)
     }
-    root = str(Path(__file__).resolve().parents[2])
+    root = str(Path(__file__).resolve().parents[3])
     kept["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [kept.get("PYTHONPATH")])])
     kept.setdefault("OMP_NUM_THREADS", str(max(1, num_cores() // count)))
     return kept
