@@ -11,7 +11,13 @@ from ctlev_core.diffusion.pretrained.loading import encode_prompts, images_to_te
 from ctlev_core.diffusion.sampling import value_table
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
-from ctlev_core.diffusion.sampling.value_table import draw_values, fit_value_table, read_value_table, write_value_table
+from ctlev_core.diffusion.sampling.value_table import (
+    draw_values,
+    fit_value_table,
+    nearest_values,
+    read_value_table,
+    write_value_table,
+)
 from ctlev_core.diffusion.training.finetuning import fine_tune
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.errors import DataError
@@ -119,3 +125,12 @@ def test_rows_of_different_prompts_are_embedded_in_their_order():
     prior = make_prior()
     one, other = encode_prompts(prior, ["a photo of a cup", "a photo of a ball"])
     assert not torch.equal(one, other)
+
+
+def test_nearest_values_are_the_nearest_that_were_seen():
+    table = np.zeros((256, 256), np.float32)
+    table[:, [0, 25, 51, 255]] = 0.25
+    expected = np.arange(256.0)[:, None, None, None].repeat(3, axis=3)
+    found = draw_values(expected, nearest_values(table), [(row,) for row in range(256)])[:, 0, 0]
+    for value, row in zip(range(256), found, strict=True):
+        assert (row == min((0, 25, 51, 255), key=lambda level: (abs(level - value), level))).all()

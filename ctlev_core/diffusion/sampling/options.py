@@ -70,10 +70,11 @@ class SamplingOptions(Frozen):
         le=255,
         description="channel values below become 0: a decoder never gives the exact black of no event",
     )
-    values: Literal["expected", "drawn"] = Field(
+    values: Literal["expected", "nearest", "drawn"] = Field(
         default="expected",
-        description="expected = what the network gives; drawn = as real values scatter about that, which a generator "
-        "trained with values_at has measured",
+        description="expected = what the network gives; nearest = the nearest value that training frames have, such as "
+        "that of a whole count; drawn = as their values scatter about what is expected. The latter two need a "
+        "generator trained with values_at",
     )
     precision: Literal["float32", "bfloat16", "float16"] = Field(
         default="float32", description="of the networks; the state of the solver stays float32"

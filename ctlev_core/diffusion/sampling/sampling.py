@@ -38,7 +38,7 @@ from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions, n
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from ctlev_core.diffusion.sampling.schedulers import make_scheduler as make_scheduler
 from ctlev_core.diffusion.sampling.shards import Shard, plan_shards
-from ctlev_core.diffusion.sampling.value_table import draw_values, read_value_table
+from ctlev_core.diffusion.sampling.value_table import draw_values, nearest_values, read_value_table
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
@@ -273,8 +273,9 @@ def load_for_sampling(checkpoint: Path, options: SamplingOptions, device: str, w
 
     place, dtype = choose_device(device), getattr(torch, options.precision)
     prior = load_prior(checkpoint, with_controlnet=with_controlnet, dtype=dtype, device=place)
-    if options.values == "drawn":
-        prior = dataclasses.replace(prior, value_table=read_value_table(checkpoint))
+    if options.values != "expected":
+        table = read_value_table(checkpoint)
+        prior = dataclasses.replace(prior, value_table=table if options.values == "drawn" else nearest_values(table))
     if not isinstance(prior.vae, PatchAutoencoder) or dtype == torch.float32:
         return prior
     exact: Any = PatchAutoencoder.from_config(prior.vae.config)

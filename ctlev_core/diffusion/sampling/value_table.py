@@ -86,6 +86,16 @@ def draw_values(expected: np.ndarray, table: np.ndarray, seeds: Sequence[tuple[i
     return drawn
 
 
+def nearest_values(table: np.ndarray) -> np.ndarray:
+    """A table [256, 256] of the same values in which each expected value has the nearest one, the lower of two.
+
+    For networks that draw the scatter themselves, whose samples are real values but for small errors.
+    """
+    seen = np.flatnonzero(table.any(axis=0))
+    nearest = seen[np.abs(np.arange(256)[:, None] - seen).argmin(axis=1)]
+    return np.eye(256, dtype=np.float32)[nearest]
+
+
 def write_value_table(checkpoint: Path, table: np.ndarray) -> None:
     """Into the folder of a checkpoint; diffusers leaves what it does not know alone."""
     folder = checkpoint / TABLE_FOLDER
@@ -102,7 +112,7 @@ def read_value_table(checkpoint: Path) -> np.ndarray:
     path = checkpoint / TABLE_FOLDER / TABLE_NAME
     if not path.is_file():
         raise DataError(
-            f"{checkpoint}: sampling.values=drawn needs a checkpoint that learnt its values; train it with "
+            f"{checkpoint}: sampling.values=drawn or nearest needs a checkpoint that learnt its values; train it with "
             "generator.options.values_at above 0"
         )
     try:

@@ -39,6 +39,7 @@ _FRAMES = {
 _COMPARED = (
     (REAL, BOTH, "real and synthetic frames, against real frames alone"),
     ("real+augmentation", BOTH, "real and synthetic frames, against real frames and augmented copies"),
+    ("real+augmentation", "real+synthetic+augmentation", "synthetic frames on top of augmented copies"),
     (REAL, OWN, "synthetic frames alone, against real frames alone"),
     ("random_weights", OWN, "synthetic frames: pre-trained weights against random weights"),
     ("real+simulator", BOTH, "real and synthetic frames, against real and simulated frames"),
