@@ -20,7 +20,7 @@ from ctlev_core.events.decoding import event_pieces
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "events"
+REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real" / "events"
 SIZE = (640, 480)
 WRITABLE = {
     "aedat2": (346, 260),

@@ -123,7 +123,7 @@ with claimed(pathlib.Path(sys.argv[1])):
 def test_one_run_at_a_time(folder):
     process = subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(folder)],
-        cwd=Path(__file__).resolve().parents[2],
+        cwd=Path(__file__).resolve().parents[3],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
@@ -153,7 +153,7 @@ def test_damage_is_named(folder, file):
         next_number(folder)
     if file != "claimed.json":
         with pytest.raises(DataError, match=file):
-            kept_versions(folder.parents[1], 5)
+            kept_versions(folder.parents[2], 5)
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, [2]), (1, [4, 2]), (2, [2, 4, 2]), (9, [1, 2, 4, 2])])

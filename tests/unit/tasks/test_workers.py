@@ -14,7 +14,7 @@ from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError
 from tasks.workers import WorkerError, Workers, current_workers, together
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(autouse=True)

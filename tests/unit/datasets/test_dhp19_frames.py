@@ -19,7 +19,7 @@ from data_contracts.config import DatasetChoice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import check_labels
 
-CALIBRATION = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "dhp19_calib"
+CALIBRATION = Path(__file__).resolve().parents[3].parent / "shared" / "real" / "dhp19_calib"
 FOLDER = "h5_dataset_7500_events/346x260"
 
 

@@ -17,7 +17,7 @@ from ctlev_core.events.decoding import prophesee, prophesee_decoding, record_fil
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "events"
+REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real" / "events"
 REAL_AEDAT4 = REAL / "person" / "tonic_sample.aedat4"
 REAL_EVT2 = REAL / "spot" / "expelliarmus_evt2.raw"
 REAL_EVT3 = REAL / "street" / "expelliarmus_evt3.raw"

@@ -31,7 +31,7 @@ from data_contracts.manifest import labels_of, read_manifest
 from tasks.ingest import ingest
 from tasks.store import Store
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "motion"
+REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real" / "motion"
 
 
 def npy_bytes(array: np.ndarray) -> bytes:

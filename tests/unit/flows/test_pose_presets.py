@@ -23,7 +23,7 @@ from tasks.encode import encode
 from tasks.ingest import ingest
 from tasks.store import Store
 
-PRESETS = Path(__file__).resolve().parents[2] / "flows" / "presets"
+PRESETS = Path(__file__).resolve().parents[3] / "flows" / "presets"
 
 
 def dhp19_raw(root: Path) -> None:

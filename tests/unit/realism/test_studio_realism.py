@@ -20,7 +20,7 @@ from ctlev_core.sensor.calibration import calibrate
 from ctlev_core.sensor.dvs_pixel import PRESETS
 from data_contracts.config import DatasetChoice
 
-PRESET = Path(__file__).resolve().parents[2] / "flows" / "presets" / "studio_person.yaml"
+PRESET = Path(__file__).resolve().parents[3] / "flows" / "presets" / "studio_person.yaml"
 NUM_RECORDINGS = 4
 """One of each motion that is learnt from; 2 to 3 s each."""
 FACTOR_OF_MEAN, FACTOR_OF_EACH = 3.0, 10.0

@@ -14,7 +14,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import check_events
 from data_contracts.labels import Conditions
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real"
+REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real"
 SIZE = (34, 34)
 SIDE = 28
 STILL = {

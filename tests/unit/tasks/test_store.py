@@ -246,7 +246,7 @@ sys.stdin.read()
 def test_nothing_is_pruned_while_a_run_uses_the_store_and_a_killed_run_frees_it(tmp_path):
     store = Store(tmp_path)
     folder = add(store, 1)
-    repository = Path(__file__).resolve().parents[2]
+    repository = Path(__file__).resolve().parents[3]
     user = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(USER), str(tmp_path), folder.name],
         cwd=repository,

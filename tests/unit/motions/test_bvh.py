@@ -27,7 +27,7 @@ from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from ctlev_core.motions import bvh
 from data_contracts.errors import DataError
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "motion"
+REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real" / "motion"
 NUM_JOINTS = len(T_POSE)
 # Seven digits more than a pose has anyway; what is left comes from rounding in the logarithm of a rotation.
 LIMIT_DEG = 1e-5

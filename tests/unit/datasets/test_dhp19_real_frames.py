@@ -22,7 +22,7 @@ from tasks.encode import encode
 from tasks.ingest import ingest
 from tasks.store import Store
 
-REAL_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "real"
+REAL_DATA = Path(__file__).resolve().parents[3].parent / "shared" / "real"
 CAMERAS = (2, 3)
 PRINTED = REAL_DATA / "dhp19_frames" / "printed_coordinates.txt"
 

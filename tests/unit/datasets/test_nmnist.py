@@ -11,7 +11,7 @@ from ctlev_core.datasets import nmnist
 from ctlev_core.events.windows import time_bins
 from data_contracts.errors import DataError
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "nmnist"
+REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real" / "nmnist"
 COUNT = 20
 
 

@@ -11,7 +11,7 @@ from ctlev_core.sensor.dvs_pixel import PRESETS, SensorOptions, read_preset, sam
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
-REAL_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "real"
+REAL_DATA = Path(__file__).resolve().parents[3].parent / "shared" / "real"
 WIDTH, HEIGHT, SECONDS = 96, 72, 6
 
 

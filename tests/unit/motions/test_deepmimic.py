@@ -18,7 +18,7 @@ from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from ctlev_core.motions import deepmimic
 from data_contracts.errors import DataError
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "motion"
+REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real" / "motion"
 MOTIONS = ("cartwheel", "dance_a", "jump", "kick", "punch", "run", "spinkick", "walk")
 FACING = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
 """x forward, z right to z forward, x left."""
