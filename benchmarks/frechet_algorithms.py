@@ -7,12 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg
 
-from ctlev_core.scoring.frechet import frechet_distance, frechet_distance_of_gaussians, frechet_distance_of_statistics
+from ctlev_core.scoring.frechet import frechet_distance, frechet_distance_of_gaussians
 from ctlev_core.scoring.frechet_extended import refined_frechet_distance
-from ctlev_core.scoring.gaussians import FeatureStream
+from ctlev_core.scoring.gaussians import gaussian_from_statistics
 
 Distance = Callable[[np.ndarray, np.ndarray], float]
-STREAM_ROWS = 64
 
 
 def statistics(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,25 +55,15 @@ def by_exact_route(a: np.ndarray, b: np.ndarray) -> float:
     return frechet_distance(a, b, tolerance=0)
 
 
-def by_stream(a: np.ndarray, b: np.ndarray) -> float:
-    """Ours, from batches of 64 rows."""
-    streams = FeatureStream(), FeatureStream()
-    for stream, features in zip(streams, (a, b), strict=True):
-        for start in range(0, len(features), STREAM_ROWS):
-            stream.add(features[start : start + STREAM_ROWS])
-    return frechet_distance_of_gaussians(streams[0].result(), streams[1].result())
-
-
 def by_statistics(a: np.ndarray, b: np.ndarray) -> float:
     """Ours, from means and covariances alone."""
-    return frechet_distance_of_statistics(*statistics(a), *statistics(b))
+    return frechet_distance_of_gaussians(*(gaussian_from_statistics(*statistics(features)) for features in (a, b)))
 
 
 PEERS: dict[str, Distance] = {"sqrtm": by_sqrtm, "eigvals": by_eigenvalues, "eigh": by_symmetric_eigenvalues}
 OURS: dict[str, Distance] = {
     "ctlev": refined_frechet_distance,
     "exact route": by_exact_route,
-    "stream": by_stream,
     "statistics": by_statistics,
 }
 

@@ -39,7 +39,7 @@ ROWS = (500, 2000, 10_000)
 LARGEST = (2048, 10_000)
 ERROR_WANTED, SQRTM_WANTED, FEW_ROWS_WANTED, POSES_WANTED = 1e-12, 4.0, 100.0, 20.0
 LEAST_SECONDS = 0.1
-CONSERVATIVE = ("ctlev", "exact route", "stream")
+CONSERVATIVE = ("ctlev", "exact route")
 """What is to keep the wanted error; a covariance alone does not hold enough digits for it."""
 
 

@@ -26,9 +26,7 @@ from ctlev_core.scoring.gaussians import (
     GaussianFactor,
     check_features,
     check_same_width,
-    check_statistics,
     fit_gaussian,
-    gaussian_from_statistics,
     mean_and_covariance,
 )
 
@@ -84,42 +82,6 @@ def frechet_distance_of_gaussians(a: GaussianFactor, b: GaussianFactor, *, toler
     scale = _scale(difference, a.root, b.root)
     shift = _squared(difference / scale)
     return (shift + _bures(a.root / scale, b.root / scale, shift, tolerance)) * scale**2
-
-
-def frechet_distance_of_statistics(
-    mean_a: np.ndarray,
-    covariance_a: np.ndarray,
-    mean_b: np.ndarray,
-    covariance_b: np.ndarray,
-    *,
-    tolerance: float = TOLERANCE,
-) -> float:
-    """Squared Frechet distance of two Gaussians given by means [D] and covariances [D, D]; never negative.
-
-    Covariances hold fewer digits than features do: 1e-16 of its size is the least that is left of a direction that has
-    no variance (`gaussian_from_statistics`).
-
-    Args:
-        mean_a: [D].
-        covariance_a: [D, D].
-        mean_b: [D].
-        covariance_b: [D, D].
-        tolerance: as for `frechet_distance`.
-    Raises:
-        DataError: shapes do not fit, a value is not finite, or a matrix is no covariance.
-        ValueError: the two have different numbers of dimensions.
-    """
-    checked_a, checked_b = check_statistics(mean_a, covariance_a), check_statistics(mean_b, covariance_b)
-    check_same_width(checked_a[1], checked_b[1])
-    difference = checked_a[0] - checked_b[0]
-    scale = _scale(difference, *(np.sqrt(np.diag(covariance)) for _, covariance in (checked_a, checked_b)))
-    if tolerance > 0:
-        shift = _squared(difference / scale)
-        bures = _bures_by_cholesky(checked_a[1] / scale**2, checked_b[1] / scale**2, shift, tolerance)
-        if bures is not None:
-            return (shift + bures) * scale**2
-    a, b = gaussian_from_statistics(mean_a, covariance_a), gaussian_from_statistics(mean_b, covariance_b)
-    return frechet_distance_of_gaussians(a, b, tolerance=tolerance)
 
 
 def _bures(root_a: np.ndarray, root_b: np.ndarray, shift: float, tolerance: float) -> float:

@@ -1,4 +1,4 @@
-"""Gaussians fitted to features, the covariance kept as a root: from arrays, from a stream, or from stored statistics.
+"""Gaussians fitted to features, the covariance kept as a root: from arrays, or from stored statistics.
 
 A root R of a covariance, R^T R = cov, is got from the centred features by QR, without forming the covariance. That
 keeps what squaring loses: directions in which the features do not vary have length 0 rather than the square root of a
@@ -19,7 +19,6 @@ from data_contracts.errors import DataError
 
 BLOCK_NUMBERS = 2**21
 """So many stay in the last cache."""
-LEAST_STREAM_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,69 +137,6 @@ def triangular(rows: np.ndarray) -> np.ndarray:
     from scipy.linalg import qr
 
     return np.asarray(qr(rows, mode="r", overwrite_a=True, check_finite=False)[0])[: rows.shape[1]]
-
-
-class FeatureStream:
-    """Fits a Gaussian to features that come in batches; keeps at most max(256, 2 D) + D rows of them.
-
-    Rows are collected into blocks of fixed size before anything is computed, so that the result is the same to the
-    last bit however the rows are divided into batches.
-    """
-
-    def __init__(self, name: str = "feature") -> None:
-        self.name = name
-        self.count = 0
-        self._num_merged = self._num_waiting = 0
-        self._origin = self._block = self._mean = self._root = np.zeros((0, 0))
-
-    def add(self, features: np.ndarray) -> None:
-        """Take in a batch [N, D], N >= 0.
-
-        Raises:
-            ValueError: not real [N, D], another D than before, or a value is not finite; names the row counted from the
-                start of the stream. Nothing of the batch is taken in then.
-        """
-        features = check_features(features, self.name, least_rows=0, first_row=self.count)
-        if not len(features):
-            return
-        if not self.count:
-            width = features.shape[1]
-            self._origin = features[0].astype(np.float64)
-            self._mean, self._root = np.zeros(width), np.zeros((0, width))
-            self._block = np.empty((max(LEAST_STREAM_ROWS, 2 * width), width))
-        check_same_width(self._block, features)
-        self.count += len(features)
-        while len(features):
-            taken = features[: len(self._block) - self._num_waiting]
-            place = self._block[self._num_waiting : self._num_waiting + len(taken)]
-            np.subtract(taken, self._origin, out=place)
-            self._num_waiting += len(taken)
-            features = features[len(taken) :]
-            if self._num_waiting == len(self._block):
-                self._mean, self._root = self._merge()
-                self._num_merged, self._num_waiting = self._num_merged + self._num_waiting, 0
-
-    def result(self) -> GaussianFactor:
-        """The Gaussian of all rows so far; more may be added afterwards.
-
-        Raises:
-            ValueError: fewer than two rows came.
-        """
-        if self.count < 2:
-            raise ValueError(f"{self.name} set: a covariance needs at least 2 rows, got {self.count}")
-        mean, root = self._merge()
-        return GaussianFactor(self.count, self._origin, mean, root / np.sqrt(self.count - 1))
-
-    def _merge(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean [D] and root of the scatter matrix of what is merged and what is waiting."""
-        if not self._num_waiting:
-            return self._mean, self._root
-        rows = self._block[: self._num_waiting].copy()
-        difference = centre(rows) - self._mean
-        share = self._num_waiting / (self._num_merged + self._num_waiting)
-        if self._num_merged:
-            rows = np.concatenate([self._root, rows, np.sqrt(self._num_merged * share) * difference[None]])
-        return self._mean + difference * share, triangular(rows)
 
 
 def gaussian_from_statistics(mean: np.ndarray, covariance: np.ndarray, count: int = 0) -> GaussianFactor:

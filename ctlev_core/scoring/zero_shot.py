@@ -11,42 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 
 
-def balanced_rows(class_names: Sequence[str], positive: str, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of a class, and as many of the other classes, drawn without replacement and evenly over those classes.
-
-    Where the others are fewer, so many rows of the class are drawn instead.
-
-    Args:
-        class_names: [N] class of each row.
-        positive: the class to tell from the others.
-        seed: of the drawing.
-    Returns:
-        rows: [2 n] int64, ascending.
-        is_positive: [2 n] bool.
-    Raises:
-        ValueError: there is no row of the class, or of any other.
-    """
-    names = np.asarray(class_names)
-    own, others = np.flatnonzero(names == positive), np.flatnonzero(names != positive)
-    if not len(own) or not len(others):
-        raise ValueError(f"needs rows of class {positive!r} and of others, got {len(own)} and {len(others)}")
-    generator = np.random.default_rng(seed)
-    count = min(len(own), len(others))
-    chosen = np.concatenate([generator.permutation(own)[:count], _evenly(others, names, generator)[:count]])
-    order = np.argsort(chosen)
-    return chosen[order], (np.arange(2 * count) < count)[order]
-
-
-def _evenly(rows: np.ndarray, names: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """The rows in a random order in which the first rows of all classes come before the second ones, and so on."""
-    rows = generator.permutation(rows)
-    rank = np.empty(len(rows), np.int64)
-    for name in np.unique(names[rows]):
-        members = names[rows] == name
-        rank[members] = np.arange(np.count_nonzero(members))
-    return rows[np.argsort(rank, kind="stable")]
-
-
 def balanced_accuracy(is_positive: np.ndarray, is_called_positive: np.ndarray) -> float:
     """Mean of the shares of positives and of negatives that are told right; 0.5 is chance.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -160,37 +159,3 @@ def _draws(group_count: int, num_resamples: int, seed: int) -> Iterator[np.ndarr
     for start in range(0, num_resamples, chunk):
         size = min(chunk, num_resamples - start)
         yield generator.multinomial(group_count, np.full(group_count, 1 / group_count), size=size)
-
-
-@dataclass(frozen=True)
-class Spread:
-    """A score over repetitions with different seeds.
-
-    Attributes:
-        mean: over the seeds.
-        deviation: sample standard deviation (n - 1) over the seeds; NaN with one seed.
-        count: number of seeds.
-    """
-
-    mean: float
-    deviation: float
-    count: int
-
-    def text(self, digits: int = 2) -> str:
-        """For a table cell: `6.31 ± 0.02`, or the mean alone with one seed."""
-        if self.count < 2:
-            return f"{self.mean:.{digits}f}"
-        return f"{self.mean:.{digits}f} ± {self.deviation:.{digits}f}"
-
-
-def compute_spread(values: Sequence[float] | np.ndarray) -> Spread:
-    """Mean and sample standard deviation of one score over seeds.
-
-    Raises:
-        ValueError: there is no value, or one is not finite.
-    """
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
-        raise ValueError(f"needs at least one finite value a seed, got {array.tolist()}")
-    deviation = float(array.std(ddof=1)) if len(array) > 1 else float("nan")
-    return Spread(float(array.mean()), deviation, len(array))

@@ -1,13 +1,11 @@
-"""The Frechet distance of features, of a stream and of stored statistics against 60-digit arithmetic."""
+"""The Frechet distance of features and of stored statistics against 60-digit arithmetic."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from ctlev_core.scoring.frechet import frechet_distance, frechet_distance_of_gaussians, frechet_distance_of_statistics
+from ctlev_core.scoring.frechet import frechet_distance, frechet_distance_of_gaussians
 from ctlev_core.scoring.frechet_extended import refined_frechet_distance
-from ctlev_core.scoring.gaussians import FeatureStream, fit_gaussian, gaussian_from_statistics, read_statistics
+from ctlev_core.scoring.gaussians import fit_gaussian, gaussian_from_statistics, read_statistics
 from data_contracts.errors import DataError
 
 mpmath = pytest.importorskip("mpmath")
@@ -66,23 +64,16 @@ CASES = {
 }
 
 
-def streamed(features, batch):
-    stream = FeatureStream()
-    for start in range(0, len(features), batch):
-        stream.add(features[start : start + batch])
-    return stream.result()
+def distance_of_statistics(mean_a, covariance_a, mean_b, covariance_b):
+    first, second = gaussian_from_statistics(mean_a, covariance_a), gaussian_from_statistics(mean_b, covariance_b)
+    return frechet_distance_of_gaussians(first, second)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_relative_error_is_below_1e_12(name):
     a, b = CASES[name]
     exact = exact_distance(a, b)
-    for found in (
-        frechet_distance(a, b),
-        frechet_distance(b, a),
-        frechet_distance(a, b, tolerance=0),
-        frechet_distance_of_gaussians(streamed(a, 7), streamed(b, 64)),
-    ):
+    for found in (frechet_distance(a, b), frechet_distance(b, a), frechet_distance(a, b, tolerance=0)):
         assert abs(mpmath.mpf(found) - exact) <= 1e-12 * exact
 
 
@@ -93,7 +84,7 @@ def test_statistics_keep_what_a_covariance_can_hold(name):
     statistics = [number for f in (a, b) for number in (f.mean(axis=0), np.cov(f, rowvar=False))]
     # Not 1e-12: np.cov has rounded. A direction dropped or kept wrongly would cost 1e-8 of the traces.
     size = float(np.trace(statistics[1]) + np.trace(statistics[3]))
-    assert frechet_distance_of_statistics(*statistics) == pytest.approx(exact, rel=1e-11, abs=1e-12 * size)
+    assert distance_of_statistics(*statistics) == pytest.approx(exact, rel=1e-11, abs=1e-12 * size)
 
 
 def test_nearly_identical_sets_lose_only_what_their_own_rounding_does():
@@ -149,45 +140,6 @@ def test_no_condition_number_gets_past_the_estimates(smallest):
     assert abs(frechet_distance(a, b) - exact) <= 1e-12 * exact
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.integers(0, 90), min_size=1, max_size=12), st.integers(0, 1000))
-def test_a_stream_does_not_depend_on_its_batches(sizes, seed):
-    features = normal(seed, max(sum(sizes), 2) + 300)  # more rows than a block of 256
-    whole, stream = streamed(features, len(features)), FeatureStream()
-    for part in np.split(features, np.cumsum(sizes)):
-        stream.add(part)
-    split = stream.result()
-    assert split.count == len(features)
-    for field in ("origin", "offset", "root"):
-        assert np.array_equal(getattr(split, field), getattr(whole, field))
-    at_once = fit_gaussian(features)
-    np.testing.assert_allclose(split.mean, at_once.mean, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(split.covariance, np.cov(features, rowvar=False), rtol=1e-10, atol=1e-12)
-
-
-def test_a_stream_of_identical_sets_is_at_distance_zero_and_may_go_on():
-    features, stream = normal(40, 700), FeatureStream()
-    stream.add(features[:650])
-    early = stream.result()
-    stream.add(features[650:])
-    assert frechet_distance_of_gaussians(stream.result(), streamed(features, 100)) == 0
-    assert frechet_distance_of_gaussians(early, streamed(features[:650], 13)) == 0
-
-
-def test_a_stream_names_the_row_and_takes_nothing_of_a_bad_batch():
-    stream = FeatureStream("synthetic")
-    with pytest.raises(ValueError, match="synthetic set: a covariance needs at least 2 rows, got 0"):
-        stream.result()
-    stream.add(normal(41, 10))
-    broken = normal(42, 5)
-    broken[3, 0] = np.inf
-    with pytest.raises(ValueError, match=r"1 of 5 rows are not, the first is row 13"):
-        stream.add(broken)
-    with pytest.raises(ValueError, match="same number of features, got 12 and 3"):
-        stream.add(broken[:, 1:4])
-    assert stream.count == 10
-
-
 def test_statistics_of_pytorch_fid_files(tmp_path):
     a, b = normal(43, 300), normal(44, 200)
     np.savez(tmp_path / "a.npz", mu=a.mean(axis=0), sigma=np.cov(a, rowvar=False))
@@ -199,7 +151,7 @@ def test_statistics_of_pytorch_fid_files(tmp_path):
 def test_the_vector_of_pytorch_fid():
     """Distance of N(0, I) and N(1, I): the number of dimensions (mseitzer/pytorch-fid, tests/test_fid_score.py)."""
     identity = np.eye(2048)
-    assert frechet_distance_of_statistics(np.zeros(2048), identity, np.ones(2048), identity) == 2048
+    assert distance_of_statistics(np.zeros(2048), identity, np.ones(2048), identity) == 2048
 
 
 def test_statistics_stored_in_single_precision_have_its_null_directions_dropped(tmp_path):
@@ -211,7 +163,7 @@ def test_statistics_stored_in_single_precision_have_its_null_directions_dropped(
         np.savez(tmp_path / "s.npz", **arrays)
         statistics += read_statistics(tmp_path / "s.npz")
     assert gaussian_from_statistics(*statistics[:2]).root.shape == (2, D)
-    assert frechet_distance_of_statistics(*statistics) == pytest.approx(frechet_distance(a, b), rel=1e-5)
+    assert distance_of_statistics(*statistics) == pytest.approx(frechet_distance(a, b), rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -228,7 +180,7 @@ def test_statistics_that_are_none_are_refused(change, message, tmp_path):
     np.savez(tmp_path / "s.npz", **({"mu": np.zeros(3), "sigma": np.eye(3)} | change))
     with pytest.raises(DataError, match=message):
         statistics = read_statistics(tmp_path / "s.npz")
-        frechet_distance_of_statistics(*statistics, np.zeros(3), np.eye(3))
+        distance_of_statistics(*statistics, np.zeros(3), np.eye(3))
     np.savez(tmp_path / "t.npz", mu=np.zeros(3))
     with pytest.raises(DataError, match="lacks sigma; found mu"):
         read_statistics(tmp_path / "t.npz")

@@ -8,7 +8,6 @@ from ctlev_core.metrics import classification, frechet, mpjpe2d, oks, pck2d
 from ctlev_core.statistics.bootstrap import (
     bootstrap_interval,
     cluster_bootstrap,
-    compute_spread,
     ratio_bootstrap,
     score_text,
 )
@@ -208,15 +207,6 @@ def test_replicates_that_cannot_be_scored_are_left_out():
         return {"score": 1.0}
 
     assert cluster_bootstrap(compute, ["a", "b", "c"]) == ({"score": 1.0}, {"score": 1.0})
-
-
-def test_spread_over_seeds():
-    spread = compute_spread([6.0, 6.2, 6.4])
-    assert (spread.mean, spread.deviation, spread.count) == (pytest.approx(6.2), pytest.approx(0.2), 3)
-    assert spread.text() == "6.20 ± 0.20"
-    assert compute_spread([6.123]).text(1) == "6.1"
-    with pytest.raises(ValueError, match="finite value"):
-        compute_spread([1.0, float("nan")])
 
 
 def test_intervals_of_quotients_are_those_of_resampled_rows():
