@@ -79,7 +79,7 @@ def counted(real: Path) -> Iterator[list[np.ndarray]]:
 def tell(name: str, active: np.ndarray, images: list[np.ndarray]) -> list[np.ndarray]:
     """Print the share of the largest image that is lit, and hand the images on."""
     options = event_histogram.Options(image_size=(SIZES[-1],) * 2, resampling="events")
-    columns, rows = event_histogram.image_geometry.pixel_bins(active.shape[::-1], options)
+    columns, rows = event_histogram.image_grid.pixel_bins(active.shape[::-1], options)
     put = np.zeros(images[-1].shape[:2], bool)
     where = np.argwhere(active)
     put[rows[where[:, 0]], columns[where[:, 1]]] = True

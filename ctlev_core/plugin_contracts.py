@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ctlev_core.body.motion.clip import MotionClip
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.events import Events, SensorSize
 from data_contracts.labels import BodyMotions, Conditions, History, ImageTrack, Labels, Recording
@@ -149,7 +150,7 @@ class Encoding(Protocol):
     def encode(self, events: Events, windows: np.ndarray, options: Any) -> np.ndarray:
         """[N, C, H, W] of the event index ranges `windows` [N, 2] int64: uint16 counts, or float32.
 
-        At `image_geometry.count_size`: in pixels of the sensor, or with resampling `events` in those of the image. N
+        At `image_grid.count_size`: in pixels of the sensor, or with resampling `events` in those of the image. N
         may be 0, which tells how many windows fit into memory.
         """
         ...
@@ -377,10 +378,14 @@ class NamedFeatureExtractor(FeatureExtractor, Protocol):
 
 
 class Metric(Protocol):
-    """A score. `INPUT` names what it compares: `joints2d`, `joints3d`, `smpl`, `classes` or `features`."""
+    """A score. `INPUT` names what it compares: `joints2d`, `joints3d`, `smpl`, `classes` or `features`.
+
+    `SCORES` says of each of its scores, by how their names begin, whether lower is better, and what it means.
+    """
 
     VERSION: int
     INPUT: str
+    SCORES: tuple[ScoreInfo, ...]
     Options: type[Frozen]
 
     def compute(self, predicted: Any, target: Any, options: Any) -> dict[str, float]:

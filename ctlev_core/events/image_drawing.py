@@ -34,7 +34,7 @@ def draw_counts(
     """Grey levels of the image of each window.
 
     Args:
-        counts: [N, C, H, W] uint16, any number of channels, at `image_geometry.count_size`.
+        counts: [N, C, H, W] uint16, any number of channels, at `image_grid.count_size`.
         fit: size of the image, and how the sensor is fitted to it.
         normalisation: see `full_scales`.
         full_scale_count: see `full_scales`.

@@ -17,11 +17,18 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.scoring.classification import calibrate, class_scores, read_guesses
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 2
 INPUT = "classes"
+SCORES = (
+    ScoreInfo("accuracy", meaning="share of frames whose class is told right", is_share=True),
+    ScoreInfo("macro_", is_share=True),
+    ScoreInfo("chance_accuracy", meaning="accuracy of always naming the commonest class", is_share=True),
+    ScoreInfo("calibration_error", lower_is_better=True, is_share=True),
+)
 
 
 class Options(Frozen):

@@ -16,10 +16,12 @@ from pydantic import Field
 
 from ctlev_core.scoring.frechet import frechet_distance
 from ctlev_core.scoring.gaussians import check_features
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 
 VERSION = 1
 INPUT = "features"
+SCORES = (ScoreInfo("fd_infinity", lower_is_better=True), ScoreInfo("fid_infinity", lower_is_better=True))
 
 
 class Options(Frozen):

@@ -20,11 +20,13 @@ from ctlev_core.remembered_files import remembered_digest
 from ctlev_core.scoring.frechet import frechet_distance_of_gaussians
 from ctlev_core.scoring.frechet_extended import refined_frechet_distance
 from ctlev_core.scoring.gaussians import GaussianFactor, fit_gaussian, gaussian_from_statistics, read_statistics
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 
 VERSION = 3
 INPUT = "features"
+SCORES = (ScoreInfo("fd", lower_is_better=True), ScoreInfo("fid", lower_is_better=True))
 
 
 class Options(Frozen):

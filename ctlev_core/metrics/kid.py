@@ -10,10 +10,12 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from ctlev_core.scoring.kid import kernel_distance
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 
 VERSION = 2
 INPUT = "features"
+SCORES = (ScoreInfo("kid", lower_is_better=True),)
 
 
 class Options(Frozen):

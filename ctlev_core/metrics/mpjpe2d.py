@@ -15,11 +15,19 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.scoring.pose import Counted, Sums, compute_joint_errors_px, quotients, row_means, row_sums
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 1
 INPUT = "joints2d"
+SCORES = (
+    ScoreInfo(
+        "mpjpe2d",
+        lower_is_better=True,
+        meaning="mean distance between predicted and true joints in the image, in pixels",
+    ),
+)
 
 
 class Options(Frozen):

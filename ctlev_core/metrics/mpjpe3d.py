@@ -22,11 +22,19 @@ from ctlev_core.scoring.pose import (
     row_means,
     row_sums,
 )
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 2
 INPUT = "joints3d"
+SCORES = (
+    ScoreInfo(
+        "mpjpe3d",
+        lower_is_better=True,
+        meaning="mean distance between predicted and true joints in space, in millimetres",
+    ),
+)
 NAMES: dict[Alignment, str] = {"pelvis": "mpjpe3d_pelvis_mm", "procrustes": "mpjpe3d_pa_mm", "none": "mpjpe3d_mm"}
 
 

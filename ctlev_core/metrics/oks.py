@@ -23,11 +23,18 @@ from pydantic import Field, field_validator
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.scoring.pose import Sums, compute_joint_errors_px, quotients, row_means
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 1
 INPUT = "joints2d"
+SCORES = (
+    ScoreInfo(
+        "oks_ap", meaning="share of poses whose similarity to the truth reaches the limit it names", is_share=True
+    ),
+    ScoreInfo("oks_mean", is_share=True),
+)
 SIGMAS = {
     "head": 0.079, "neck": 0.079, "nose": 0.026, "eye": 0.025, "ear": 0.035,
     "shoulder": 0.079, "elbow": 0.072, "wrist": 0.062, "hand": 0.062,

@@ -16,11 +16,13 @@ from pydantic import Field
 
 from ctlev_core.scoring.body_lengths import head_length, torso_length
 from ctlev_core.scoring.pose import Sums, check_length, compute_joint_errors_px, quotients
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 1
 INPUT = "joints2d"
+SCORES = (ScoreInfo("pck_", meaning="share of joints predicted within the limit it names", is_share=True),)
 _LENGTHS = {"torso": torso_length, "head": head_length}
 
 

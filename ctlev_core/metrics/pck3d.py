@@ -29,11 +29,17 @@ from ctlev_core.scoring.pose import (
     row_means,
     row_sums,
 )
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 1
 INPUT = "joints3d"
+SCORES = (
+    ScoreInfo("pck3d_", meaning="share of joints predicted within the limit it names", is_share=True),
+    ScoreInfo("pckh3d_", meaning="share of joints predicted within the limit it names", is_share=True),
+    ScoreInfo("auc3d_", meaning="share of joints within a limit, averaged over limits", is_share=True),
+)
 TAGS: dict[Alignment, str] = {"pelvis": "pelvis_", "procrustes": "pa_", "none": ""}
 
 

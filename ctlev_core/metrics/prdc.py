@@ -10,10 +10,17 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.scoring.prdc import neighbour_scores
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 
 VERSION = 1
 INPUT = "features"
+SCORES = (
+    ScoreInfo("precision", is_share=True),
+    ScoreInfo("recall", is_share=True),
+    ScoreInfo("density"),
+    ScoreInfo("coverage", is_share=True),
+)
 
 
 class Options(Frozen):

@@ -17,12 +17,20 @@ from pydantic import Field, field_serializer
 from ctlev_core.remembered_files import remembered_digest
 from ctlev_core.scoring.mesh import compute_vertex_errors_mm
 from ctlev_core.scoring.pose import Alignment, Sums, quotients
+from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 
 VERSION = 1
 INPUT = "smpl"
+SCORES = (
+    ScoreInfo(
+        "pve",
+        lower_is_better=True,
+        meaning="mean distance between predicted and true points of the body's surface, in millimetres",
+    ),
+)
 NAMES: dict[Alignment, str] = {"pelvis": "pve_pelvis_mm", "procrustes": "pve_pa_mm", "none": "pve_mm"}
 
 

@@ -18,12 +18,20 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.scoring.classification import read_guesses
+from ctlev_core.scoring.score_info import ScoreInfo
 from ctlev_core.scoring.zero_shot import balanced_accuracy
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 2
 INPUT = "classes"
+SCORES = (
+    ScoreInfo(
+        "binary_accuracy",
+        meaning="share told right where a class is told from the others, half of the frames its own",
+        is_share=True,
+    ),
+)
 
 
 class Options(Frozen):

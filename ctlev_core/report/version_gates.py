@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ctlev_core.realism.two_sample import C2ST, MIN_FRAMES
-from ctlev_core.report.sections.verdict import lower_is_better
+from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts.errors import DataError
 from data_contracts.published import GateCheck
 from data_contracts.regeneration import Gates

@@ -19,6 +19,8 @@ from ctlev_core.events.windows import cut
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.labels.labelling import labels_at_windows, labels_in_image
 from ctlev_core.report.sections import verdict
+from ctlev_core.scoring.score_info import ScoreInfo, lower_is_better
+from ctlev_core.statistics.paired_differences import Difference
 from data_contracts.config import Frozen, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, check_events
@@ -165,12 +167,23 @@ def test_the_page_names_every_function_of_the_contracts():
     assert not [name for name in functions | attributes if name[0] != "_" and not re.search(rf"\b{name}\b", prose)]
 
 
-def test_the_page_says_which_scores_want_to_be_small():
-    sentence = re.search(r"scores that start with (.*?)\s+want to be small", PAGE, re.DOTALL)
-    assert sentence is not None
-    named = re.findall("`(.*?)`", sentence[1])
-    assert len(named) >= 6 and all(verdict.lower_is_better(f"{prefix}_of_mine") for prefix in named)
-    assert not verdict.lower_is_better("worst_joint_px")
+def test_a_new_metric_says_itself_what_its_scores_are():
+    """Nothing but its own file names it: tables, verdicts and gates know the direction and the words all the same."""
+    assert lower_is_better("worst_joint_px") and not lower_is_better("best_joint_px")
+    values = {"real": 6.0, "real+synthetic": 5.0}
+    about = {"metric": "worst_joint_px", "group": "all"}
+    rows = [{"setting": name, "value": value, **about} for name, value in values.items()]
+    told = verdict.verdict(rows, list(values), Difference(-1.0, -1.5, -0.5))
+    assert "mean error of a frame's worst joint, in pixels; lower is better" in told
+    assert "better: paired difference -1.000" in told
+    better = verdict.made_better(Difference(-1.0, -1.5, -0.5), "worst_joint_px")
+    assert better and not verdict.made_better(Difference(1.0, 0.5, 1.5), "worst_joint_px")
+
+
+def test_every_metric_says_what_its_scores_are():
+    for name in plugins.names("metrics"):
+        scores = plugins.load("metrics", name).SCORES
+        assert scores and all(isinstance(info, ScoreInfo) and info.start for info in scores), name
 
 
 def test_the_dataset_reads_recordings_and_labels(root, tmp_path):
@@ -266,10 +279,10 @@ def test_the_model_learns_where_the_points_are(chain, tmp_path):
     predicted = model.predict(tmp_path / "model", held_out)
     metric, none = load("metrics", "worst_joint")
     assert target.joints2d is not None and labels.joints2d is not None
-    score = metric.compute(predicted, target, none)["error_worst_joint_px"]
+    score = metric.compute(predicted, target, none)["worst_joint_px"]
     always_the_mean = {"joints2d": np.broadcast_to(labels.joints2d.mean(axis=0), target.joints2d.shape)}
     # The points drift by up to 4 px of the image to either side, so that the mean errs by about 2 px.
-    assert score < 0.5 * metric.compute(always_the_mean, target, none)["error_worst_joint_px"]
+    assert score < 0.5 * metric.compute(always_the_mean, target, none)["worst_joint_px"]
 
 
 def test_the_metric_takes_the_worst_visible_joint():
@@ -278,7 +291,7 @@ def test_the_metric_takes_the_worst_visible_joint():
     target = Labels(("",) * 3, np.zeros(3, np.int64), np.zeros((3, 3, 2), np.float32), visible)
     predicted = {"joints2d": np.array([[[3, 4], [1, 0], [9, 9]], [[0, 2], [8, 8], [8, 8]], [[7, 7]] * 3], float)}
     np.testing.assert_array_equal(metric.compute_rows(predicted, target, none), [5, 2, np.nan])
-    assert metric.compute(predicted, target, none) == {"error_worst_joint_px": 3.5}
+    assert metric.compute(predicted, target, none) == {"worst_joint_px": 3.5}
 
 
 def test_the_preset_is_valid(root, tmp_path):

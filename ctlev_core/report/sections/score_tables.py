@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core.report.page.tables import Cell, Table
-from ctlev_core.report.sections.verdict import in_words, lower_is_better
+from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference, Trainings, paired_difference, read_trainings
 from data_contracts.experiment import LABELS_OF, SHUFFLED
@@ -181,7 +181,7 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
         "interval of the difference says that compares sample by sample."
     )
     notes = [f"`{name}`: {text}" for name, text in _SETTINGS.items() if any(name in s.split("+") for s in settings)]
-    explained = {in_words(name): name for name in metrics if in_words(name)}
+    explained = {find_score(name).meaning: name for name in metrics if find_score(name).meaning}
     notes += [f"`{name}`: {text}" for text, name in explained.items()]
     if any("@" in setting for setting in settings):
         notes.append("`synthetic@SHARE`: the first part of the synthetic frames")

@@ -8,38 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
-
-__all__ = ["Difference", "lower_is_better", "made_better", "verdict"]
 from data_contracts.experiment import LABELS_OF, SHUFFLED
-
-_LOWER = ("mpjpe", "pve", "fd_", "fid", "kid", "error", "calibration_error")
-_WORDS = {
-    "mpjpe2d": "mean distance between predicted and true joints in the image, in pixels",
-    "mpjpe3d": "mean distance between predicted and true joints in space, in millimetres",
-    "pve": "mean distance between predicted and true points of the body's surface, in millimetres",
-    "pck": "share of joints predicted within the limit it names",
-    "auc": "share of joints within a limit, averaged over limits",
-    "oks_ap": "share of poses whose similarity to the truth reaches the limit it names",
-    "accuracy": "share of frames whose class is told right",
-    "binary_accuracy": "share told right where a class is told from the others, half of the frames its own",
-}
-
-
-def lower_is_better(metric: str) -> bool:
-    """Errors and distances want to be small; shares want to be large."""
-    return metric.startswith(_LOWER)
-
-
-def in_words(metric: str) -> str:
-    """What a score of a downstream model is the mean of; empty where its name says it or it is seldom looked at."""
-    return next((text for start, text in _WORDS.items() if metric.startswith(start)), "")
 
 
 def in_range(score: Difference, metric: str) -> Difference:
     """The score with its interval cut off where the metric ends: shares lie in 0 to 1."""
-    if not in_words(metric).startswith("share"):
+    if not find_score(metric).is_share:
         return score
     return Difference(score.value, max(score.low, 0.0), min(score.high, 1.0))
 
@@ -80,7 +57,7 @@ def verdict(
     if not own:
         own = {name: values[name] for name in settings if name in values}
     sense = f"{'lower' if lower_is_better(metric) else 'higher'} is better"
-    summary = f"{metric} ({'; '.join(filter(None, (in_words(metric), sense)))}) on held-out real data: "
+    summary = f"{metric} ({'; '.join(filter(None, (find_score(metric).meaning, sense)))}) on held-out real data: "
     summary += ", ".join(f"{setting} {score_text(value)}" for setting, value in own.items()) + "."
     if "real+synthetic" not in values and instead is not None and {"real", "synthetic"} <= values.keys():
         told = _what_it_did(instead, metric, values["real"], "Training on synthetic data instead of real data")

@@ -17,8 +17,9 @@ import pyarrow as pa
 
 from ctlev_core.report.page.html import Curves, Folded, Section
 from ctlev_core.report.page.tables import Cell, Table
-from ctlev_core.report.sections.verdict import in_range, in_words, lower_is_better, made_better
+from ctlev_core.report.sections.verdict import in_range, made_better
 from ctlev_core.report.studies.study import Part
+from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
 from ctlev_core.statistics.pooled_scores import PooledScores, pool_values
@@ -227,7 +228,7 @@ def _score_table(groups: Sequence[Group]) -> Table:
             if difference is not None and made_better(difference, metric):
                 bold.add((len(body), column))
         body.append(row)
-    notes = [f"`{metric}`: {in_words(metric)}"] if in_words(metric) else []
+    notes = [f"`{metric}`: {find_score(metric).meaning}"] if find_score(metric).meaning else []
     agreed = [group.label_agreement for group in groups]
     if any(agreed):
         body.append([f"label agreement (`{LABELS}`)", *("" if one is None else _score(one) for one in agreed)])

@@ -23,7 +23,7 @@ from ctlev_core.provenance.records import Record, options_of, read_provenance, v
 from ctlev_core.provenance.scores import PAIRED_SAMPLES, TRACED_SCORES
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import cell_text, interval_over_trainings
-from ctlev_core.report.sections.verdict import lower_is_better
+from ctlev_core.scoring.score_info import lower_is_better
 from ctlev_core.statistics.paired_differences import (
     Difference,
     Trainings,

@@ -11,10 +11,11 @@ from typing import Any
 from ctlev_core.report.page.html import Folded, Section, Text
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import PairedScores, cell_text, score_tables, trained_rows
-from ctlev_core.report.sections.verdict import in_words, lower_is_better, made_better
+from ctlev_core.report.sections.verdict import made_better
 from ctlev_core.report.studies import paper_numbers
 from ctlev_core.report.studies.speed_summary import SpeedSummary
 from ctlev_core.report.studies.summary import Figure, Summary
+from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.paired_differences import Difference
 
 Row = dict[str, Any]
@@ -110,8 +111,8 @@ def study_overview(parts: Sequence[Part]) -> Table:
         told = "" if difference is None else difference.text()
         direction = "↓" if lower_is_better(part.metric) else "↑"
         body.append([part.heading, f"{part.metric} {direction}", *map(cell_text, by_setting.values()), told])
-        if in_words(part.metric):
-            explained[part.metric] = in_words(part.metric)
+        if find_score(part.metric).meaning:
+            explained[part.metric] = find_score(part.metric).meaning
     caption = (
         "Models trained on labelled real frames, on synthetic ones and on both, all tested on real frames that nothing "
         "was trained on; ↓ less is better, ↑ more is. In brackets 95 % intervals. Bold: differences, frame by frame, "

@@ -104,7 +104,7 @@ def test_groups_without_numbers_have_no_chart(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("metric", "expected"), [("accuracy", (0.9, 1.0)), ("pck2d_10", (0.9, 1.0)), ("mpjpe2d", (0.9, 1.1))]
+    ("metric", "expected"), [("accuracy", (0.9, 1.0)), ("pck_px10", (0.9, 1.0)), ("mpjpe2d", (0.9, 1.1))]
 )
 def test_intervals_of_shares_end_where_shares_do(metric, expected):
     found = in_range(Difference(0.98, 0.9, 1.1), metric)

@@ -122,7 +122,7 @@ def test_faithful_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
     def metric(score):
         return SimpleNamespace(compute_rows=lambda *given: errors, compute=lambda *given: {score: 1.0, "mpjpe": 2.0})
 
-    scores = {"mpjpe2d": "mpjpe2d_px", "pck2d": "pck2d", "worst_joint": "error_worst_joint_px"}
+    scores = {"mpjpe2d": "mpjpe2d_px", "pck2d": "pck2d", "pve": "pve_mm"}
     fakes = {"pose2d": model, **{name: metric(score) for name, score in scores.items()}}
     monkeypatch.setattr(
         plugins, "load_options", lambda choice: SimpleNamespace(module=fakes[choice.name], options=None)
@@ -144,7 +144,7 @@ def test_faithful_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
     # a: rows 0, 3, 6, 9 with errors 3, 1, 2, NaN; b: the other eight.
     kept_of_errors = ["s2", "s3", "s5", "s6", "s8", "s11"]
     assert kept("mpjpe2d") == kept_of_errors
-    assert kept("worst_joint") == kept_of_errors
+    assert kept("pve") == kept_of_errors
     # Of a score that wants to be large the largest are kept.
     assert kept("pck2d") == ["s0", "s1", "s4", "s6", "s7", "s10"]
 

@@ -9,8 +9,10 @@ import pytest
 from ctlev_core import plugins
 from ctlev_core.labels.body_views import with_joints
 from ctlev_core.metrics import mpjpe2d, mpjpe3d, oks, pck2d
-from ctlev_core.report.sections.verdict import Difference, lower_is_better, verdict
+from ctlev_core.report.sections.verdict import verdict
 from ctlev_core.scoring.pose import quotients
+from ctlev_core.scoring.score_info import lower_is_better
+from ctlev_core.statistics.paired_differences import Difference
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 from data_contracts.manifest import concat_labels
