@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctlev_core.body.motion.keyframes import HELD_OUT, SEEN, UNSEEN
-from ctlev_core.sensor_choice import read_sensor, sensor_preset_files
+from ctlev_core.sensor.choice import read_sensor, sensor_preset_files
 from ctlev_core.studio.options import Options
 from data_contracts.errors import DataError
 from data_contracts.events import Events

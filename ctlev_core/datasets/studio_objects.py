@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator
 
-from ctlev_core.sensor_choice import check_sensor_preset, read_sensor, sensor_preset_files
+from ctlev_core.sensor.choice import check_sensor_preset, read_sensor, sensor_preset_files
 from ctlev_core.studio.camera_paths import Motion, sample_camera_path
 from ctlev_core.studio.objects import COLOURS, NAMES, OBJECTS
 from data_contracts.config import Frozen

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
-from ctlev_core.image_shifts import shift_images
+from ctlev_core.supervised.image_shifts import shift_images
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError

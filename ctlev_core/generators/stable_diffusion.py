@@ -89,7 +89,7 @@ def sample(
 
 def embed_names(checkpoint: Path, names: Sequence[str]) -> np.ndarray:
     """What the checkpoint's text encoder makes of N names: [N, D] float32."""
-    from ctlev_core.diffusion import name_embeddings
+    from ctlev_core.diffusion.pretrained import name_embeddings
 
     return name_embeddings.embed_names(checkpoint, names)
 

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, field_serializer
 
-from ctlev_core.remembered_files import remembered_digest
 from ctlev_core.scoring.frechet import frechet_distance_of_gaussians
 from ctlev_core.scoring.frechet_extended import refined_frechet_distance
 from ctlev_core.scoring.gaussians import GaussianFactor, fit_gaussian, gaussian_from_statistics, read_statistics
 from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
+from data_contracts.remembered_files import remembered_digest
 
 VERSION = 3
 INPUT = "features"

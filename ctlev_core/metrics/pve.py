@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_serializer
 
-from ctlev_core.remembered_files import remembered_digest
 from ctlev_core.scoring.mesh import compute_vertex_errors_mm
 from ctlev_core.scoring.pose import Alignment, Sums, quotients
 from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
+from data_contracts.remembered_files import remembered_digest
 
 VERSION = 1
 INPUT = "smpl"

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core import sensor_columns
+from ctlev_core.sensor import columns as sensor_columns
 from ctlev_core.sensor import kernels
 from ctlev_core.sensor.options import PRESETS, PixelMaps, SensorOptions, read_preset, sample_pixel_maps
 from data_contracts.errors import DataError

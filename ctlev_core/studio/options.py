@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from ctlev_core.sensor_choice import check_sensor_preset
+from ctlev_core.sensor.choice import check_sensor_preset
 from data_contracts.config import Frozen
 
 

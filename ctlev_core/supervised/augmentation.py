@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
-from ctlev_core.image_shifts import shift_images
+from ctlev_core.supervised.image_shifts import shift_images
 
 
 class BodySamples(NamedTuple):

@@ -39,7 +39,7 @@ def accelerated(denoiser: Denoiser, options: TrainingOptions, device: torch.devi
     compiled = options.compile_networks and compiler_works(device)
     attention = [network.attn_processors for network in networks]
     if options.precision == "bfloat16" and device.type == "cpu":
-        from ctlev_core.diffusion.float32_attention import use_float32_attention
+        from ctlev_core.diffusion.training.float32_attention import use_float32_attention
 
         for network in networks:
             use_float32_attention(network)

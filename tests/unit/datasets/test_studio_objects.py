@@ -16,8 +16,8 @@ from ctlev_core.conditions import text
 from ctlev_core.datasets import studio_objects
 from ctlev_core.datasets.studio_objects import CLASSES, COMPOSITIONS, HELD_OUT, UNSEEN, Options
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.sensor.choice import read_sensor
 from ctlev_core.sensor.options import PRESETS
-from ctlev_core.sensor_choice import read_sensor
 from ctlev_core.studio.compositions import NOUNS, Composition, all_compositions, parse_composition
 from ctlev_core.studio.object_drawing import draw_composition, draw_object
 from ctlev_core.studio.objects import COLOURS, OBJECTS

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from tiny_prior import make_data, make_prior, shared_prior
 
 from ctlev_core.diffusion.denoising import generator_for
-from ctlev_core.diffusion.float32_attention import use_float32_attention
 from ctlev_core.diffusion.training import acceleration, finetuning, loop, trainer
 from ctlev_core.diffusion.training.finetuning import draw_turns, fine_tune, split_rows
+from ctlev_core.diffusion.training.float32_attention import use_float32_attention
 from ctlev_core.diffusion.training.latent_cache import LatentCache, cache_latents, turn_conditions
 from ctlev_core.diffusion.training.muon import MATRIX_RATE, is_matrix
 from ctlev_core.diffusion.training.options import FineTuningOptions
