@@ -97,6 +97,8 @@ def _read_made_frames(made: Manifest, recorded: np.ndarray) -> Frames:
     rows = made.rows_where(split="train")
     rows = rows[two_sample.choose_rows(len(rows), two_sample.MAX_FRAMES)]
     own = np.array(made.column("recording_id"), str)[rows]
+    if "source_id" not in made.table.column_names:
+        return np.asarray(made.array("frames")[rows]), own
     sources = np.array([name.partition(":")[0] for name in made.column("source_id")], str)[rows]
     return np.asarray(made.array("frames")[rows]), np.where(np.isin(sources, recorded), sources, own)
 

@@ -153,7 +153,7 @@ def test_damage_is_named(folder, file):
         next_number(folder)
     if file != "claimed.json":
         with pytest.raises(DataError, match=file):
-            kept_versions(folder.parents[2], 5)
+            kept_versions(folder.parents[1], 5)
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, [2]), (1, [4, 2]), (2, [2, 4, 2]), (9, [1, 2, 4, 2])])
