@@ -1,7 +1,7 @@
 """The small convolutional network of the two-sample test: learns which of two sets a frame is from.
 
 Three times convolution, maximum over 2 x 2 px, batch normalisation and ReLU, a mean over 4 x 4 parts of the image and a
-linear layer. The first convolution takes steps of more than one pixel where images are larger than 64 px, with a
+linear layer. The first convolution takes steps of more than one pixel where images are larger than 32 px, with a
 kernel that leaves none out: the finest noise is still seen, at the same cost.
 
 Training has a fixed length, half of each batch from either set, in frames moved by up to a pixel. Nothing is chosen by
@@ -21,8 +21,8 @@ import torch
 from torch import nn
 from torch.nn.utils import skip_init
 
-WIDTHS = (16, 32, 32)
-FULL_SIDE_PX = 64
+WIDTHS = (32, 32, 32)
+FULL_SIDE_PX = 32
 NUM_STEPS, BATCH_SIZE = 120, 32
 LEARNING_RATE, WEIGHT_DECAY = 3e-3, 1e-2
 _PREDICTED_TOGETHER = 64
