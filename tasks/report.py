@@ -50,7 +50,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=16, schema=tables.REPORT)
+@stage(version=17, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,

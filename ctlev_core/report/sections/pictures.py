@@ -45,7 +45,7 @@ def steps(frames: Manifest, frame_conditions: Manifest, conditions: Manifest, ma
     asked = {name: row for row, name in enumerate(conditions.column("sample_id"))}
     real, fake = np.asarray(frames.array("frames")[learnt[first]]), np.asarray(made.array("frames")[second])
     t_start_us, t_end_us = (frames.column(name)[learnt[first]] for name in ("t_start_us", "t_end_us"))
-    colours = "white where there were any" if (real == real[..., :1]).all() else "red where it got brighter, else blue"
+    colours = colours_in_words(real)
     label = _KINDS.get(kind, "words, as the generator reads them" if kind == "text" else f"a condition, `{kind}`")
     return [
         Step("1. A label", _condition(frame_conditions, first), f"What is known of a recorded moment, {label}."),
@@ -69,6 +69,13 @@ def steps(frames: Manifest, frame_conditions: Manifest, conditions: Manifest, ma
             follows=True,
         ),
     ]
+
+
+def colours_in_words(image: np.ndarray) -> str:
+    """How the colours of an event image [H, W, 3] read: green is drawn by `time_bins` alone."""
+    if (image == image[..., :1]).all():
+        return "white where there were any"
+    return "a colour for each part of that time" if image[..., 1].any() else "red where it got brighter, else blue"
 
 
 def _condition(conditions: Manifest, row: int) -> np.ndarray | str:

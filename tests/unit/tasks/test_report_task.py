@@ -8,6 +8,7 @@ from report_artefacts import SETTINGS, Experiment
 from ctlev_core.provenance.records import read_provenance
 from ctlev_core.provenance.scores import PAIRED_SAMPLES, TRACED_SCORES
 from ctlev_core.report.page.report_files import publish_report
+from ctlev_core.report.sections import pictures
 from ctlev_core.report.sections.pictures import evenly_by_class, runs, sample_grid, steps
 from ctlev_core.report.studies.run_comparison import compare_runs, read_run
 from data_contracts.manifest import ManifestRef
@@ -172,3 +173,12 @@ def test_moments_that_no_real_frame_shows_are_grey():
     (label, (first, second)), _ = grid.rows
     # Recording a is seen until 10 us; at 50 us there is no frame of it, but one of b.
     assert label == "real, same moment" and not first.any() and (second == 128).all() and "Grey" in grid.caption
+
+
+def test_colours_of_event_images_are_told_by_what_is_drawn():
+    image = np.zeros((4, 4, 3), np.uint8)
+    assert "white" in pictures.colours_in_words(image)
+    image[0, 0, 0] = 255
+    assert "red where it got brighter" in pictures.colours_in_words(image)
+    image[1, 1, 1] = 255
+    assert "each part of that time" in pictures.colours_in_words(image)
