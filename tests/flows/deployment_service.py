@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import http
 import json
 import os
 import re
@@ -40,8 +41,8 @@ class Service:
     def api(self, path: str, body: Any = None, method: str | None = None) -> Any:
         """What the server answers; a question that changes nothing is asked again where no answer comes.
 
-        A server on SQLite can be silent for the minute in which one of its writers waits for a lock. Prefect's own
-        client is as patient.
+        A server on SQLite can be silent for the minute in which one of its writers waits for a lock, and then answers
+        503, having changed nothing. Prefect's own client is as patient, and asks again.
         """
         data = None if body is None else json.dumps(body).encode()
         headers = {"Content-Type": "application/json"}
@@ -55,6 +56,10 @@ class Service:
             except TimeoutError:
                 if not asks or time.monotonic() > deadline:
                     raise
+            except urllib.error.HTTPError as error:
+                if error.code != http.HTTPStatus.SERVICE_UNAVAILABLE or time.monotonic() > deadline:
+                    raise
+                time.sleep(1)
 
     def prefect(self, *arguments: str, timeout: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:
         """Run a command of Prefect's, from the repository."""
