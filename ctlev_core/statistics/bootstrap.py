@@ -101,13 +101,12 @@ def cluster_bootstrap(
     names, index = np.unique(np.asarray(groups), return_inverse=True)
     if len(names) < 2:
         return {}, {}
-    members = [np.flatnonzero(index == group) for group in range(len(names))]
+    by_group, sizes = np.argsort(index, kind="stable"), np.bincount(index)
     replicates: list[Mapping[str, float]] = []
     for draws in _draws(len(names), num_resamples, seed):
         for counts in draws:
-            rows = np.concatenate([np.tile(members[group], counts[group]) for group in np.flatnonzero(counts)])
             with suppress(ValueError):
-                replicates.append(compute(rows))
+                replicates.append(compute(by_group[_repeated(sizes, counts)]))
     if not replicates:
         return {}, {}
     low, high = {}, {}
@@ -115,6 +114,13 @@ def cluster_bootstrap(
         values = [replicate[name] for replicate in replicates]
         low[name], high[name] = (float(q) for q in np.quantile(values, [(1 - level) / 2, (1 + level) / 2]))
     return low, high
+
+
+def _repeated(sizes: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Positions of rows that lie group by group, `sizes` of them, with each group `counts` times in a row."""
+    lengths = sizes * counts
+    within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return np.repeat(np.cumsum(sizes) - sizes, lengths) + within % np.repeat(sizes, lengths)
 
 
 def ratio_bootstrap(

@@ -209,6 +209,24 @@ def test_replicates_that_cannot_be_scored_are_left_out():
     assert cluster_bootstrap(compute, ["a", "b", "c"]) == ({"score": 1.0}, {"score": 1.0})
 
 
+def test_a_replicate_is_whole_groups_one_after_the_other():
+    groups = np.random.default_rng(1).permutation(np.repeat(["a", "b", "c", "d"], [1, 4, 2, 5]))
+    members = [np.flatnonzero(groups == name) for name in "abcd"]
+    replicates = []
+
+    def compute(rows):
+        replicates.append(rows)
+        return {"rows": 1.0}
+
+    cluster_bootstrap(compute, groups, num_resamples=50, seed=2)
+    assert len(replicates) == 50
+    for rows in replicates:
+        counts = [np.count_nonzero(rows == own[0]) for own in members]
+        assert sum(counts) == 4
+        expected = [np.tile(own, count) for own, count in zip(members, counts, strict=True)]
+        np.testing.assert_array_equal(rows, np.concatenate(expected))
+
+
 def test_intervals_of_quotients_are_those_of_resampled_rows():
     """Some rows have nothing to count, and one score can be counted in two recordings alone: others leave it empty."""
     random = np.random.default_rng(3)
