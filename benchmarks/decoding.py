@@ -190,7 +190,7 @@ def print_memory(name: str, events: Events, gigabytes: float, folder: Path) -> N
         # Not ru_maxrss, which a new process takes over from the one that started it.
         "peak = lambda: int(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1]) / 1024\n"
         "before, start = peak(), time.perf_counter()\n"
-        "total = sum(len(piece) for piece in event_files.read_event_chunks(Path(sys.argv[1])))\n"
+        "total = sum(len(chunk) for chunk in event_files.read_event_chunks(Path(sys.argv[1])))\n"
         "seconds = time.perf_counter() - start\n"
         "print(f'{total:,} events in {seconds:.1f} s ({total / seconds / 1e6:.0f} Mev/s),', end=' ')\n"
         "print(f'peak {peak() - before:.0f} MB above import ({before:.0f} MB)')\n"

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctlev_core.diffusion.pretrained.loading import Prior
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel
 from data_contracts.labels import Conditions
 
 Precision = Literal["float32", "bfloat16"]
@@ -66,9 +66,9 @@ def collate(items: list[dict[str, Tensor]]) -> dict[str, Tensor]:
 
 
 class ExampleLoop:
-    """The examples' loop over one prior, to be run some steps at a time.
+    """The examples' loop over one base model, to be run some steps at a time.
 
-    A prior with a ControlNet is trained as by `train_controlnet`, one without as by `train_text_to_image`.
+    A base model with a ControlNet is trained as by `train_controlnet`, one without as by `train_text_to_image`.
 
     Attributes:
         seconds: of each of `STAGES`, summed up while `clock` is set.
@@ -77,7 +77,7 @@ class ExampleLoop:
 
     def __init__(
         self,
-        prior: Prior,
+        base_model: PretrainedModel,
         frames: np.ndarray,
         conditions: Conditions,
         *,
@@ -87,7 +87,9 @@ class ExampleLoop:
         use_ema: bool = False,
         seed: int = 0,
     ) -> None:
-        """Take over `prior`: its frozen parts are cast, the trained one learns. One loop at a time in a process."""
+        """Take over `base_model`: its frozen parts are cast, the trained one learns. One loop at a
+        time in a process.
+        """
         from accelerate import Accelerator
         from accelerate.state import AcceleratorState
         from diffusers.optimization import get_scheduler
@@ -97,19 +99,19 @@ class ExampleLoop:
         torch.manual_seed(seed)
         AcceleratorState._reset_state(reset_partial_state=True)  # the precision of a process is set only once
         self._accelerator: Any = Accelerator(
-            mixed_precision={"float32": "no", "bfloat16": "bf16"}[precision], cpu=prior.unet.device.type == "cpu"
+            mixed_precision={"float32": "no", "bfloat16": "bf16"}[precision], cpu=base_model.unet.device.type == "cpu"
         )
-        self._prior, self._dtype = prior, getattr(torch, precision)
-        self._noise_scheduler: Any = DDPMScheduler.from_config(prior.scheduler_config)
-        self._steers = prior.controlnet is not None
-        trained = prior.controlnet if self._steers else prior.unet
-        for part in (prior.vae, prior.text_encoder, prior.unet):
+        self._base_model, self._dtype = base_model, getattr(torch, precision)
+        self._noise_scheduler: Any = DDPMScheduler.from_config(base_model.scheduler_config)
+        self._steers = base_model.controlnet is not None
+        trained = base_model.controlnet if self._steers else base_model.unet
+        for part in (base_model.vae, base_model.text_encoder, base_model.unet):
             part.requires_grad_(False)
             if part is not trained and part.dtype != self._dtype:
                 part.to(self._dtype)
         trained.train().requires_grad_(True)
         optimizer = torch.optim.AdamW(trained.parameters(), lr=learning_rate, **ADAM)
-        rows = ImageRows(frames, conditions, prior.tokenizer)
+        rows = ImageRows(frames, conditions, base_model.tokenizer)
         self._ema = EMAModel(trained.parameters(), decay=EMA_DECAY) if use_ema else None
         self._trained, self._optimizer, self._loader, self._schedule = self._accelerator.prepare(
             trained,
@@ -137,15 +139,15 @@ class ExampleLoop:
             self.seconds[name] += self.clock() - start
 
     def _step(self) -> float:
-        accelerator, prior = self._accelerator, self._prior
+        accelerator, base_model = self._accelerator, self._base_model
         with self._stage("data"):
             batch = next(self._batches)
         with accelerator.accumulate(self._trained):
             with self._stage("autoencoder"):
-                latents = prior.vae.encode(batch["pixel_values"].to(dtype=self._dtype)).latent_dist.sample()
-                latents = latents * prior.vae.config.scaling_factor
+                latents = base_model.vae.encode(batch["pixel_values"].to(dtype=self._dtype)).latent_dist.sample()
+                latents = latents * base_model.vae.config.scaling_factor
             with self._stage("text encoder"):
-                embeddings = prior.text_encoder(batch["input_ids"])[0]
+                embeddings = base_model.text_encoder(batch["input_ids"])[0]
             with self._stage("forward"):
                 loss = self._loss(latents, embeddings, batch.get("conditioning_pixel_values"))
                 if not self._steers:
@@ -189,7 +191,7 @@ class ExampleLoop:
             controlnet_cond=conditions.to(dtype=self._dtype),
             return_dict=False,
         )
-        return self._prior.unet(
+        return self._base_model.unet(
             noisy,
             timesteps,
             encoder_hidden_states=embeddings,

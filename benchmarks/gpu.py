@@ -35,8 +35,8 @@ from interleaved import Comparison, describe_machine, matmul_flops, print_compar
 from torch.utils.flop_counter import FlopCounterMode
 
 from ctlev_core.diffusion.pretrained.components import read_json
-from ctlev_core.diffusion.pretrained.loading import Prior, choose_device
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, choose_device
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
 from ctlev_core.diffusion.pretrained.single_file import CONFIGS
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 
@@ -115,9 +115,9 @@ def _run_part(name: str, chosen: Any, device: torch.device, limit: float, found:
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def build_prior(
+def build_base_model(
     size: str, image_size: int, *, with_controlnet: bool, dtype: torch.dtype, device: torch.device, seed: int = 0
-) -> Prior:
+) -> PretrainedModel:
     """Stable Diffusion v1 by its configs, with random weights; the tokenizer, which takes no time, is the bundled one.
 
     Args:
@@ -137,7 +137,7 @@ def build_prior(
     for name, changes in TINY.items() if size == "tiny" else ():
         configs[name] = {**configs[name], **changes}
     configs["unet"]["sample_size"] = image_size // 8
-    tokenizer = CLIPTokenizer.from_pretrained(str(BUNDLED_PRIOR / "tokenizer"), local_files_only=True)
+    tokenizer = CLIPTokenizer.from_pretrained(str(BUNDLED_BASE_MODEL / "tokenizer"), local_files_only=True)
     tokenizer.model_max_length = configs["text_encoder"]["max_position_embeddings"]
     torch.manual_seed(seed)
     with torch.device(device):
@@ -150,64 +150,64 @@ def build_prior(
     for network in networks.values():
         if network is not None:
             network.to(device, dtype).eval().requires_grad_(False)
-    return Prior(
+    return PretrainedModel(
         tokenizer=tokenizer, scheduler_config=configs["scheduler"], image_size=(image_size, image_size), **networks
     )
 
 
-def count_parameters(prior: Prior) -> str:
+def count_parameters(base_model: PretrainedModel) -> str:
     """Millions of weights, network by network."""
     counts = []
     for name in ("unet", "controlnet", "vae", "text_encoder"):
-        network = getattr(prior, name)
+        network = getattr(base_model, name)
         if network is not None:
             counts.append(f"{name} {sum(weight.numel() for weight in network.parameters()) / 1e6:,.1f} M")
     return ", ".join(counts)
 
 
-def use_channels_last(prior: Prior) -> Prior:
+def use_channels_last(base_model: PretrainedModel) -> PretrainedModel:
     """The same networks; convolutions then take images as tensor cores like them."""
-    for network in (prior.unet, prior.controlnet, prior.vae):
+    for network in (base_model.unet, base_model.controlnet, base_model.vae):
         if network is not None:
             network.to(memory_format=torch.channels_last)
-    return prior
+    return base_model
 
 
-def compile_networks(prior: Prior) -> Prior:
+def compile_networks(base_model: PretrainedModel) -> PretrainedModel:
     """The same networks, compiled when they are first called, with images as tensor cores like them."""
-    for network in (use_channels_last(prior).unet, prior.controlnet):
+    for network in (use_channels_last(base_model).unet, base_model.controlnet):
         if network is not None:
             network.compile()
-    return prior
+    return base_model
 
 
 # Parts ----------------------------------------------------------------------------------------------------------------
 
 
-Change = Callable[[Prior], Prior]
+Change = Callable[[PretrainedModel], PretrainedModel]
 
 
 def measure_sampling(
     change: Change | None, chosen: Any, device: torch.device, limit: float, found: list[Comparison]
 ) -> None:
     """The ControlNet route with few steps; with unchanged networks beside the paper's thousand, too."""
-    prior = build_prior(
+    base_model = build_base_model(
         chosen.size, chosen.image_size, with_controlnet=True, dtype=getattr(torch, chosen.precision), device=device
     )
-    print(f"  {count_parameters(prior)}")
+    print(f"  {count_parameters(base_model)}")
     options = SamplingOptions(num_inference_steps=chosen.inference_steps, precision=chosen.precision)
     options = options.model_copy(update={"batch_size": chosen.batch_size})
-    _, conditions = training.make_rows(prior, chosen.batch_size, with_images=True)
+    _, conditions = training.make_rows(base_model, chosen.batch_size, with_images=True)
     with FlopCounterMode(display=False) as counter:
-        sampling.sample_ours(prior, conditions, options)
+        sampling.sample_ours(base_model, conditions, options)
     flops = counter.get_total_flops()
-    compare = partial(sampling.compare, prior, options, count=chosen.batch_size, rounds=chosen.rounds)
+    compare = partial(sampling.compare, base_model, options, count=chosen.batch_size, rounds=chosen.rounds)
     if change is None:
         of_part = compare("sampling", paper_steps=chosen.ddpm_steps, in_full=True)
     else:
-        copies = {part: copy.deepcopy(getattr(prior, part)) for part in ("unet", "controlnet", "vae")}
+        copies = {part: copy.deepcopy(getattr(base_model, part)) for part in ("unet", "controlnet", "vae")}
         of_part = compare(
-            f"sampling, {EXPERIMENTS[change]}", ours=change(dataclasses.replace(prior, **copies)), paper_steps=0
+            f"sampling, {EXPERIMENTS[change]}", ours=change(dataclasses.replace(base_model, **copies)), paper_steps=0
         )
     found += of_part
     rate = flops / statistics.median(of_part[0].ours)
@@ -225,20 +225,20 @@ def measure_training(
 ) -> None:
     """One route with options of ours, or with networks changed from outside."""
     build = partial(
-        build_prior,
+        build_base_model,
         chosen.size,
         chosen.image_size,
         with_controlnet=route == "controlnet",
         dtype=torch.float32,
         device=device,
     )
-    prior, same = build(), build()
-    print(f"  {count_parameters(prior)}")
+    base_model, same = build(), build()
+    print(f"  {count_parameters(base_model)}")
     if change is not None:
-        prior = change(prior)
+        base_model = change(base_model)
     options = training.make_options(chosen.batch_size, chosen.precision, [f"device={chosen.device}", *changed])
     name = ", ".join([f"training, {route}", *changed, *([EXPERIMENTS[change]] if change else [])])
-    comparison = training.compare(prior, same, options, route, chosen.rounds, chosen.steps, name)
+    comparison = training.compare(base_model, same, options, route, chosen.rounds, chosen.steps, name)
     if change is not None:
         comparison.wanted = None
     found.append(comparison)

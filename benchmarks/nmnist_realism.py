@@ -1,9 +1,10 @@
-"""How real are filmed pictures? Simulated recordings beside N-MNIST's, number by number, and what they are worth.
+"""How real are simulated recordings of pictures? They are set beside N-MNIST's, number by number, and what they are
+worth.
 
     python benchmarks/nmnist_realism.py --nmnist FOLDER --images FILE [--set option=value ...]
 
 FOLDER holds N-MNIST's training recordings by class, FOLDER/zero/00001.bin ...; FILE is an .npz of MNIST's `images` and
-`labels`, other ones than those that were filmed. Of each class the first 40 % of the recordings by number calibrate,
+`labels`, other ones than those that were recorded. Of each class the first 40 % of the recordings by number calibrate,
 the next 15 % are compared with; the rest is not looked at.
 
 Three things are printed: a table of numbers; how well a small network tells real from simulated images of events in
@@ -23,7 +24,7 @@ import yaml
 
 from ctlev_core.conditions import picture
 from ctlev_core.events.files import read_events_file
-from ctlev_core.generators import filmed_pictures
+from ctlev_core.generators import picture_simulator
 from data_contracts.events import Events
 from data_contracts.labels import Conditions, Labels
 
@@ -185,19 +186,19 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="the table alone")
     chosen = parser.parse_args()
     given = {name: yaml.safe_load(value) for name, _, value in (text.partition("=") for text in chosen.set)}
-    options = filmed_pictures.SampleOptions(**given)
+    options = picture_simulator.SampleOptions(**given)
 
     known, names = read_real(chosen.nmnist, CALIBRATION, chosen.calibrate_with)
     started = time.perf_counter()
-    options, measured = filmed_pictures.calibrate(known, names, pictures_of(chosen.images, names, 1), options)
+    options, measured = picture_simulator.calibrate(known, names, pictures_of(chosen.images, names, 1), options)
     print(f"calibration: {time.perf_counter() - started:.1f} s of {len(known)} recordings")
-    print({name: getattr(options, name) for name in filmed_pictures.UNCALIBRATED})
+    print({name: getattr(options, name) for name in picture_simulator.UNCALIBRATED})
     print({name: round(value, 4) for name, value in measured.items()})
 
     real, real_names = read_real(chosen.nmnist, COMPARISON)
     asked = pictures_of(chosen.images, [CLASSES[row % 10] for row in range(NUM_LEARNT)], 2)
     started = time.perf_counter()
-    made = list(filmed_pictures.sample_events(asked, (SIZE, SIZE), options, seeds=range(NUM_LEARNT)))
+    made = list(picture_simulator.sample_events(asked, (SIZE, SIZE), options, seeds=range(NUM_LEARNT)))
     seconds = time.perf_counter() - started
     print(f"simulation: {len(made) / seconds:.0f} recordings/s, {sum(map(len, made)) / seconds / 1e6:.2f} M events/s")
 
@@ -215,7 +216,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     another = options.model_copy(update={"sensor_seed": 1})
-    other = list(filmed_pictures.sample_events(asked, (SIZE, SIZE), another, seeds=range(NUM_LEARNT, 2 * NUM_LEARNT)))
+    other = list(picture_simulator.sample_events(asked, (SIZE, SIZE), another, seeds=range(NUM_LEARNT, 2 * NUM_LEARNT)))
     for polarity in (False, True):
         x_known, x_real, x_made, x_other = (images_of(some, polarity) for some in (known, real, made, other))
         x_every = np.concatenate([x_known, x_real])

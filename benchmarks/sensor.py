@@ -273,7 +273,7 @@ def print_speeds(num_frames: int, rounds: int) -> list[str]:
     wall = np.clip(wall, 0.01, 1.0).astype(np.float32)
     t_us = 4000 * np.arange(num_frames)
     real = SensorOptions(
-        threshold_sigma=0.03, refractory_us=500, leak_rate_hz=0.1, shot_rate_hz=1.0, starts_settled=False
+        threshold_sigma=0.03, refractory_us=500, leak_rate_hz=0.1, shot_noise_rate_hz=1.0, starts_settled=False
     )
     lagging = real.model_copy(update={"cutoff_dark_hz": 22.0, "cutoff_bright_hz": 300.0})
     print(f"\nspeed, 346 x 260 px, {num_frames} frames 4 ms apart: CPU time, medians of {rounds} rounds")
@@ -327,12 +327,12 @@ def simulate_v2e(
         num_on = np.maximum(difference, 0.0) // maps.threshold_on
         num_off = np.maximum(-difference, 0.0) // maps.threshold_off
         steps = int(max(num_on.max(), num_off.max(), 1))
-        noise = 0.5 * maps.shot_rate_hz * span_s / steps * ((options.shot_rate_bright - 1.0) * frame + 1.0)
+        noise = 0.5 * maps.shot_noise_rate_hz * span_s / steps * ((options.shot_noise_rate_bright - 1.0) * frame + 1.0)
         sent_on, sent_off = np.zeros(base.shape), np.zeros(base.shape)
         for step in range(steps):
             time_s = begin_s + span_s * (step + 1) / steps
             on, off = num_on > step, num_off > step
-            if options.shot_rate_hz > 0:
+            if options.shot_noise_rate_hz > 0:
                 dice = rng.random(base.shape, dtype=np.float32)
                 on |= dice > 1.0 - noise * (options.threshold / maps.threshold_on)
                 off |= dice < noise * (options.threshold / maps.threshold_off)

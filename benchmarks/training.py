@@ -1,6 +1,6 @@
 """How fast fine-tuning is beside diffusers' own example loops, and where the time goes on both sides.
 
-    python benchmarks/training.py                                   # bundled prior, both routes, two precisions
+    python benchmarks/training.py                                   # bundled base model, both routes, two precisions
     python benchmarks/training.py --batch-size 32 --set compile_networks=true --precisions float32
 
 Both loops train the same networks on the same frames in one process and take turns; each turn is a few steps, and the
@@ -32,7 +32,7 @@ from interleaved import Comparison, describe_machine, matmul_flops, measure, now
 from torch.utils.flop_counter import FlopCounterMode
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, denoising_loss, generator_for
-from ctlev_core.diffusion.pretrained.loading import Prior, load_prior
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, load_base_model
 from ctlev_core.diffusion.training import finetuning
 from ctlev_core.diffusion.training import loop as training
 from ctlev_core.diffusion.training.acceleration import accelerated, autocast
@@ -49,7 +49,7 @@ PROMPTS = ("A photo of a cup", "A photo of a ball", "A photo of a chair", "A mov
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the comparison, the parts, and which targets were missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--prior", type=Path, help="diffusers folder; the bundled prior without")
+    parser.add_argument("--base_model", type=Path, help="diffusers folder; the bundled base model without")
     parser.add_argument("--routes", nargs="*", default=["controlnet", "text"], choices=("controlnet", "text"))
     parser.add_argument("--precisions", nargs="*", default=["float32", "bfloat16"], choices=("float32", "bfloat16"))
     parser.add_argument("--batch-size", type=int, default=8)
@@ -64,8 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for precision in chosen.precisions:
         for route in chosen.routes:
             options = make_options(chosen.batch_size, precision, chosen.set)
-            priors = [load_prior(chosen.prior, with_controlnet=route == "controlnet") for _ in range(2)]
-            found.append(compare(priors[0], priors[1], options, route, chosen.rounds, chosen.steps))
+            base_models = [load_base_model(chosen.base_model, with_controlnet=route == "controlnet") for _ in range(2)]
+            found.append(compare(base_models[0], base_models[1], options, route, chosen.rounds, chosen.steps))
     found += beside_default(found)
     print_comparisons(f"fine-tuning, batches of {chosen.batch_size}", "diffusers", found)
     print_targets(found)
@@ -89,10 +89,10 @@ def make_options(batch_size: int, precision: str, changed: Sequence[str] = ()) -
     return FineTuningOptions.model_validate({**fixed, "checkpoint_every_s": 1e9, **further})
 
 
-def make_rows(prior: Prior, count: int, *, with_images: bool) -> tuple[np.ndarray, Conditions]:
+def make_rows(base_model: PretrainedModel, count: int, *, with_images: bool) -> tuple[np.ndarray, Conditions]:
     """Frames of scattered events and, as conditions, a few bright boxes on black; time does not depend on either."""
     random = np.random.default_rng(0)
-    width, height = prior.image_size
+    width, height = base_model.image_size
     frames = np.where(random.random((count, height, width, 1)) < 0.1, random.integers(0, 256, (count, 1, 1, 3)), 0)
     images = np.zeros((count, height, width, 3), np.uint8)
     for image in images:
@@ -119,7 +119,7 @@ class FineTuningLoop:
 
     def __init__(
         self,
-        prior: Prior,
+        base_model: PretrainedModel,
         frames: np.ndarray,
         conditions: Conditions,
         options: FineTuningOptions,
@@ -134,10 +134,10 @@ class FineTuningLoop:
             handed_over.append((positional, named))
             raise _Stopped
 
-        self._device = prior.unet.device
+        self._device = base_model.unet.device
         start = now_s(self._device)
         with mock.patch.object(finetuning, "run_training", keep), contextlib.suppress(_Stopped):
-            finetuning.fine_tune(prior, frames, conditions, options, tune=tune, seed=0, work=work)
+            finetuning.fine_tune(base_model, frames, conditions, options, tune=tune, seed=0, work=work)
         self.preparation_s = now_s(self._device) - start
         (self._trainer, self.denoiser, self.schedule, self.fetch), self._further = handed_over[0]
         self.data_s = 0.0
@@ -173,11 +173,17 @@ class FineTuningLoop:
 
 
 def compare(
-    prior: Prior, same: Prior, options: FineTuningOptions, route: Route, rounds: int, steps: int, name: str = ""
+    base_model: PretrainedModel,
+    same: PretrainedModel,
+    options: FineTuningOptions,
+    route: Route,
+    rounds: int,
+    steps: int,
+    name: str = "",
 ) -> Comparison:
-    """Train `prior` by our loop and `same`, an equal one, by the example's, in turns; print the parts of a step."""
-    device = prior.unet.device
-    frames, conditions = make_rows(prior, max(FRAMES, options.batch_size), with_images=route == "controlnet")
+    """Train `base_model` by our loop and `same`, an equal one, by the example's, in turns; print parts of a step."""
+    device = base_model.unet.device
+    frames, conditions = make_rows(base_model, max(FRAMES, options.batch_size), with_images=route == "controlnet")
     peer = ExampleLoop(
         same, frames, conditions, batch_size=options.batch_size, precision=_peer_precision(options),
         use_ema=route == "text",
@@ -186,7 +192,7 @@ def compare(
     found = Comparison(name or f"{route}, {options.precision}", steps * options.batch_size, WANTED)
     tune: finetuning.Tune = "controlnet" if route == "controlnet" else "unet"
     with tempfile.TemporaryDirectory() as work:
-        ours = FineTuningLoop(prior, frames, conditions, options, tune=tune, work=Path(work))
+        ours = FineTuningLoop(base_model, frames, conditions, options, tune=tune, work=Path(work))
         found.ours = ours.run(steps, rounds, lambda: found.peer.append(measure(partial(peer.run, steps), device)))
     print_parts(ours, peer, options, found, steps)
     print(f"  ours before the first step: {1e3 * ours.preparation_s / len(frames):.1f} ms a frame")

@@ -43,7 +43,7 @@ class DatasetWithChunks(Dataset, Protocol):
     """A dataset whose recordings may be larger than memory."""
 
     def read_event_chunks(self, recording: Recording, options: Any) -> Iterator[Events]:
-        """The events of `read_events` in consecutive pieces."""
+        """The events of `read_events` in consecutive chunks."""
         ...
 
 
@@ -106,9 +106,9 @@ class Format(Protocol):
         ...
 
     def read_chunks(self, path: Path, num_events: int) -> Iterator[Events]:
-        """The events of `read` in consecutive pieces of about `num_events`, in memory that does not grow with the file.
+        """The events of `read` in consecutive chunks of about `num_events`, in memory that does not grow with the file.
 
-        Every piece is checked and has the sensor size of the whole file.
+        Every chunk is checked and has the sensor size of the whole file.
         """
         ...
 
@@ -218,7 +218,7 @@ class Generator(Protocol):
     Options: type[Frozen]
     SampleOptions: type[Frozen]
 
-    def prior_folders(self, options: Any) -> list[Path]:
+    def base_model_folders(self, options: Any) -> list[Path]:
         """The folders of the pre-trained weights, checked to be there; their content enters the cache key."""
         ...
 

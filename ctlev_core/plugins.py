@@ -21,6 +21,7 @@ from pydantic import BaseModel, ValidationError
 
 from data_contracts.config import Choice
 from data_contracts.errors import DataError
+from data_contracts.renamed_options import RENAMED_VALUES, name_hint
 
 KINDS = ("datasets", "formats", "motions", "encodings", "conditions", "generators", "downstream", "metrics")
 
@@ -102,7 +103,8 @@ def load(kind: str, name: str) -> ModuleType:
     if not (kind in KINDS and name.isidentifier() and not name.startswith("_") and path in sys.modules):
         known = names(kind)
         if name not in known:
-            raise PluginError(f"unknown plug-in {name!r} in {kind}; known: {', '.join(known)}")
+            hint = name_hint(name, known, RENAMED_VALUES)
+            raise PluginError(f"unknown plug-in {name!r} in {kind}{hint}; known: {', '.join(known)}")
     return importlib.import_module(path)  # which waits where another thread has begun to import it
 
 
@@ -116,12 +118,22 @@ def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: s
             option = ".".join(str(part) for part in problem["loc"])
             if problem["type"] == "extra_forbidden":
                 known = _options_at(model, problem["loc"][:-1])
-                lines.append(f"unknown option {option!r}; known: {', '.join(known)}")
+                hint = name_hint(str(problem["loc"][-1]), known)
+                lines.append(f"unknown option {option!r}{hint}; known: {', '.join(known)}")
             elif problem["type"] == "path_type":
                 lines.append(f"option {option!r} must be a path, got {problem['input']!r}; --set ...{option}=PATH")
             else:
-                lines.append(f"option {option!r}: {problem['msg'].lower()}, got {problem['input']!r}")
+                value = problem["input"]
+                hint = f"; {value!r} is now {RENAMED_VALUES[value]!r}" if _is_renamed(problem) else ""
+                lines.append(f"option {option!r}: {problem['msg'].lower()}, got {value!r}{hint}")
         raise PluginError(f"{where}: " + "; ".join(lines)) from None
+
+
+def _is_renamed(problem: Any) -> bool:
+    value = problem["input"]
+    if problem["type"] != "literal_error" or not isinstance(value, str) or value not in RENAMED_VALUES:
+        return False
+    return repr(RENAMED_VALUES[value]) in problem["ctx"]["expected"]
 
 
 def _options_at(model: Any, path: Sequence[int | str]) -> list[str]:

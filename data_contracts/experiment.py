@@ -19,16 +19,20 @@ from data_contracts.config import (
     Windows,
 )
 from data_contracts.event_export import EventExport
+from data_contracts.training_sets import (
+    LABEL_CONSISTENT,
+    ORACLE,
+    REAL,
+    SOURCES,
+    SYNTHETIC,
+    TrainingSet,
+    TrainingSource,
+)
 
-Setting = Literal["real", "synthetic", "real+synthetic"]
-PoseOrder = Literal["random", "in_time"]
-PoseViews = Literal["labelled", "new"]
-LABELS_OF = "labels of"
-"""Settings that start so score frames of a generator against the labels they were made from."""
-SHUFFLED = f"shuffled {LABELS_OF}"
-"""Settings that start so score the same frames against the labels of others: how bad no faithfulness at all is."""
+TrainedOn = Literal["real", "synthetic", "real+synthetic"]
+LabelOrder = Literal["random", "in_time"]
+View = Literal["labelled", "new"]
 NAME_PATTERN = r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$"
-RESERVED = ("real", "synthetic", "more_real", "faithful")
 
 
 class Baseline(Frozen):
@@ -50,7 +54,7 @@ class Baseline(Frozen):
         return SamplingChoice(name=self.generator.name, options=self.sampling)
 
 
-class MoreReal(Frozen):
+class Oracle(Frozen):
     """Other real recordings to train on: of the very poses, say, that synthetic frames are sampled from."""
 
     dataset: DatasetChoice = Field(description="its training recordings are used; it needs a test recording too")
@@ -60,9 +64,9 @@ class MoreReal(Frozen):
 class Experiment(Frozen):
     """One experiment: data, generator, how much to sample, and what to train and score with it.
 
-    `baselines` are rows of the tables: a baseline `X` adds the settings `X` and `real+X` beside `synthetic` and
-    `real+synthetic`, where those are asked for; `more_real` adds `more_real` and `real+more_real`, `scaling`,
-    `keep_faithful` and `together` the settings named in their descriptions. `sampling` are the generator's
+    `baselines` are rows of the tables: a baseline `X` adds the training sets `X` and `real+X` beside `synthetic` and
+    `real+synthetic`, where those are asked for; `oracle` adds `oracle` and `real+oracle`, `scaling`,
+    `keep_fraction` and `mixtures` the training sets named in their descriptions. `sampling` are the generator's
     `SampleOptions`. `feature_extractor` is the classifier, trained on real frames, in whose features real and synthetic
     frames are compared; None leaves the comparison out.
     """
@@ -77,12 +81,12 @@ class Experiment(Frozen):
     target: DatasetChoice | None = Field(
         None,
         description="another dataset that the generator learns nothing of, such as classes it has never seen: its "
-        "labels are sampled, its training recordings are the setting `real`, its test recordings are tested",
+        "labels are sampled, its training recordings are the training set `real`, its test recordings are tested",
     )
-    pose_order: PoseOrder = Field(
-        "random", description="of the labels to sample from: classes in turn and at random, or as they follow in time"
+    temporal_order: bool = Field(
+        False, description="labels to sample from follow one another in time; else classes in turn and at random"
     )
-    pose_views: PoseViews = Field(
+    view: View = Field(
         "labelled", description="bodies to sample from as their own camera sees them, or from new, random sides"
     )
     windows: Windows = Windows()
@@ -91,20 +95,20 @@ class Experiment(Frozen):
     base_model: dict[str, Any] | None = Field(
         None,
         description="options of pre-training (flows/presets/pretraining): a base model is made of pictures first, and "
-        "generators that name no `prior` start from it",
+        "generators that name no `base_model` start from it",
     )
     generator: GeneratorChoice
     sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
     num_synthetic: int = Field(gt=0, description="synthetic frames to sample, of the generator and of each baseline")
-    max_tries: int = Field(
+    max_attempts: int = Field(
         3,
         ge=1,
-        description="samplings of a frame, until it passes postprocessing/rejection.py; 1 = count refusals only",
+        description="samplings of a frame, until it passes postprocessing/quality_filter.py; 1 = count rejections only",
     )
-    round_to_counts: bool = Field(
+    stochastic_rounding: bool = Field(
         False,
-        description="sampled frames become, by dithering, renderings of whole event counts, as real ones are; of "
-        "event histograms only",
+        description="sampled frames become, by stochastic rounding, renderings of whole event counts, as real ones "
+        "are; of event histograms only",
     )
     num_generators: int = Field(
         1,
@@ -112,27 +116,28 @@ class Experiment(Frozen):
         description="fine-tunings, each with a seed and synthetic frames of its own, of the generator and of each "
         "baseline; the downstream seeds take turns with them",
     )
-    more_real: MoreReal | None = Field(
+    oracle: Oracle | None = Field(
         None, description="real recordings of the sampled poses: the most that synthetic frames can give"
     )
     scaling: tuple[float, ...] = Field(
-        (), description="train on real frames and these shares of the synthetic ones too, as settings `real+S@SHARE`"
+        (),
+        description="train on real frames and these shares of the synthetic ones too, as training sets `real+S@SHARE`",
     )
-    keep_faithful: float | None = Field(
+    keep_fraction: float | None = Field(
         None,
         gt=0,
         lt=1,
         description="train also on this share of the synthetic frames, those whose labels a model trained on real "
-        "frames finds best: settings `faithful` and `real+faithful`",
+        "frames finds best: training sets `label_consistent` and `real+label_consistent`",
     )
     baselines: dict[str, Baseline] = Field(default_factory=dict, description="other generators, by a name of each")
-    together: tuple[str, ...] = Field(
+    mixtures: tuple[str, ...] = Field(
         (),
-        description="further settings, of frames of several generators, such as `real+synthetic+event_gan`",
+        description="further training sets, of frames of several generators, such as `real+synthetic+event_gan`",
     )
     downstream: DownstreamChoice
-    settings: tuple[Setting, ...] = Field(("real", "synthetic", "real+synthetic"), min_length=1)
-    downstream_seeds: tuple[int, ...] = Field((0,), min_length=1, description="one training per setting and seed")
+    training_sets: tuple[TrainedOn, ...] = Field(("real", "synthetic", "real+synthetic"), min_length=1)
+    downstream_seeds: tuple[int, ...] = Field((0,), min_length=1, description="one training per training set and seed")
     metrics: tuple[MetricChoice, ...] = Field(min_length=1)
     feature_extractor: DownstreamChoice | None = None
     distances: tuple[MetricChoice, ...] = Field(
@@ -163,9 +168,9 @@ class Experiment(Frozen):
     @classmethod
     def _names_are_free(cls, baselines: dict[str, Baseline]) -> dict[str, Baseline]:
         for name in baselines:
-            if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in RESERVED:
+            if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in SOURCES:
                 raise ValueError(
-                    f"a baseline's name is made of a-z, 0-9 and _, and is not {' or '.join(RESERVED)}, got {name!r}"
+                    f"a baseline's name is made of a-z, 0-9 and _, and is not {' or '.join(SOURCES)}, got {name!r}"
                 )
         return baselines
 
@@ -173,22 +178,24 @@ class Experiment(Frozen):
     @classmethod
     def _shares_are_shares(cls, scaling: tuple[float, ...]) -> tuple[float, ...]:
         if any(not 0 < share < 1 for share in scaling) or len(set(scaling)) < len(scaling):
-            raise ValueError(f"scaling are different shares between 0 and 1, got {scaling}; all frames are a setting")
+            raise ValueError(
+                f"scaling are different shares between 0 and 1, got {scaling}; all frames are a training set"
+            )
         return scaling
 
     @model_validator(mode="after")
     def _only_histograms_hold_counts(self) -> Experiment:
-        if self.round_to_counts and self.encoding.name != "event_histogram":
-            raise ValueError(f"round_to_counts needs encoding 'event_histogram', got {self.encoding.name!r}")
+        if self.stochastic_rounding and self.encoding.name != "event_histogram":
+            raise ValueError(f"stochastic_rounding needs encoding 'event_histogram', got {self.encoding.name!r}")
         return self
 
     @model_validator(mode="after")
     def _parts_are_known(self) -> Experiment:
-        known = {"real", *self.generator_names, *(["more_real"] if self.more_real else [])}
-        for setting in self.together:
-            parts = setting.split("+")
+        known = {REAL, *self.generator_names, *([ORACLE] if self.oracle else [])}
+        for mixture in self.mixtures:
+            parts = mixture.split("+")
             if len(parts) < 2 or len(set(parts)) < len(parts) or not set(parts) <= known:
-                raise ValueError(f"together joins different ones of {', '.join(sorted(known))} by +, got {setting!r}")
+                raise ValueError(f"mixtures join different ones of {', '.join(sorted(known))} by +, got {mixture!r}")
         return self
 
     @property
@@ -199,13 +206,13 @@ class Experiment(Frozen):
     @property
     def rounding(self) -> EncodingChoice | None:
         """The encoding whose levels sampled frames are rounded to, if any."""
-        return self.encoding if self.round_to_counts else None
+        return self.encoding if self.stochastic_rounding else None
 
     @property
     def choices(self) -> list[Any]:
         """Every plug-in the experiment names."""
         chosen = [self.dataset, self.encoding, self.condition, self.generator, self.sampling_choice, self.downstream]
-        more = None if self.more_real is None else self.more_real.dataset
+        more = None if self.oracle is None else self.oracle.dataset
         others = (self.poses, self.target, self.feature_extractor, self.realism_reference, more)
         optional = [choice for choice in others if choice]
         baselines = self.baselines.values()
@@ -223,15 +230,12 @@ class Experiment(Frozen):
         return ["synthetic", *self.baselines]
 
     @property
-    def trained_settings(self) -> list[str]:
+    def all_training_sets(self) -> list[TrainingSet]:
         """What downstream models are trained on, in the order of the tables."""
         makers = list(self.generator_names)
-        makers += ["faithful"] * (self.keep_faithful is not None) + ["more_real"] * (self.more_real is not None)
-        names = [setting.replace("synthetic", name) for setting in self.settings for name in makers]
-        names += [f"real+{share_name(share)}" for share in sorted(self.scaling)] + list(self.together)
-        return list(dict.fromkeys(names))
-
-
-def share_name(share: float) -> str:
-    """The name of the first part of the synthetic frames in a setting."""
-    return f"synthetic@{share:g}"
+        makers += [LABEL_CONSISTENT] * (self.keep_fraction is not None) + [ORACLE] * (self.oracle is not None)
+        asked = [TrainingSet.parse(name) for name in self.training_sets]
+        found = [training_set.with_generator(name) for training_set in asked for name in makers]
+        shares = [TrainingSource(SYNTHETIC, share) for share in sorted(self.scaling)]
+        found += [TrainingSet((TrainingSource(REAL), source)) for source in shares]
+        return list(dict.fromkeys([*found, *map(TrainingSet.parse, self.mixtures)]))

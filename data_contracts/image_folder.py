@@ -64,7 +64,7 @@ IMAGES = TableSchema(
         *(_SYNTHETIC[name] for name in ("class_name", "split", "subject", "prompt")),
         *(_SYNTHETIC[name] for name in ("joint_set", *LABEL_COLUMNS.values())),
         *(replace(_STREAMS[name], name=own, nullable=True) for name, own in EVENT_COLUMNS.items()),
-        *(_SYNTHETIC[name] for name in ("seed", "num_tries", "source_id", "condition_id", "generator", "scheduler")),
+        *(_SYNTHETIC[name] for name in ("seed", "num_attempts", "source_id", "condition_id", "generator", "scheduler")),
         *(_SYNTHETIC[name] for name in ("num_inference_steps", "guidance_scale", "checkpoint_digest")),
         Column("frames_digest", pa.string(), "digest of the manifest of all frames that were sampled"),
     ),

@@ -242,7 +242,7 @@ class Conditions:
     Attributes:
         prompts: N text prompts.
         images: [N, H, W, 3] uint8 condition images, or None for the text route.
-        motions: what N bodies do, for a generator that films them; else None.
+        motions: what N bodies do, for a generator that records them; else None.
         class_names: N classes, whose names may take turns while a generator learns; else None.
         made_by: the plug-in that made them, where it is known: the colours of its images may be directions.
     """

@@ -86,7 +86,9 @@ class Version(Frozen):
 
     def __str__(self) -> str:
         failed = "; ".join(str(check) for check in self.checks if not check.passed)
-        return f"version {self.number} of {self.experiment} " + (f"was refused: {failed}" if failed else "is published")
+        return f"version {self.number} of {self.experiment} " + (
+            f"was rejected: {failed}" if failed else "is published"
+        )
 
 
 def published_folder(home: Path, experiment: str) -> Path:

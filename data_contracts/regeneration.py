@@ -24,11 +24,11 @@ class Gates(Frozen):
         gt=0,
         description="error in the first metric, of the model trained on real frames, over that on held-out real frames",
     )
-    max_copies_share: float | None = Field(
+    max_memorised_share: float | None = Field(
         default=0.05, ge=0, le=1, description="frames nearer to a training frame than 1 % of real frames are"
     )
-    max_refused_share: float | None = Field(
-        default=0.05, ge=0, le=1, description="frames that are no event images after `max_tries`"
+    max_rejected_share: float | None = Field(
+        default=0.05, ge=0, le=1, description="frames that are no event images after `max_attempts`"
     )
     max_c2st: float | None = Field(
         default=None,

@@ -22,7 +22,11 @@ class SamplerLine(Frozen):
 
     def over(self, options: dict[str, Any], num_inference_steps: int) -> dict[str, Any]:
         """Sampling options of one point, over others; their spacing is not kept where the line chooses a solver."""
-        kept = {name: value for name, value in options.items() if name != "spacing" or "scheduler" not in self.options}
+        kept = {
+            name: value
+            for name, value in options.items()
+            if name != "timestep_spacing" or "scheduler" not in self.options
+        }
         return kept | self.options | {"num_inference_steps": num_inference_steps}
 
 

@@ -63,7 +63,7 @@ class Study(Frozen):
 def _check_alike(group: str, members: dict[str, Experiment]) -> None:
     """Raises ValueError where experiments cannot be told as draws of one."""
     for what, of in (
-        ("settings", lambda one: one.trained_settings),
+        ("training sets", lambda one: list(map(str, one.all_training_sets))),
         ("metrics", lambda one: [metric.model_dump() for metric in one.metrics]),
         ("num_generators", lambda one: one.num_generators),
         ("number of downstream_seeds", lambda one: len(one.downstream_seeds)),

@@ -199,8 +199,10 @@ SYNTHETIC = TableSchema(
         Column("num_inference_steps", pa.int32(), "network evaluations per image", minimum=1),
         Column("guidance_scale", pa.float64(), "classifier-free guidance; 1 = none", minimum=0),
         Column("seed", pa.int64(), "seed of this row's last try, from which it can be made again alone", minimum=0),
-        Column("num_tries", pa.int32(), "samplings of this row; the gate refused all but the last", minimum=1),
-        Column("refused", pa.string(), "why the gate refused the last try; empty where it passed"),
+        Column(
+            "num_attempts", pa.int32(), "samplings of this row; the quality filter rejected all but the last", minimum=1
+        ),
+        Column("rejected", pa.string(), "why the quality filter rejected the last try; empty where it passed"),
         *_LABELS,
     ),
 )
@@ -229,7 +231,7 @@ SCORES = TableSchema(
     None,
     (
         Column("task", pa.string(), "what was scored"),
-        Column("setting", pa.string(), "what the model was trained on, or which images were compared"),
+        Column("subject", pa.string(), "what the model was trained on, or which images were compared"),
         Column("seed", pa.int64(), "seed of the downstream training", minimum=0),
         Column("group", pa.string(), "`all`, or the subset of the test data"),
         Column("metric", pa.string(), "score, with its unit"),

@@ -6,7 +6,7 @@ import sys
 from functools import partial
 
 from ctlev_core import plugins
-from ctlev_core.report.sections.refusals import count_refusals
+from ctlev_core.report.sections.rejections import count_rejections
 from data_contracts.config import Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef, read_manifest
@@ -71,7 +71,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         dataset.frames,
         asked,
         sampling=baseline.sampling_choice,
-        max_tries=experiment.max_tries,
+        max_attempts=experiment.max_attempts,
         rounding=experiment.rounding,
         seed=seed,
         label=label,
@@ -84,7 +84,7 @@ if __name__ == "__main__":
         main(
             baselines,
             lambda made, _: "\n".join(
-                f"{name}: {count_refusals(read_manifest(frames.synthetic))}, in {frames.synthetic.path}"
+                f"{name}: {count_rejections(read_manifest(frames.synthetic))}, in {frames.synthetic.path}"
                 for name, sets in made.items()
                 for frames in sets
             ),

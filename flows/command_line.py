@@ -18,6 +18,7 @@ from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError, TrainingError
 from data_contracts.experiment import Experiment
+from data_contracts.renamed_options import RENAMED_VALUES, name_hint
 from data_contracts.study import Study
 from data_contracts.yaml_text import load_yaml
 from flows import local_server, settings
@@ -77,7 +78,8 @@ def read_preset(folder: Path, preset: str, heirs: tuple[str, ...] = ()) -> dict[
     if not path.is_file():
         known = ", ".join(preset_names(folder))
         of = f"{heirs[-1]} extends an " if heirs else ""
-        raise PluginError(f"{of}unknown preset {preset!r}; known: {known}, or the path of a .yaml file")
+        hint = name_hint(preset, preset_names(folder), RENAMED_VALUES)
+        raise PluginError(f"{of}unknown preset {preset!r}{hint}; known: {known}, or the path of a .yaml file")
     try:
         values = load_yaml(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -142,7 +144,7 @@ def with_plan(script_flow: Any, rows: list[PlannedStage], description: str) -> A
 
 
 def print_costs(asked: Any) -> None:
-    """What generators of Stable Diffusion's size would take; nothing for the bundled prior, a matter of minutes."""
+    """What generators of Stable Diffusion's size would take; nothing for the bundled base model."""
     if not isinstance(asked, Experiment | Study):
         return
     parts = asked.experiments if isinstance(asked, Study) else {asked.name: asked}

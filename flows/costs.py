@@ -57,7 +57,7 @@ class Costs:
 def estimate_costs(experiment: Experiment) -> Costs | None:
     """The costs of an experiment whose generator is fine-tuned from weights of Stable Diffusion's size, else None."""
     given, sampling = experiment.generator.options, experiment.sampling
-    if experiment.generator.name not in ("stable_diffusion", "controlnet") or "prior" not in given:
+    if experiment.generator.name not in ("stable_diffusion", "controlnet") or "base_model" not in given:
         return None
     # Read as they are: other options may still be wrong, or their files missing.
     options = _with_defaults(experiment.generator.name, "Options", given)

@@ -24,7 +24,7 @@ from flows import evaluate as of_evaluate
 from flows import export_events as of_export_events
 from flows import full_experiment as of_full_experiment
 from flows import prepare_dataset as of_prepare_dataset
-from flows import pretrain_prior as of_pretrain_prior
+from flows import pretrain as of_pretrain
 from flows import regenerate as of_regenerate
 from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
@@ -99,8 +99,8 @@ export_events = _deployable(of_export_events.export_streams, publish=publish_eve
 speed_vs_error = _deployable(
     of_speed_vs_error.speed_vs_error, load=of_speed_vs_error.load_speed_vs_error, publish=publish_speed_report
 )
-pretrain_prior = _deployable(
-    of_pretrain_prior.pretrain_prior,
-    default_preset="small_prior",
+pretrain = _deployable(
+    of_pretrain.pretrain,
+    default_preset="small",
     load=functools.partial(load_preset, PretrainingOptions, PRESETS / "pretraining"),
 )

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from functools import partial
 
 from data_contracts.config import DownstreamChoice, Frozen
-from data_contracts.experiment import LABELS_OF, SHUFFLED, Experiment, share_name
+from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
+from data_contracts.training_sets import (
+    LABEL_CONSISTENT,
+    ORACLE,
+    REAL,
+    SYNTHETIC,
+    LabelAgreement,
+    TrainingSet,
+    TrainingSource,
+)
 from flows.baselines import BaselineFrames, baselines
 from flows.command_line import main
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
@@ -16,7 +26,7 @@ from flows.synthesize import synthesize
 from tasks.downstream import train_downstream
 from tasks.evaluate import score_distance, score_model
 from tasks.stage import call_flow, call_together, numbered
-from tasks.subset import take_faithful, take_share
+from tasks.subset import take_label_consistent, take_share
 
 Generated = dict[str, list[ManifestRef]]
 """The sets of frames of each generator, one a fine-tuning."""
@@ -38,17 +48,19 @@ def evaluate(
     synthetic: list[ManifestRef] | None = None,
     compared: dict[str, list[BaselineFrames]] | None = None,
 ) -> Evaluation:
-    """Train and score every setting and seed; what is not given is made first."""
+    """Train and score every training set and seed; what is not given is made first."""
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     if synthetic is None:
         synthetic = [call_flow(synthesize, experiment, dataset, number=n) for n in range(experiment.num_generators)]
     if compared is None:
         compared = call_flow(baselines, experiment, dataset)
-    generated: Generated = {"synthetic": synthetic}
+    generated: Generated = {SYNTHETIC: synthetic}
     generated |= {name: [frames.synthetic for frames in made] for name, made in compared.items()}
-    trained = [(setting, seed) for setting in experiment.trained_settings for seed in experiment.downstream_seeds]
-    calls = [partial(_train_and_score, experiment, dataset, generated, setting, seed) for setting, seed in trained]
+    trained = list(itertools.product(experiment.all_training_sets, experiment.downstream_seeds))
+    calls = [
+        partial(_train_and_score, experiment, dataset, generated, training_set, seed) for training_set, seed in trained
+    ]
     if experiment.feature_extractor is not None:
         calls.append(partial(_distances, experiment, experiment.feature_extractor, dataset, generated))
     found = call_together(*calls)
@@ -56,34 +68,34 @@ def evaluate(
         extractor=found[-1][0] if experiment.feature_extractor is not None else None,
         scores=[score for _, scores in found for score in scores],
         models=[model for model, _ in found[: len(trained)]],
-        model_names=[f"{setting}, seed {seed}" for setting, seed in trained],
+        model_names=[f"{training_set}, seed {seed}" for training_set, seed in trained],
     )
 
 
 def _train_and_score(
-    experiment: Experiment, dataset: PreparedDataset, generated: Generated, setting: str, seed: int
+    experiment: Experiment, dataset: PreparedDataset, generated: Generated, training_set: TrainingSet, seed: int
 ) -> tuple[ManifestRef, list[ManifestRef]]:
-    """A model of one setting and seed, and its scores."""
-    training_set = [_frames_of(experiment, dataset, generated, part, seed) for part in setting.split("+")]
-    label = f"{experiment.downstream.name} on {setting}, seed {seed}"
-    model = train_downstream(training_set, downstream=experiment.downstream, seed=seed, label=label)
-    tested = [(dataset.tested_frames, "test", setting, [dataset.poses])]
-    if setting == "real":
-        # Do the synthetic frames show what their labels say? The real row's error is the floor, other frames' labels
-        # are the ceiling.
+    """A model of one training set and seed, and its scores."""
+    frames = [_frames_of(experiment, dataset, generated, source, seed) for source in training_set.sources]
+    label = f"{experiment.downstream.name} on {training_set}, seed {seed}"
+    model = train_downstream(frames, downstream=experiment.downstream, seed=seed, label=label)
+    tested = [(dataset.tested_frames, "test", str(training_set), [dataset.poses])]
+    if training_set == TrainingSet.of(REAL):
+        # Do the synthetic frames show what their labels say? The real row is the best they can do, labels of other
+        # frames the worst.
         for name, sets in generated.items():
             made = _of_seed(experiment, sets, seed)
-            tested += [(made, "train", f"{LABELS_OF} {name}", [])]
-            tested += [(made, "train", f"{SHUFFLED} {name}", [])] * (name == "synthetic")
+            tested += [(made, "train", str(LabelAgreement(name)), [])]
+            tested += [(made, "train", str(LabelAgreement(name, shuffled=True)), [])] * (name == SYNTHETIC)
     scores = [
         score_model(
             model,
             data,
-            training_set,
+            frames,
             poses,
             downstream=experiment.downstream,
             metrics=list(experiment.metrics),
-            setting=row,
+            subject=row,
             split=split,
             seed=seed,
             label=f"{label}: {row}",
@@ -94,29 +106,27 @@ def _train_and_score(
 
 
 def _frames_of(
-    experiment: Experiment, dataset: PreparedDataset, generated: Generated, part: str, seed: int
+    experiment: Experiment, dataset: PreparedDataset, generated: Generated, source: TrainingSource, seed: int
 ) -> ManifestRef:
-    """The training frames that a part of a setting's name stands for."""
-    if part == "real":
+    """The training frames of a source."""
+    if source.name == REAL:
         return dataset.tested_frames
-    if part == "more_real" and dataset.more_frames is not None:
+    if source.name == ORACLE and dataset.more_frames is not None:
         return dataset.more_frames
-    if part in generated:
-        return _of_seed(experiment, generated[part], seed)
-    synthetic = _of_seed(experiment, generated["synthetic"], seed)
-    if part == "faithful":
+    if source.name == LABEL_CONSISTENT:
+        synthetic = _of_seed(experiment, generated[SYNTHETIC], seed)
         real = [dataset.tested_frames]
         judge = train_downstream(real, downstream=experiment.downstream, seed=seed, label="judge of labels")
-        return take_faithful(
+        return take_label_consistent(
             judge,
             synthetic,
             downstream=experiment.downstream,
             metric=experiment.metrics[0],
-            share=experiment.keep_faithful,
-            label=f"faithful frames, seed {seed}",
+            share=experiment.keep_fraction,
+            label=f"label-consistent frames, seed {seed}",
         )
-    share = next(share for share in experiment.scaling if share_name(share) == part)
-    return take_share(synthetic, share=share, label=part)
+    made = _of_seed(experiment, generated[source.name], seed)
+    return made if source.share == 1 else take_share(made, share=source.share, label=str(source))
 
 
 def _of_seed(experiment: Experiment, sets: list[ManifestRef], seed: int) -> ManifestRef:
@@ -141,7 +151,7 @@ def _distances(
             data,
             downstream=feature_extractor,
             distances=list(experiment.distances),
-            setting=row,
+            subject=row,
             split=split,
             seed=number,
             label=numbered(row, number),

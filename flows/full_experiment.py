@@ -24,8 +24,8 @@ from flows.speed_vs_error import speed_vs_error, speed_vs_error_of
 from flows.studies import load_study
 from flows.synthesize import synthesize
 from flows.train_generator import train_generator
-from tasks.copy_check import copy_check
 from tasks.ingest import ingest
+from tasks.memorisation import memorisation
 from tasks.nearest_seen import nearest_seen
 from tasks.realism import realism
 from tasks.report import report
@@ -62,13 +62,13 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         names=experiment.generator_names,
         label=f"training frames and {', '.join(experiment.generator_names)}",
     )
-    copies = [
-        copy_check(
+    memorised = [
+        memorisation(
             dataset.frames,
             frames,
             evaluation.extractor,
             downstream=experiment.feature_extractor,
-            setting=name,
+            subject=name,
             label=name,
         )
         for name, frames in zip(experiment.generator_names, generated, strict=True)
@@ -94,13 +94,13 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         evaluation.scores,
         evaluation.models,
         looks,
-        copies,
+        memorised,
         dataset.more_frames,
         dataset.target_frames,
         names,
         title=experiment.name,
         notice=experiment.data_notice,
-        settings=experiment.trained_settings,
+        training_sets=[str(one) for one in experiment.all_training_sets],
         generator_names=experiment.generator_names,
         checkpoint_names=["synthetic", *(name for name, frames in first.items() if frames.checkpoint)],
         model_names=evaluation.model_names,
@@ -120,7 +120,7 @@ def _study(study: Study) -> ManifestRef:
         title=study.name,
         notice=study.data_notice,
         names=list(parts),
-        settings=[part.trained_settings for part in parts.values()],
+        training_sets=[[str(one) for one in part.all_training_sets] for part in parts.values()],
         generator_names=[part.generator_names for part in parts.values()],
         pooled=list(study.pooled.items()),
         num_generators=[part.num_generators for part in parts.values()],

@@ -77,7 +77,7 @@ def _look_for(choice: Choice) -> None:
     if choice.KIND == "datasets":
         look = plugin.module.list_recordings
     elif choice.KIND == "generators" and choice.OPTIONS == "Options":
-        look = getattr(plugin.module, "prior_folders", None)  # some film instead of learning
+        look = getattr(plugin.module, "base_model_folders", None)  # some record instead of learning
     elif choice.KIND != "generators":
         look = getattr(plugin.module, "input_files", None)
     if look is not None:
@@ -89,7 +89,7 @@ def _check_labels(experiment: Experiment) -> None:
 
 
 def _check_counts(experiment: Experiment) -> None:
-    asking = {"round_to_counts": experiment.round_to_counts, "export": experiment.export is not None}
+    asking = {"stochastic_rounding": experiment.stochastic_rounding, "export": experiment.export is not None}
     for what, is_asked in asking.items():
         if is_asked:
             check_whole_counts(experiment, what)

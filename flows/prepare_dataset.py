@@ -72,7 +72,7 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
 
 def _more_frames(experiment: Experiment) -> ManifestRef | None:
     """Other real recordings to train on, where the experiment names some."""
-    more = experiment.more_real
+    more = experiment.oracle
     if more is None:
         return None
     recordings = ingest(dataset=more.dataset, label=f"{more.dataset.name}, more real recordings")
@@ -110,8 +110,8 @@ def condition_asked_samples(
         encoding=experiment.encoding,
         windows=experiment.windows,
         count=experiment.num_synthetic,
-        order=experiment.pose_order,
-        views=experiment.pose_views,
+        order="in_time" if experiment.temporal_order else "random",
+        views=experiment.view,
         seed=experiment.seed,
         label=f"{condition.name}, to sample",
     )

@@ -13,20 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.report.sections.refusals import count_refusals
+from ctlev_core.report.sections.rejections import count_rejections
 from ctlev_core.report.version_gates import check_gates
 from data_contracts.config import Frozen
-from data_contracts.experiment import LABELS_OF
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.published import StoredArtefact, Version, published_folder, version_file
 from data_contracts.regeneration import Regeneration
+from data_contracts.training_sets import LabelAgreement
 from flows.command_line import load_experiment, main
 from flows.prepare_dataset import PreparedDataset, condition_asked_samples, prepare_dataset
 from flows.settings import flow
 from flows.train_generator import train_generator
-from tasks.copy_check import copy_check
 from tasks.downstream import train_downstream
 from tasks.evaluate import score_model
+from tasks.memorisation import memorisation
 from tasks.publish import claimed, next_number
 from tasks.realism import realism
 from tasks.sample import sample
@@ -94,7 +94,7 @@ def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: Mani
         dataset.frames,
         conditions,
         sampling=regeneration.sampling_choice,
-        max_tries=regeneration.max_tries,
+        max_attempts=regeneration.max_attempts,
         rounding=regeneration.rounding,
         seed=seed,
         label=regeneration.generator.name,
@@ -125,7 +125,7 @@ def _score_likeness(regeneration: Regeneration, dataset: PreparedDataset, synthe
                 label="beside real",
             )
         )
-    return [*scores, copy_check(frames, synthetic, extractor, downstream=downstream, setting=NAME, label=NAME)]
+    return [*scores, memorisation(frames, synthetic, extractor, downstream=downstream, subject=NAME, label=NAME)]
 
 
 def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
@@ -134,7 +134,7 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
     model = train_downstream([frames], downstream=downstream, seed=seed, label=f"{downstream.name} on real")
     scored = [
         (frames, "test", "real", [dataset.poses]),
-        (synthetic, "train", f"{LABELS_OF} {NAME}", []),
+        (synthetic, "train", str(LabelAgreement(NAME)), []),
     ]
     return [
         score_model(
@@ -144,12 +144,12 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
             poses,
             downstream=downstream,
             metrics=list(regeneration.metrics),
-            setting=setting,
+            subject=subject,
             split=split,
             seed=seed,
-            label=f"{downstream.name}: {setting}",
+            label=f"{downstream.name}: {subject}",
         )
-        for data, split, setting, poses in scored
+        for data, split, subject, poses in scored
     ]
 
 
@@ -161,11 +161,11 @@ def _score_realism(dataset: PreparedDataset, synthetic: ManifestRef) -> list[Man
 def _judge(regeneration: Regeneration, checkpoint: ManifestRef, made: MadeVersion, number: int, seed: int) -> Version:
     """The record of a version: what it is, what it was made from, its scores, and how it kept the gates."""
     rows = [row for ref in made.scores for row in read_manifest(ref).table.to_pylist()]
-    refusals = count_refusals(read_manifest(made.synthetic))
+    rejections = count_rejections(read_manifest(made.synthetic))
     # Those of single classes are in the artefacts.
-    told = [row for row in rows if row["group"] == "all" or row["task"] in ("copies", "realism")]
-    scores = {f"{row['setting']}, {row['group']}: {row['metric']}": row["value"] for row in told}
-    scores["sampled again"], scores["refused"] = refusals.num_again, refusals.num_refused
+    told = [row for row in rows if row["group"] == "all" or row["task"] in ("memorisation", "realism")]
+    scores = {f"{row['subject']}, {row['group']}: {row['metric']}": row["value"] for row in told}
+    scores["sampled again"], scores["rejected"] = rejections.num_again, rejections.num_rejected
     return Version(
         experiment=regeneration.name,
         number=number,
@@ -181,8 +181,8 @@ def _judge(regeneration: Regeneration, checkpoint: ManifestRef, made: MadeVersio
                 regeneration.gates,
                 rows,
                 task=regeneration.downstream.name,
-                labels_of=f"{LABELS_OF} {NAME}",
-                refused_share=refusals.num_refused / refusals.num_rows,
+                labels_of=str(LabelAgreement(NAME)),
+                rejected_share=rejections.num_rejected / rejections.num_rows,
             )
         ),
     )
@@ -197,7 +197,7 @@ def _record(version: Version) -> Path:
 
 
 def _show(version: Version) -> Any:
-    """The state of the run, `Published` or `Refused`, with the reasons in Prefect's log and as an artefact."""
+    """The state of the run, `Published` or `Rejected`, with the reasons in Prefect's log and as an artefact."""
     from prefect.artifacts import create_table_artifact
     from prefect.logging import get_run_logger
     from prefect.states import Completed
@@ -209,7 +209,7 @@ def _show(version: Version) -> Any:
     create_table_artifact(table, key="version", description=f"{version}. Record: {_record(version)}")
     logger = get_run_logger()
     (logger.info if version.passed else logger.warning)(str(version))
-    return Completed(data=version, name="Published" if version.passed else "Refused", message=str(version))
+    return Completed(data=version, name="Published" if version.passed else "Rejected", message=str(version))
 
 
 def load_regeneration(preset: str, overrides: list[str]) -> Regeneration:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ctlev_core.report.sections.refusals import count_refusals
+from ctlev_core.report.sections.rejections import count_rejections
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.synthesis import Synthesis
@@ -42,7 +42,7 @@ def synthesize(
         dataset.frames,
         dataset.sample_conditions,
         sampling=experiment.sampling_choice,
-        max_tries=experiment.max_tries,
+        max_attempts=experiment.max_attempts,
         rounding=experiment.rounding,
         seed=experiment.seed + number,
         label=numbered(experiment.generator.name, number),
@@ -76,7 +76,7 @@ def load_synthesis(preset: str, overrides: list[str]) -> Synthesis:
 
 
 def _describe(made: ManifestRef, synthesis: Synthesis) -> str:
-    lines = [f"synthetic: {count_refusals(read_manifest(made))}", f"frames: {made.path}"]
+    lines = [f"synthetic: {count_rejections(read_manifest(made))}", f"frames: {made.path}"]
     if synthesis.export_folder is not None:
         lines.append(f"exported: {synthesis.export_folder}, see its README.md")
     return "\n".join(lines)

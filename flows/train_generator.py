@@ -14,7 +14,7 @@ from flows.command_line import main
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from tasks.finetune import finetune
-from tasks.pretrain import pretrain_prior
+from tasks.pretrain import pretrain
 from tasks.stage import call_flow, numbered
 
 if TYPE_CHECKING:  # torch, which most plans do without
@@ -39,9 +39,9 @@ def train_generator(experiment: Experiment, dataset: PreparedDataset | None = No
 def base_model_of(experiment: Experiment, generator: GeneratorChoice) -> ManifestRef | None:
     """The experiment's own base model, for a generator that starts from one and names none; made if it must be."""
     options = plugins.load_options(generator).options
-    if experiment.base_model is None or getattr(options, "prior", ...) is not None:
+    if experiment.base_model is None or getattr(options, "base_model", ...) is not None:
         return None
-    return pretrain_prior(options=base_model_options(experiment), label="base model of pictures")
+    return pretrain(options=base_model_options(experiment), label="base model of pictures")
 
 
 def base_model_options(experiment: Experiment) -> PretrainingOptions:

@@ -27,13 +27,13 @@ from ctlev_core.labels.sources import (
     sensor_size_of,
 )
 from ctlev_core.plugins import Plugin
-from ctlev_core.seeds import row_seeds
+from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.arrays import ArrayWriter
 from data_contracts.config import ConditionChoice, EncodingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
-from data_contracts.experiment import PoseOrder, PoseViews
+from data_contracts.experiment import LabelOrder, View
 from data_contracts.labels import BodyMotions, Labels
 from data_contracts.manifest import Manifest, concat_labels, condition_arrays, label_columns, labels_of
 from tasks.stage import Output, input_files_of, stage
@@ -69,8 +69,8 @@ def condition_samples(
     encoding: EncodingChoice,
     windows: Windows,
     count: int,
-    order: PoseOrder,
-    views: PoseViews,
+    order: LabelOrder,
+    views: View,
     seed: int,
 ) -> pa.Table:
     """Choose `count` labels to sample from and render them.
@@ -113,14 +113,14 @@ def condition_samples(
         rows = rows_of_frames(recordings, frames, _choose(frames.table, learnt, count, order, seed))
     if getattr(plugins.load_options(condition).module, "NEEDS", "") == "intensity":
         if views == "new":
-            raise DataError(f"condition {condition.name!r} shows pictures as they were; set pose_views to 'labelled'")
+            raise DataError(f"condition {condition.name!r} shows pictures as they were; set view to 'labelled'")
         if windows.method == "count" and moments.num_rows:
             rows = as_different_as_training(rows, recordings, frames)
     sample_ids = [f"condition/{number:06d}" for number in range(count)]
     return _render(out, sample_ids, rows, condition, recordings, frames, encoding, seed)
 
 
-def _choose(table: pa.Table, rows: np.ndarray, count: int, order: PoseOrder, seed: int) -> np.ndarray:
+def _choose(table: pa.Table, rows: np.ndarray, count: int, order: LabelOrder, seed: int) -> np.ndarray:
     """`count` of the given rows of a table of labels."""
     if order == "in_time":
         return rows[np.sort(np.resize(spread(len(rows), count), count))]
@@ -188,7 +188,7 @@ def _from_new_sides(labels: Labels, turned: np.ndarray, sensor_size: SensorSize,
     from ctlev_core.labels.body_views import from_new_side
 
     if labels.smpl_pose is None:
-        raise DataError("pose_views 'new' needs bodies (SMPL parameters) to turn; these labels have joints or classes")
+        raise DataError("view 'new' needs bodies (SMPL parameters) to turn; these labels have joints or classes")
     groups = [np.flatnonzero(turned == number) for number in np.unique(turned)]
     seen = [
         from_new_side(labels.take(rows), np.random.default_rng([seed, VIEW_STREAM, number]), sensor_size)
@@ -218,7 +218,7 @@ def _render(
     seed: int,
 ) -> pa.Table:
     plugin = _load_condition(condition, recordings)
-    labels, seeds = rows.labels, row_seeds(seed, len(rows.labels))
+    labels, seeds = rows.labels, sample_seeds(seed, len(rows.labels))
     needs = getattr(plugin.module, "NEEDS", None)
     motions = read_motions(rows, recordings, frames, encoding) if needs == "motion" else None
     prompts: list[str] = []

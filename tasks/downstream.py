@@ -22,8 +22,8 @@ def train_downstream(
 ) -> pa.Table:
     """Train on the rows of split `train` of all given sets; the artefact's `model/` holds the weights.
 
-    The number of optimiser steps is an option of the model, so that it is the same for every setting. A model that can
-    look at several frames at once (`train_sequences`) is told which follow one another.
+    The number of optimiser steps is an option of the model, so that it is the same for every training_set. A model that
+    can look at several frames at once (`train_sequences`) is told which follow one another.
     """
     plugin = plugins.load_options(downstream)
     rows = [manifest.rows_where(split="train") for manifest in training_sets]

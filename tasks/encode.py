@@ -161,8 +161,8 @@ def _encode_spread(
     """The same, several recordings at a time."""
     found = map_shards(partial(_encode_shard, encoding, windows, work), list(enumerate(sources)), max_group=MAX_GROUP)
     found = tqdm(found, "encode", len(sources), unit="recording", leave=False, disable=None)
-    for source, pieces in zip(sources, found, strict=True):
-        for samples in pieces:
+    for source, chunks in zip(sources, found, strict=True):
+        for samples in chunks:
             yield source.recording["recording_id"], samples if isinstance(samples, _Samples) else samples.take_back()
 
 
@@ -192,12 +192,12 @@ def _encode_shard(
 ) -> list[_Samples | _PutAway]:
     """All windows of a recording; images beyond `HELD_BYTES` go to files, for many recordings may wait."""
     number, source = numbered
-    pieces: list[_Samples | _PutAway] = []
+    chunks: list[_Samples | _PutAway] = []
     held = 0
     for samples in _encode_source(source, plugins.load_options(encoding), windows):
         held += samples.histograms.nbytes + samples.frames.nbytes
-        pieces.append(samples if held <= HELD_BYTES else _put_away(samples, work / f"{number:07d}_{len(pieces):05d}"))
-    return pieces
+        chunks.append(samples if held <= HELD_BYTES else _put_away(samples, work / f"{number:07d}_{len(chunks):05d}"))
+    return chunks
 
 
 def _sources(recordings: Manifest, windows: Windows) -> list[_Source]:

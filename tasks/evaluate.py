@@ -26,9 +26,9 @@ from ctlev_core.supervised.frame_sequences import name_recordings
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
-from data_contracts.experiment import SHUFFLED
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest
+from data_contracts.training_sets import LabelAgreement
 from tasks.stage import Output, Stage
 
 SHUFFLE_STREAM = 40
@@ -60,7 +60,7 @@ def score_model(
     *,
     downstream: DownstreamChoice,
     metrics: list[MetricChoice],
-    setting: str,
+    subject: str,
     split: str,
     seed: int,
 ) -> pa.Table:
@@ -69,8 +69,8 @@ def score_model(
     Classes that real training frames show, those that only the label-only recordings of `poses` have, and those
     that neither has are groups of their own: what synthetic data adds is in the second. So are subjects of whom there
     is nothing to learn from, beside others, and each of a few subjects (`ctlev_core.scoring.subsets`). Beside the table
-    lie the scores of the single samples, from which two models can be compared in pairs. A setting that starts with
-    `SHUFFLED` gives every frame the labels of another.
+    lie the scores of the single samples, from which two models can be compared in pairs. The subject of
+    shuffled label agreement gives every frame the labels of another.
 
     Raises:
         DataError: the split has no rows, or a recording is both learnt from and tested on.
@@ -83,13 +83,14 @@ def score_model(
     predict = _predict_of(plugin.module, data, rows)
     prediction = predict(model.ref.path / "model", np.asarray(data.array("frames")[rows]))
     labels = data.labels.take(rows)
-    if setting.startswith(SHUFFLED):
+    of_labels = LabelAgreement.parse(subject)
+    if of_labels is not None and of_labels.shuffled:
         labels = labels.take(_others(len(rows), seed))
     recordings = np.array(data.column("recording_id"))[rows]
     num_train = sum(len(training_set.rows_where(split="train")) for training_set in training_sets)
     same = {
         "task": plugin.name,
-        "setting": setting,
+        "subject": subject,
         "seed": seed,
         "num_train": num_train,
         "model_digest": model.ref.digest,
@@ -267,7 +268,7 @@ def score_distance(
     *,
     downstream: DownstreamChoice,
     distances: list[MetricChoice],
-    setting: str,
+    subject: str,
     split: str,
     seed: int,
 ) -> pa.Table:
@@ -298,11 +299,11 @@ def score_distance(
             target_groups=groups[1],
         )
         named |= {name_distance(plugin, folder, extractor.ref.digest, name): one for name, one in estimates.items()}
-    out.write_table(estimates_table(setting, named), DISTANCE_ESTIMATES)
+    out.write_table(estimates_table(subject, named), DISTANCE_ESTIMATES)
     found = [
         {
             "task": "distance",
-            "setting": setting,
+            "subject": subject,
             "seed": seed,
             "group": "all",
             "metric": name,

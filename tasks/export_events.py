@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from ctlev_core.events.image_grid import check_whole_counts, count_size, pixel_bins
 from ctlev_core.events.windows import spread
 from ctlev_core.postprocessing.event_streams import TimeModel, fit_times, sample_streams
@@ -127,11 +127,11 @@ def _windows(rows: list[dict[str, Any]], recordings: Manifest) -> Iterator[Event
             if part["recording_id"] == row["recording_id"] and part["split"] == row["split"]:
                 found += _events_between(path, part["event_start"], part["event_stop"], start_us, end_us)
         if found:
-            yield event_pieces.concatenate(found)
+            yield event_chunks.concatenate(found)
 
 
 def _events_between(path: Path, start: int, stop: int, start_us: int, end_us: int) -> list[Events]:
-    """Events of a stretch of a file from one time to another, both included, in pieces."""
+    """Events of a stretch of a file from one time to another, both included, in chunks."""
     # By halves, so that a window of a long recording costs a few reads of single events.
     low, high = start, stop
     while low < high:
@@ -142,12 +142,12 @@ def _events_between(path: Path, start: int, stop: int, start_us: int, end_us: in
             high = middle
     found = []
     while low < stop:
-        piece = event_files.read_events_range(path, low, min(low + READ_EVENTS, stop))
-        last = int(np.searchsorted(piece.t, end_us, "right"))
-        found.append(piece.slice(0, last))
-        if last < len(piece):
+        chunk = event_files.read_events_range(path, low, min(low + READ_EVENTS, stop))
+        last = int(np.searchsorted(chunk.t, end_us, "right"))
+        found.append(chunk.slice(0, last))
+        if last < len(chunk):
             break
-        low += len(piece)
+        low += len(chunk)
     return found
 
 
@@ -215,9 +215,9 @@ def _suffix(name: str, writer: ModuleType) -> str:
     return own if own in writer.SUFFIXES else writer.SUFFIXES[0]
 
 
-def _write(path: Path, pieces: Iterable[Events], name: str, writer: ModuleType) -> None:
-    """Parquet piece by piece; other formats write a recording as a whole, which must fit into memory."""
+def _write(path: Path, chunks: Iterable[Events], name: str, writer: ModuleType) -> None:
+    """Parquet chunk by chunk; other formats write a recording as a whole, which must fit into memory."""
     if name == "parquet":
-        event_files.write_event_chunks_parquet(path, pieces)
+        event_files.write_event_chunks_parquet(path, chunks)
         return
-    writer.write(path, event_pieces.concatenate(pieces))
+    writer.write(path, event_chunks.concatenate(chunks))

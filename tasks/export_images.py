@@ -37,7 +37,8 @@ WriteFile = Callable[[int, Path], object]
 
 
 def export_images(artefacts: Artefacts, folder: Path, *, name: str, notice: str) -> Path:
-    """Write frames that passed the gate, with their labels, into a new folder, as a task of the run that calls it.
+    """Write frames that passed the quality filter, with their labels, into a new folder, as a task of the run that
+    calls it.
 
     The folder appears when it is complete. Until then the files lie beside it, under another name; a run that is killed
     goes on with them. A folder that holds this very export stays as it is.
@@ -50,7 +51,7 @@ def export_images(artefacts: Artefacts, folder: Path, *, name: str, notice: str)
     Returns:
         The folder.
     Raises:
-        DataError: the folder holds something else, or no frame passed the gate.
+        DataError: the folder holds something else, or no frame passed the quality filter.
         BlockingIOError: another run is writing it.
     """
     from prefect import task
@@ -94,9 +95,11 @@ def write_image_folder(artefacts: Artefacts, folder: Path, *, name: str, notice:
         return folder
     opened = {role: read_manifest(ref) for role, ref in artefacts.items()}
     frames = opened["synthetic"]
-    rows = frames.rows_where(refused="")
+    rows = frames.rows_where(rejected="")
     if not len(rows):
-        raise DataError(f"{frames.ref.path}: the gate refused all {len(frames)} frames, there is nothing to export")
+        raise DataError(
+            f"{frames.ref.path}: the quality filter rejected all {len(frames)} frames, there is nothing to export"
+        )
     records = read_records([(role, ref.path) for role, ref in artefacts.items()])
     with _claimed(artefacts, folder, records) as partial:
         table, event_suffix = _write_files(opened, rows, partial)
@@ -106,7 +109,7 @@ def write_image_folder(artefacts: Artefacts, folder: Path, *, name: str, notice:
             notice=notice,
             table=table,
             image_size=(frames.array("frames").shape[2], frames.array("frames").shape[1]),
-            num_refused=len(frames) - len(rows),
+            num_rejected=len(frames) - len(rows),
             event_suffix=event_suffix,
             records=records,
         )

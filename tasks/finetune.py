@@ -17,15 +17,15 @@ from data_contracts.manifest import Manifest, conditions_of, history_table
 from tasks.stage import Output, files_of, stage
 
 
-def _prior_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
+def _base_model_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     plugin = plugins.load_options(arguments["generator"])
     # A base model is an artefact, and its key is part of ours.
-    places = [] if arguments["base_model"] is not None else plugin.module.prior_folders(plugin.options)
+    places = [] if arguments["base_model"] is not None else plugin.module.base_model_folders(plugin.options)
     shown = [] if not getattr(plugin.options, "rehearsal_share", 0) else picture_files(plugin.options.rehearsal)
     return files_of(places) + [(f"rehearsal/{name}", path) for name, path in files_of(shown)]
 
 
-@stage(version=1, schema=tables.TRAINING, raw_files=_prior_files)
+@stage(version=1, schema=tables.TRAINING, raw_files=_base_model_files)
 def finetune(
     out: Output,
     frames: Manifest,
@@ -35,15 +35,15 @@ def finetune(
     generator: GeneratorChoice,
     seed: int,
 ) -> pa.Table:
-    """Tune the prior on the training frames; the artefact's `checkpoint/` is an ordinary diffusers folder.
+    """Tune the base model on the training frames; the artefact's `checkpoint/` is an ordinary diffusers folder.
 
-    With `base_model`, an artefact of pre-training, that is the prior.
+    With `base_model`, an artefact of pre-training, that is the base model.
     """
     plugin = plugins.load_options(generator)
     rows = matching_rows(frames, conditions)
     options = plugin.options
     if base_model is not None:
-        options = options.model_copy(update={"prior": base_model.ref.path / "prior"})
+        options = options.model_copy(update={"base_model": base_model.ref.path / "base_model"})
     history = plugin.module.train(
         np.asarray(frames.array("frames")[rows]),
         conditions_of(conditions),

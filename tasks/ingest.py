@@ -123,30 +123,30 @@ def _ingest_recording(dataset: DatasetChoice, out: Output, recording: Recording)
 
 
 def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str) -> dict[str, Any]:
-    """Events into Parquet, piece by piece where the dataset reads in pieces."""
+    """Events into Parquet, chunk by chunk where the dataset reads in chunks."""
     name = f"events/{recording.recording_id}.parquet"
     finished, attached = out.work / name, out.folder / name
     for path in (finished, attached):
         path.parent.mkdir(parents=True, exist_ok=True)
 
-    def watched(pieces: Iterable[Events]) -> Iterator[Events]:
+    def watched(chunks: Iterable[Events]) -> Iterator[Events]:
         # Only a recording that takes long gets a bar of its own.
         label = recording.recording_id
         with tqdm(desc=label, unit="event", unit_scale=True, delay=5, leave=False, disable=None) as bar:
-            for piece in pieces:
-                yield piece
-                bar.update(len(piece))
+            for chunk in chunks:
+                yield chunk
+                bar.update(len(chunk))
 
     if finished.exists():  # by an earlier run that was interrupted
         summary = event_files.Summary()
-        for piece in watched(event_files.read_event_chunks(finished)):
-            summary.add(piece)
+        for chunk in watched(event_files.read_event_chunks(finished)):
+            summary.add(chunk)
     else:
         if hasattr(plugin.module, "read_event_chunks"):
-            pieces = plugin.module.read_event_chunks(recording, plugin.options)
+            chunks = plugin.module.read_event_chunks(recording, plugin.options)
         else:
-            pieces = [check_events(plugin.module.read_events(recording, plugin.options), where)]
-        summary = event_files.write_event_chunks_parquet(finished, watched(pieces))
+            chunks = [check_events(plugin.module.read_events(recording, plugin.options), where)]
+        summary = event_files.write_event_chunks_parquet(finished, watched(chunks))
     if summary.num_events == 0 or summary.sensor_size is None:
         raise DataError(f"{where}: the recording holds no events")
     os.link(finished, attached)

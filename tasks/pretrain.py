@@ -1,4 +1,4 @@
-"""Make a small prior: the bundled ones, or a base model of a user's own pictures."""
+"""Make a small base model: the bundled ones, or a base model of a user's own pictures."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
 
 
 @stage(version=4, schema=tables.TRAINING, raw_files=_raw_files)
-def pretrain_prior(out: Output, *, options: PretrainingOptions) -> pa.Table:
-    """Train the small prior on pictures; the artefact's `prior/` is an ordinary diffusers folder."""
+def pretrain(out: Output, *, options: PretrainingOptions) -> pa.Table:
+    """Train the small base model on pictures; the artefact's `base_model/` is an ordinary diffusers folder."""
     from ctlev_core.diffusion.pretraining.pretraining import pretrain
 
-    return history_table(pretrain(options, out.folder / "prior", out.work))
+    return history_table(pretrain(options, out.folder / "base_model", out.work))

@@ -109,17 +109,17 @@ def _tell_apart(first: str, of_first: Frames, second: str, of_second: Frames) ->
     )
 
 
-def _test_row(group: str, setting: str, test: two_sample.TwoSampleTest) -> dict[str, Any]:
-    return {"group": group, "setting": setting} | test.row()
+def _test_row(group: str, subject: str, test: two_sample.TwoSampleTest) -> dict[str, Any]:
+    return {"group": group, "subject": subject} | test.row()
 
 
 def _test_rows(group: str, tests: dict[str, two_sample.TwoSampleTest], data: Manifest) -> list[dict[str, Any]]:
     """Rows of the table `scores`, of those tests that have an area."""
     return [
         _score(
-            group, setting, two_sample.C2ST, distances.Estimate(test.value, test.low, test.high), test.num_first, data
+            group, subject, two_sample.C2ST, distances.Estimate(test.value, test.low, test.high), test.num_first, data
         )
-        for setting, test in tests.items()
+        for subject, test in tests.items()
         if not np.isnan(test.value)
     ]
 
@@ -174,27 +174,27 @@ def _compare(
     found[f"{first} against {first}"] = distances.estimate_floor(sets[first])
     sizes = {name: len(summaries) for name, summaries in sets.items()}
     rows = [
-        _score(group, setting, metric, estimate, sizes[setting.split(" against ")[0]], data)
-        for setting, estimates in found.items()
+        _score(group, subject, metric, estimate, sizes[subject.split(" against ")[0]], data)
+        for subject, estimates in found.items()
         for metric, estimate in estimates.items()
     ]
     return rows, [row for name, summaries in sets.items() for row in _distribution_rows(group, name, summaries)]
 
 
-def _distribution_rows(group: str, setting: str, summaries: Sequence[Summary]) -> list[dict[str, Any]]:
+def _distribution_rows(group: str, subject: str, summaries: Sequence[Summary]) -> list[dict[str, Any]]:
     return [
-        {"group": group, "setting": setting, "axis": axis, "centre": float(centre), "share": float(share)}
+        {"group": group, "subject": subject, "axis": axis, "centre": float(centre), "share": float(share)}
         for axis, shares in distances.mean_distributions(summaries).items()
         for centre, share in zip(AXES[axis].centres, shares, strict=True)
     ]
 
 
 def _score(
-    group: str, setting: str, metric: str, estimate: distances.Estimate, num_samples: int, data: Manifest
+    group: str, subject: str, metric: str, estimate: distances.Estimate, num_samples: int, data: Manifest
 ) -> dict[str, Any]:
     return {
         "task": "realism",
-        "setting": setting,
+        "subject": subject,
         "seed": 0,
         "group": group,
         "metric": metric,

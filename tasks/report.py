@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.provenance.records import Record, read_records, write_provenance
-from ctlev_core.provenance.scores import paired_samples, trace_scores
+from ctlev_core.provenance.scores import paired_samples, trace_lineage
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from ctlev_core.report.page.html import Curves, Folded, Section, render_report
@@ -21,13 +21,13 @@ from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, PROVENANC
 from ctlev_core.report.page.tables import Cell, Table, render_latex, render_markdown
 from ctlev_core.report.sections import pictures
 from ctlev_core.report.sections.contact_sheet import contact_sheet_sections
-from ctlev_core.report.sections.copies import copy_sections
 from ctlev_core.report.sections.costs import cost_table, options_table, versions_table
 from ctlev_core.report.sections.data_split import told_split
 from ctlev_core.report.sections.distances import floor_tables
+from ctlev_core.report.sections.memorisation import memorisation_sections
 from ctlev_core.report.sections.nearest_classes import nearest_sections
 from ctlev_core.report.sections.realism import realism_sections
-from ctlev_core.report.sections.refusals import refusal_sections
+from ctlev_core.report.sections.rejections import rejection_sections
 from ctlev_core.report.sections.scaling import scaling_figure, scaling_points
 from ctlev_core.report.sections.score_tables import (
     PairedScores,
@@ -36,7 +36,7 @@ from ctlev_core.report.sections.score_tables import (
     score_tables,
     trained_rows,
 )
-from ctlev_core.report.sections.training_curves import prior_figures
+from ctlev_core.report.sections.training_curves import base_model_figures
 from ctlev_core.report.sections.verdict import verdict
 from ctlev_core.report.studies.paper_numbers import paper_section
 from ctlev_core.report.studies.summary import Figure, Summary, write_summary
@@ -62,14 +62,14 @@ def report(
     scores: list[Manifest],
     models: list[Manifest],
     realism: Manifest,
-    copies: list[Manifest],
-    more_real: Manifest | None = None,
+    memorisation: list[Manifest],
+    oracle: Manifest | None = None,
     target: Manifest | None = None,
     nearest: Manifest | None = None,
     *,
     title: str,
     notice: str,
-    settings: Sequence[str],
+    training_sets: Sequence[str],
     generator_names: Sequence[str],
     checkpoint_names: Sequence[str],
     model_names: Sequence[str],
@@ -77,7 +77,7 @@ def report(
     """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, `provenance.json` and `summary.json`.
 
     `generated` are the frames of each generator: first the experiment's own, called `synthetic`, then the baselines; of
-    several sets of one name the first is shown. `more_real` are other real frames of the moments asked for, `target`
+    several sets of one name the first is shown. `oracle` are other real frames of the moments asked for, `target`
     those of another dataset that was tested on, `nearest` what of the training set is most like its classes.
     """
     if target is None:  # whose recordings are others
@@ -95,25 +95,25 @@ def report(
             *_roles("model of", model_names, models),
             *_roles("score of", [_score_name(manifest) for manifest in scores], scores),
             ("realism", realism.ref.path),
-            *_roles("copies of", generator_names, copies),
-            *([] if more_real is None else [("more real frames", more_real.ref.path)]),
+            *_roles("memorisation of", generator_names, memorisation),
+            *([] if oracle is None else [("more real frames", oracle.ref.path)]),
             *([] if target is None else [("target frames", target.ref.path)]),
             *([] if nearest is None else [("nearest seen classes", nearest.ref.path)]),
         ]
     )
-    traced = trace_scores([(manifest.ref.key, manifest.table) for manifest in scores], records)
-    real = [frames, *(manifest for manifest in (more_real, target) if manifest is not None)]
+    traced = trace_lineage([(manifest.ref.key, manifest.table) for manifest in scores], records)
+    real = [frames, *(manifest for manifest in (oracle, target) if manifest is not None)]
     samples = paired_samples(_samples(scores, [*real, *generated]))
     rows, paired = traced.to_pylist(), PairedScores(samples)
-    results = _results(rows, settings, list(shown), paired)
-    copied = copy_sections(frames, generated, copies)
+    results = _results(rows, training_sets, list(shown), paired)
+    copied = memorisation_sections(frames, generated, memorisation)
     distributions, tests = (realism.attached(schema).to_pylist() for schema in (DISTRIBUTIONS, TWO_SAMPLE_TESTS))
     looks = realism_sections(realism.table.to_pylist(), distributions, tests)
-    refused = refusal_sections(shown)
+    refused = rejection_sections(shown)
     floors = floor_tables(scores)
     sheet = contact_sheet_sections(frames, frame_conditions, conditions)
-    _, by_class = group_tables(rows, settings)
-    words = _verdict(rows, settings, list(shown), paired)
+    _, by_class = group_tables(rows, training_sets)
+    words = _verdict(rows, training_sets, list(shown), paired)
     steps = pictures.steps(frames, frame_conditions, conditions, next(iter(shown.values())), _kind(frame_conditions))
     grid, *other_grids = pictures.sample_grids(conditions, shown, real)
     figures = _figures(rows, _learnt_with(records), conditions, next(iter(shown.values())))
@@ -161,10 +161,10 @@ def _first_metric(rows: list[Row]) -> str:
     return next((row["metric"] for row in trained_rows(rows)), "")
 
 
-def _results(rows: list[Row], settings: Sequence[str], names: list[str], paired: PairedScores) -> list[Table]:
+def _results(rows: list[Row], training_sets: Sequence[str], names: list[str], paired: PairedScores) -> list[Table]:
     """The tables of scores, headline first."""
-    headline, *others = score_tables(rows, settings, paired)
-    origins, _ = group_tables(rows, settings)
+    headline, *others = score_tables(rows, training_sets, paired)
+    origins, _ = group_tables(rows, training_sets)
     return [headline, *origins, *baseline_tables(names, _first_metric(rows), paired), *others]
 
 
@@ -174,24 +174,24 @@ def _figures(
     metric = _first_metric(rows)
     points = scaling_points(rows, metric)
     return [
-        *prior_figures(rows, learnt_with, metric),
+        *base_model_figures(rows, learnt_with, metric),
         *pictures.motion(conditions, synthetic),
         *([scaling_figure(points, metric)] if len({point.ratio for point in points}) >= FEWEST_AMOUNTS else []),
     ]
 
 
-def _verdict(rows: list[Row], settings: Sequence[str], names: list[str], paired: PairedScores) -> str:
+def _verdict(rows: list[Row], training_sets: Sequence[str], names: list[str], paired: PairedScores) -> str:
     metric = _first_metric(rows)
     own, *others = names
     beside = {other: paired.difference(f"real+{other}", f"real+{own}", metric) for other in others}
-    gain = paired.difference("real", "real+more_real", metric)
-    trainings = [paired.of(setting, metric) for setting in ("real", f"real+{own}", "real+more_real")]
+    gain = paired.difference("real", "real+oracle", metric)
+    trainings = [paired.of(training_set, metric) for training_set in ("real", f"real+{own}", "real+oracle")]
     start, reached, most = trainings
-    ceiling = None
+    oracle = None
     if gain is not None and start is not None and reached is not None and most is not None:
-        ceiling = gain, share_of_gain(start, reached, most)
-    added, instead = (paired.difference("real", setting, metric) for setting in (f"real+{own}", own))
-    return verdict(rows, settings, added, beside, ceiling, instead)
+        oracle = gain, share_of_gain(start, reached, most)
+    added, instead = (paired.difference("real", training_set, metric) for training_set in (f"real+{own}", own))
+    return verdict(rows, training_sets, added, beside, oracle, instead)
 
 
 def _learnt_with(records: Sequence[Record]) -> dict[str, dict[str, Any]]:
@@ -210,7 +210,7 @@ def _roles(role: str, names: Sequence[str], manifests: Sequence[Manifest]) -> li
 
 def _score_name(manifest: Manifest) -> str:
     first = manifest.table.slice(0, 1).to_pylist()[0]
-    return f"{first['setting']}, seed {first['seed']}" + (", distance" if first["task"] == "distance" else "")
+    return f"{first['subject']}, seed {first['seed']}" + (", distance" if first["task"] == "distance" else "")
 
 
 def _kind(conditions: Manifest) -> str:

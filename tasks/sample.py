@@ -22,9 +22,15 @@ from ctlev_core.events import files as event_files
 from ctlev_core.events.image_grid import check_whole_counts
 from ctlev_core.events.windows import spread, window_around
 from ctlev_core.labels.sources import sensor_size_of
-from ctlev_core.postprocessing.rejection import GatedImages, ImageGate, find_causes, fit_gate, sample_until_accepted
-from ctlev_core.postprocessing.stochastic_rounding import dither_counts
-from ctlev_core.seeds import row_seeds
+from ctlev_core.postprocessing.quality_filter import (
+    FilteredImages,
+    QualityFilter,
+    find_causes,
+    fit_quality_filter,
+    sample_until_accepted,
+)
+from ctlev_core.postprocessing.stochastic_rounding import round_stochastically
+from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
@@ -36,12 +42,12 @@ from tasks.workers import map_shards
 
 SHARD_ROWS = 64
 BLOCK_BYTES = 1 << 30
-"""Frames held at a time. For each block the generator reads its checkpoint again, so it is no smaller."""
+"""Frames held at a time. For each chunk the generator reads its checkpoint again, so it is no smaller."""
 CALIBRATION_FILE = "calibration.json"
 MAX_CALIBRATION, MAX_CALIBRATION_EVENTS = 64, 1 << 22
 """Training recordings that a simulator is fitted to, evenly spread over all, and events that are read of each."""
 MAX_GATE_FRAMES = 2_000
-"""Training frames the gate is fitted to, evenly spread: the quantiles of more hardly move."""
+"""Training frames the quality filter is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
 @stage(version=3, schema=tables.SYNTHETIC)
@@ -52,14 +58,14 @@ def sample(
     conditions: Manifest,
     *,
     sampling: SamplingChoice,
-    max_tries: int,
+    max_attempts: int,
     seed: int,
     rounding: EncodingChoice | None = None,
 ) -> pa.Table:
     """One frame per condition row, each from a seed of its own; the labels come along unchanged.
 
     A row whose frame cannot be an event image, beside the training frames among `frames`, is sampled again, in all
-    `max_tries` times. If the last is refused as well it is kept, and says why. With `rounding`, the encoding of the
+    `max_attempts` times. If the last is refused as well it is kept, and says why. With `rounding`, the encoding of the
     training frames, each frame becomes the rendering of event counts that it is the expectation of.
     """
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
@@ -70,67 +76,68 @@ def sample(
     def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
         return plugin.module.sample(folder, asked.take(rows), plugin.options, seeds=seeds, work=out.work)
 
-    seeds = row_seeds(seed, len(asked))
+    seeds = sample_seeds(seed, len(asked))
     if isinstance(plugin.options, SamplingOptions):
         seeds = noise_seeds(seeds, plugin.options)  # here, so that every row is told the seed it was made from
-    gate, block, told = gate_of(frames), _block_rows(frames), _Told([], [], [])
+    quality_filter, chunk, told = quality_filter_of(frames), _chunk_rows(frames), SampleLog([], [], [])
     with out.open_array("frames") as written:
-        for start in range(0, len(seeds), block):
-            rows = np.arange(start, min(start + block, len(seeds)))
+        for start in range(0, len(seeds), chunk):
+            rows = np.arange(start, min(start + chunk, len(seeds)))
             made = sample_until_accepted(
                 lambda members, seeds, rows=rows: sample_rows(rows[members], seeds),
-                seeds[start : start + block],
-                gate,
-                max_tries=max_tries,
+                seeds[start : start + chunk],
+                quality_filter,
+                max_attempts=max_attempts,
             )
             written.append(made.frames if rounding is None else _rounded(made, frames, rounding))
-            told.add(made.seeds, made.num_tries, made.causes)
+            told.add(made.seeds, made.num_attempts, made.causes)
     return _table(conditions, plugin, checkpoint.ref.digest, told)
 
 
-class _Told(NamedTuple):
-    """What the table says of each row, as in `GatedImages`."""
+class SampleLog(NamedTuple):
+    """What the table says of each row, as in `FilteredImages`."""
 
     seeds: list[int]
-    num_tries: list[int]
+    num_attempts: list[int]
     causes: list[str]
 
-    def add(self, seeds: Sequence[int], num_tries: Sequence[int], causes: Sequence[str]) -> None:
+    def add(self, seeds: Sequence[int], num_attempts: Sequence[int], causes: Sequence[str]) -> None:
+        """Note further rows."""
         self.seeds.extend(seeds)
-        self.num_tries.extend(num_tries)
+        self.num_attempts.extend(num_attempts)
         self.causes.extend(causes)
 
 
-def _block_rows(frames: Manifest) -> int:
+def _chunk_rows(frames: Manifest) -> int:
     """Rows that are sampled before their frames are written: whole shards, so that batches are what they were."""
     return max(BLOCK_BYTES // math.prod(frames.array("frames").shape[1:]) // SHARD, 1) * SHARD
 
 
 def _check_rounding(frames: Manifest) -> None:
     """Raise `DataError` where the counts of image pixels are not known."""
-    check_whole_counts(frames.array("histograms").shape, frames.array("frames").shape, "round_to_counts")
+    check_whole_counts(frames.array("histograms").shape, frames.array("frames").shape, "stochastic_rounding")
     if not all(frames.column("num_events")):
         raise DataError(
-            f"{frames.ref.path}: round_to_counts needs event counts, and there are windows without any, as finished "
-            "event images are; set round_to_counts=false"
+            f"{frames.ref.path}: stochastic_rounding needs event counts, and there are windows without any, as "
+            "finished event images are; set stochastic_rounding=false"
         )
 
 
-def _rounded(made: GatedImages, frames: Manifest, encoding: EncodingChoice) -> np.ndarray:
+def _rounded(made: FilteredImages, frames: Manifest, encoding: EncodingChoice) -> np.ndarray:
     """The frames as renderings of whole event counts, as many as some window of training has."""
     encoder = plugins.load_options(encoding)
     learnt = frames.rows_where(split="train")
     histograms = frames.array("histograms")
     num_events = np.array([histograms[row].sum(dtype=np.int64) for row in learnt])
-    counts = dither_counts(made.frames, num_events, polarity=encoder.options.polarity, seeds=made.seeds)
+    counts = round_stochastically(made.frames, num_events, polarity=encoder.options.polarity, seeds=made.seeds)
     return encoder.module.render_image(counts, encoder.options)
 
 
-def gate_of(frames: Manifest) -> ImageGate:
-    """The gate of the training frames. Red and blue images have no green; grey ones have as much of it as of red."""
+def quality_filter_of(frames: Manifest) -> QualityFilter:
+    """Fitted to the training frames. Red and blue images have no green; grey ones have as much of it as of red."""
     rows = frames.rows_where(split="train")
     real = np.asarray(frames.array("frames")[rows[spread(len(rows), MAX_GATE_FRAMES)]])
-    return fit_gate(real, polarity=not real[..., 1].any())
+    return fit_quality_filter(real, polarity=not real[..., 1].any())
 
 
 @stage(version=2, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"))
@@ -149,8 +156,8 @@ def simulate(
 
     A frame is the window around the labelled moment, or, where conditions have no motions and so no moment, around the
     middle of the recording that is simulated: all of it with the method `whole`. A row without events becomes an empty
-    frame. What the gate of `sample` would refuse says so, but is not simulated again: a body that keeps still would
-    send no events then either.
+    frame. What the quality filter of `sample` would refuse says so, but is not simulated again: a body that keeps still
+    would send no events then either.
 
     A generator that can be calibrated is, on the training recordings; `calibration.json` says with what result.
     """
@@ -161,8 +168,8 @@ def simulate(
         raise DataError(f"{conditions.ref.path}: {error}") from error
     plugin = _calibrated(plugin, recordings, conditions, out)
     asked = _Simulation(conditions.ref, size, sampling, plugin.options, encoding, windows, out.work)
-    gate, count = gate_of(frames), len(conditions)
-    seeds, causes = row_seeds(seed, count), []
+    quality_filter, count = quality_filter_of(frames), len(conditions)
+    seeds, causes = sample_seeds(seed, count), []
     shards = [_Shard(start, seeds[start : start + SHARD_ROWS]) for start in range(0, count, SHARD_ROWS)]
     paths = map_shards(partial(_simulate_shard, asked), shards)
     with (
@@ -172,9 +179,9 @@ def simulate(
         for path in paths:
             made = np.load(path, allow_pickle=False)
             written.append(made)
-            causes += find_causes(made, gate)
+            causes += find_causes(made, quality_filter)
             progress.update(len(made))
-    return _table(conditions, plugin, "", _Told(seeds, [1] * count, causes))
+    return _table(conditions, plugin, "", SampleLog(seeds, [1] * count, causes))
 
 
 def _calibrated(plugin: plugins.Plugin, recordings: Manifest, conditions: Manifest, out: Output) -> plugins.Plugin:
@@ -274,7 +281,7 @@ def _middle_us(events: Events) -> int:
     return int(events.t[0] + events.t[-1]) // 2 if len(events) else 0
 
 
-def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str, made: _Told) -> pa.Table:
+def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str, made: SampleLog) -> pa.Table:
     # Generators that are no diffusion models make an image in one step, without scheduler or guidance.
     options: dict[str, Any] = plugin.options.model_dump()
     count = len(made.seeds)
@@ -296,7 +303,7 @@ def _table(conditions: Manifest, plugin: plugins.Plugin, checkpoint_digest: str,
             "num_inference_steps": pa.array([options.get("num_inference_steps", 1)] * count, pa.int32()),
             "guidance_scale": pa.array([float(options.get("guidance_scale", 1.0))] * count, pa.float64()),
             "seed": pa.array(made.seeds, pa.int64()),
-            "num_tries": pa.array(made.num_tries, pa.int32()),
-            "refused": pa.array(made.causes, pa.string()),
+            "num_attempts": pa.array(made.num_attempts, pa.int32()),
+            "rejected": pa.array(made.causes, pa.string()),
         }
     )

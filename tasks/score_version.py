@@ -44,7 +44,7 @@ def score_beside_real(
     compared = ((HELD_OUT, frames, held_out), (SYNTHETIC, generated, made))
     real = plugin.module.features(folder, np.asarray(frames.array("frames")[learnt]))
     rows = []
-    for setting, data, members in compared:
+    for subject, data, members in compared:
         chosen = members[spread(len(members), count)]
         features = plugin.module.features(folder, np.asarray(data.array("frames")[chosen]))
         for choice in distances:
@@ -54,7 +54,7 @@ def score_beside_real(
             rows += [
                 {
                     "task": "distance",
-                    "setting": setting,
+                    "subject": subject,
                     "seed": 0,
                     "group": "all",
                     "metric": name_distance(plugin, folder, extractor.ref.digest, name),

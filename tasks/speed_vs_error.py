@@ -14,7 +14,7 @@ from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import STOCHASTIC
 from ctlev_core.events.windows import spread
 from ctlev_core.realism.sampling import realism_of_real, realism_of_samples
-from ctlev_core.seeds import row_seeds
+from ctlev_core.seeds import sample_seeds
 from ctlev_core.statistics.sampling_errors import (
     CPU,
     EXACT,
@@ -71,7 +71,7 @@ def _asked(conditions: Manifest, num_images: int, seed: int) -> tuple[np.ndarray
     rows = spread(len(conditions), num_images)
     every = conditions_of(conditions)
     images = None if every.images is None else np.asarray(every.images[rows])
-    seeds = row_seeds(seed, len(conditions))
+    seeds = sample_seeds(seed, len(conditions))
     return rows, Conditions(tuple(every.prompts[row] for row in rows), images), [seeds[row] for row in rows]
 
 

@@ -294,7 +294,7 @@ class RawFileDigests:
         identity = [status.st_size, status.st_mtime_ns, status.st_ino]
         resolved = path.resolve()
         name = str(resolved)
-        if resolved.is_relative_to(self.artefacts):  # a prior that was trained here, say
+        if resolved.is_relative_to(self.artefacts):  # a base model that was trained here, say
             _touch(self.artefacts.joinpath(*resolved.relative_to(self.artefacts).parts[:2]))
         entry = self.known.get(name)
         if entry is None or entry[:3] != identity:

@@ -41,7 +41,7 @@ def study_report(
     title: str,
     notice: str,
     names: Sequence[str],
-    settings: Sequence[Sequence[str]],
+    training_sets: Sequence[Sequence[str]],
     generator_names: Sequence[Sequence[str]],
     pooled: Sequence[tuple[str, Sequence[str]]] = (),
     num_generators: Sequence[int] = (),
@@ -54,7 +54,7 @@ def study_report(
         title: of the page; its links lead to the folder of that name, where the pages are published.
         notice: first line.
         names: of the experiments, likewise the following.
-        settings: what was trained on.
+        training_sets: what was trained on.
         generator_names: whose frames were compared, the experiment's own first.
         pooled: groups of experiments that differ in their draw of training recordings: names of the group and of these.
         num_generators: fine-tunings in each experiment; needed where some are pooled.
@@ -65,7 +65,7 @@ def study_report(
     parts = [
         _part(report.ref.path, name, trained, generators)
         for report, name, trained, generators in zip(
-            reports[: len(names)], names, settings, generator_names, strict=True
+            reports[: len(names)], names, training_sets, generator_names, strict=True
         )
     ]
     measured = [read_speed_summary(report.ref.path) for report in reports[len(names) :]]
@@ -132,7 +132,7 @@ def _groups(
     return found
 
 
-def _part(folder: Path, name: str, settings: Sequence[str], generators: Sequence[str]) -> Part:
+def _part(folder: Path, name: str, training_sets: Sequence[str], generators: Sequence[str]) -> Part:
     paired = PairedScores(pq.read_table(folder / "samples.parquet"))
     rows = pq.read_table(folder / "scores.parquet").to_pylist()
-    return Part(name, rows, settings, generators, paired, read_summary(folder))
+    return Part(name, rows, training_sets, generators, paired, read_summary(folder))

@@ -23,7 +23,7 @@ def take_share(out: Output, synthetic: Manifest, *, share: float) -> pa.Table:
 
 
 @stage(version=2, schema=tables.SYNTHETIC)
-def take_faithful(
+def take_label_consistent(
     out: Output,
     model: Manifest,
     synthetic: Manifest,
@@ -42,7 +42,7 @@ def take_faithful(
     """
     plugin, scorer = plugins.load_options(downstream), plugins.load_options(metric)
     if not hasattr(scorer.module, "compute_rows"):
-        raise DataError(f"keep_faithful: metric {metric.name!r} has no score of single frames to choose by")
+        raise DataError(f"keep_fraction: metric {metric.name!r} has no score of single frames to choose by")
     prediction: Any = plugin.module.predict(model.ref.path / "model", np.asarray(synthetic.array("frames")))
     scores = scorer.module.compute_rows(prediction, synthetic.labels, scorer.options)
     # As elsewhere the name of the score decides, which need not be that of the plug-in.

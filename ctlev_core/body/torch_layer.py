@@ -112,7 +112,7 @@ class BodyLayer(torch.nn.Module):
         count, num_vertices = len(rest), rest.shape[2]
         columns = moves.permute(0, 3, 2, 1)
         step = FRAMES_ON_CPU if rest.device.type == "cpu" else max(count, 1)
-        pieces = []
+        segments = []
         for start in range(0, max(count, 1), step):
             x, y, z = rest[start : start + step].unbind(1)
             few = columns[start : start + step]
@@ -120,8 +120,8 @@ class BodyLayer(torch.nn.Module):
             blended = (few.reshape(-1, NUM_JOINTS) @ self.weights).view(len(few), 4, 3, num_vertices)
             posed = torch.addcmul(blended[:, 3], blended[:, 0], x[:, None])
             posed = torch.addcmul(torch.addcmul(posed, blended[:, 1], y[:, None]), blended[:, 2], z[:, None])
-            pieces.append(posed.transpose(1, 2))
-        return torch.cat(pieces)
+            segments.append(posed.transpose(1, 2))
+        return torch.cat(segments)
 
     def _check(self, rotations: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> None:
         count = len(rotations)

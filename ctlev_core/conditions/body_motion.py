@@ -1,4 +1,4 @@
-"""What a body does around the moment it is labelled at: the condition of generators that film a moving body.
+"""What a body does around the moment it is labelled at: the condition of generators that record a moving body.
 
 The generator is handed the motion; the picture beside it, a normal map of the labelled pose, is for looking at. What
 the simulated camera sees besides (clothes, light, background) is drawn by the generator, from its own seed.

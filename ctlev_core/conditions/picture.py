@@ -1,4 +1,5 @@
-"""A picture of the labelled class, out of the user's own labelled pictures: the condition of generators that film one.
+"""A picture of the labelled class, out of the user's own labelled pictures: the condition of generators that record
+one.
 
 Source: Orchard et al., Converting Static Image Datasets to Spiking Neuromorphic Datasets Using Saccades, Frontiers in
 Neuroscience 2015: each recording is of one labelled picture.

@@ -25,7 +25,8 @@ class Options(Frozen):
     prompt: str = Field(default="A moving human", description="The same prompt for every image, as in the paper.")
     drawing: Literal["smooth", "openpose"] = Field(
         default="smooth",
-        description="anti-aliased, what the bundled prior knows; or ControlNet v1.0's, for its published checkpoints",
+        description="anti-aliased, what the bundled base model knows; or ControlNet v1.0's, for its published "
+        "checkpoints",
     )
     stick_width_px: int | None = Field(
         default=None,

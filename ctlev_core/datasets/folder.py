@@ -97,7 +97,7 @@ def read_events(recording: Recording, options: Options) -> Events:
 
 
 def read_event_chunks(recording: Recording, options: Options) -> Iterator[Events]:
-    """The events of `read_events` piece by piece, so that a recording may be larger than memory.
+    """The events of `read_events` chunk by chunk, so that a recording may be larger than memory.
 
     Raises:
         DataError: the file cannot be read.

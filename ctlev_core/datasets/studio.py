@@ -3,7 +3,7 @@
 It stands in for recordings of real people, which users must download under their own licences. Training recordings
 show four subjects and the SEEN motions; tests show two other subjects and all motions; `condition` recordings carry
 labels, and grey pictures where asked for, but no events: random people in UNSEEN motions, from whose poses synthetic
-data is sampled; `film_conditions` films the very same people as training recordings, which is what synthetic data
+data is sampled; `record_conditions` records the very same people as training recordings, which is what synthetic data
 stands in for. The HELD_OUT motions appear in tests alone.
 
 Recordings like those of a real dataset are options: DHP19 is 346 x 260 px, `dhp19`, 4 cameras; CDEHP is 1280 x 800 px,
@@ -67,7 +67,7 @@ def list_recordings(options: Options) -> list[Recording]:
 def _recording(split: str, index: int, camera: int, options: Options) -> Recording:
     motions = MOTIONS_OF_SPLIT[split]
     motion, turn = motions[index % len(motions)], index // len(motions)
-    has_events = split != "condition" or options.film_conditions
+    has_events = split != "condition" or options.record_conditions
     if split == "train":
         subject = f"subject{turn % options.num_train_subjects}"
     elif split == "test":
@@ -113,7 +113,7 @@ def read_labels(recording: Recording, options: Options) -> Labels:
 
 
 def read_events(recording: Recording, options: Options) -> Events:
-    """Film the recording, as densely in time as its motion asks for, and send it through the sensor.
+    """Record the recording, as densely in time as its motion asks for, and send it through the sensor.
 
     Raises:
         DataError: the recording is not one of the studio with these options, carries labels only, or has more than
@@ -125,19 +125,19 @@ def read_events(recording: Recording, options: Options) -> Events:
     if not recording.has_events:
         raise DataError(f"studio recording {recording.recording_id!r} has no events")
     *entropy, camera = _entropy(recording, options)
-    film = _film(recording, options)
+    record = _record(recording, options)
     sensor = int(np.random.default_rng([*entropy, camera, SENSOR_STREAM]).integers(options.num_sensors))
     try:
         events, _ = simulate_rendered(
-            film,
+            record,
             0,
             options.recording_duration_us,
             read_sensor(options.sensor_preset, options.noise),
             RenderingOptions(max_displacement_px=options.max_displacement_px),
             sensor_seed=[options.seed, SENSOR_STREAM, camera, sensor],
             seed=[*entropy, camera, NOISE_STREAM],
-            speed_bound=film.speed_bound,
-            background=film.background,
+            speed_bound=record.speed_bound,
+            background=record.background,
             max_events=options.max_events,
         )
     except EventBudgetError as error:
@@ -154,7 +154,7 @@ def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:
     if options.intensity_rate_hz is None:
         raise DataError(f"studio recording {recording.recording_id!r} has no pictures without intensity_rate_hz")
     t_us = _times_us(options.intensity_rate_hz, options)
-    frames = _film(recording, options).render_frames(1e-6 * t_us)
+    frames = _record(recording, options).render_frames(1e-6 * t_us)
     return ImageTrack(np.rint(255.0 * frames).astype(np.uint8), t_us)
 
 
@@ -209,7 +209,7 @@ def _subject(recording: Recording, entropy: list[int], options: Options) -> Subj
     return sample_subject(np.random.default_rng([options.seed, SUBJECT_STREAM, *number]), colour=False)
 
 
-def _film(recording: Recording, options: Options) -> MovingBody:
+def _record(recording: Recording, options: Options) -> MovingBody:
     """The person in motion, under a light and before a wall drawn at random."""
     from ctlev_core.body.motion.procedural import pose_at
     from ctlev_core.studio.moving_body import MovingBody

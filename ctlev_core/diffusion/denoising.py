@@ -15,7 +15,7 @@ class Emphasis:
     """Which time steps a training dwells on; the options of `TrainingOptions` of the same names."""
 
     snr_gamma: float | None = None
-    max_sample_weight: float = 5.0
+    max_loss_weight: float = 5.0
     timestep_power: float = 1.0
 
     def draw(self, count: int, num_timesteps: int, generator: torch.Generator) -> Tensor:
@@ -121,11 +121,11 @@ class NoiseSchedule:
 
         With `snr_gamma` min-SNR weights: min(snr, gamma) of the error in the latents, which over snr is of that in the
         noise and over snr + 1 of that in v. Without: 1; for networks that predict the latents what makes the loss equal
-        to that of v, snr + 1, up to `max_sample_weight` and with mean 1 over the schedule.
+        to that of v, snr + 1, up to `max_loss_weight` and with mean 1 over the schedule.
         """
         alpha_bar, snr_gamma = self.alphas_cumprod[timesteps], emphasis.snr_gamma
         if snr_gamma is None and self.prediction_type == "sample":
-            weights = (1 / (1 - self.alphas_cumprod)).clamp(max=emphasis.max_sample_weight)
+            weights = (1 / (1 - self.alphas_cumprod)).clamp(max=emphasis.max_loss_weight)
             return weights[timesteps] / weights.mean()
         if snr_gamma is None:
             return torch.ones(len(timesteps))

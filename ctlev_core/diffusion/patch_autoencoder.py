@@ -1,4 +1,4 @@
-"""A fixed, lossless autoencoder for small latent-diffusion priors: it drops into any diffusers pipeline as `vae`.
+"""A fixed, lossless autoencoder for small latent-diffusion base models: it drops into any diffusers pipeline as `vae`.
 
 Event images are mostly isolated single pixels on a flat background. Autoencoders trained for minutes blur them away
 (with 8 channels a learned one kept 14 % of a single pixel's brightness), and what the code loses no generator can put
@@ -146,7 +146,7 @@ def fit_patch_autoencoder(images: torch.Tensor, patch_px: int = PATCH_PX) -> Pat
     """Measure mean and spread of the coefficients of images and return the code.
 
     Args:
-        images: [N, 3, H, W] in [-1, 1], a few hundred of the images the prior will be trained on.
+        images: [N, 3, H, W] in [-1, 1], a few hundred of the images the base model will be trained on.
         patch_px: edge of a block: 1, 2, 4, ...
     Returns:
         A code whose latents have standard deviation 1 after `scaling_factor`.

@@ -9,7 +9,7 @@ and followed from there. By default each image is seen alone, by a small network
 A sequence is up to `sequence_length` consecutive frames of one recording. In training every frame is the last of one,
 and the loss is the mean over all frames of the sequences, as in Event-HPE's code, which draws 8 of the next 16 frames.
 In prediction every frame is again the last of its own sequence, so that each but the first few of a recording knows
-as much of the past as in training, whatever else is predicted with it; Event-HPE cuts recordings into pieces.
+as much of the past as in training, whatever else is predicted with it; Event-HPE cuts recordings into chunks.
 """
 
 from __future__ import annotations

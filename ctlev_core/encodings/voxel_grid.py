@@ -154,7 +154,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
 def _three_sigma(magnitudes: np.ndarray) -> float:
     used = magnitudes[magnitudes > 0].astype(np.float64)
     sigma = float(used.std(ddof=1)) if len(used) > 1 else 0.0
-    # A lone pixel, and pixels that are all equal, come out white, as in the event histogram.
+    # An isolated pixel, and pixels that are all equal, come out white, as in the event histogram.
     return 3 * sigma if sigma > 0 else float(used.max(initial=0)) or 1.0
 
 

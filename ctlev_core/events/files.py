@@ -8,12 +8,12 @@ from pathlib import Path
 from types import ModuleType
 
 from ctlev_core import plugins
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 
 CHUNK_EVENTS = 1 << 20
-"""Events a piece where nothing else is asked for: 13 MiB."""
+"""Events a chunk where nothing else is asked for: 13 MiB."""
 
 
 def find_format(path: Path) -> ModuleType:
@@ -47,15 +47,15 @@ def read_events_file(path: Path) -> Events:
 
 
 def read_event_chunks(path: Path, num_events: int = CHUNK_EVENTS) -> Iterator[Events]:
-    """The events of a file of any known format in pieces of `num_events`, in memory that does not grow with the file.
+    """The events of a file of any known format in chunks of `num_events`, in memory that does not grow with the file.
 
-    Together the pieces keep the promises of `Events`: times do not descend from one to the next, and all have the same
-    sensor size. A recording without events is one empty piece.
+    Together the chunks keep the promises of `Events`: times do not descend from one to the next, and all have the same
+    sensor size. A recording without events is one empty chunk.
 
     Raises:
-        DataError: see `find_format` and the format's own `read_chunks`; part of the pieces may have been given by then.
+        DataError: see `find_format` and the format's own `read_chunks`; part of the chunks may have been given by then.
     """
-    return event_pieces.check_joints(find_format(path).read_chunks(path, num_events), str(path))
+    return event_chunks.check_joints(find_format(path).read_chunks(path, num_events), str(path))
 
 
 def read_events_range(path: Path, start: int, stop: int) -> Events:
@@ -77,17 +77,17 @@ def write_events_parquet(path: Path, events: Events) -> None:
 
 
 def write_event_chunks_parquet(path: Path, chunks: Iterable[Events]) -> Summary:
-    """Write a recording that comes in pieces in the project's own format, in memory that does not grow with it.
+    """Write a recording that comes in chunks in the project's own format, in memory that does not grow with it.
 
-    The file appears under its name only when it is complete; where a piece is wrong, nothing is left.
+    The file appears under its name only when it is complete; where a chunk is wrong, nothing is left.
 
     Args:
         path: the file.
-        chunks: at least one piece, all of one sensor size, each starting where the last one ended or later.
+        chunks: at least one chunk, all of one sensor size, each starting where the last one ended or later.
     Returns:
         What a manifest says of the whole recording.
     Raises:
-        DataError: the pieces break `check_events` or do not join.
+        DataError: the chunks break `check_events` or do not join.
     """
     partial = path.with_name(path.name + ".partial")
     summary = Summary()
@@ -100,14 +100,14 @@ def write_event_chunks_parquet(path: Path, chunks: Iterable[Events]) -> Summary:
 
 
 class Summary:
-    """What a manifest says of a recording, gathered piece by piece; `sensor_size` is None before the first piece."""
+    """What a manifest says of a recording, gathered chunk by chunk; `sensor_size` is None before the first chunk."""
 
     def __init__(self) -> None:
         self.sensor_size: SensorSize | None = None
         self.num_events = self.num_positive = self.t_first_us = self.t_last_us = 0
 
     def add(self, events: Events) -> None:
-        """Count the next piece."""
+        """Count the next chunk."""
         self.sensor_size = events.sensor_size
         if len(events) == 0:
             return
@@ -118,7 +118,7 @@ class Summary:
         self.num_positive += int(events.p.sum(dtype="int64"))
 
     def watch(self, chunks: Iterable[Events]) -> Iterator[Events]:
-        """Hand the pieces on, counted."""
+        """Hand the chunks on, counted."""
         for chunk in chunks:
             self.add(chunk)
             yield chunk

@@ -5,7 +5,7 @@ incrementing random cells of a histogram that fits the first-level cache takes 1
 second-level cache 2 to 3, whatever the width of a cell; computing cell numbers takes 0.7, reading an event's 5 bytes
 0.6. So cell numbers are computed for a block of events at once, which the compiler vectorises. A second copy of the
 histogram, against increments that wait for one another on a busy pixel, gained nothing, nor did large memory pages or
-tiles of pixels; sorting events into pieces that fit the first-level cache costs as much as it saves.
+tiles of pixels; sorting events into chunks that fit the first-level cache costs as much as it saves.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def full_scales(histogram: np.ndarray, scales: np.ndarray) -> None:
     """Three standard deviations of each window's total counts over the pixels that have events.
 
     The standard deviation divides by n - 1 and is at least 0.1 / 255, as in DHP19's normalizeImage3Sigma.m. Of a single
-    pixel it is 0, so that a lone event comes out white, like equal counts. A window without events gets the floor.
+    pixel it is 0, so that an isolated event comes out white, like equal counts. A window without events gets the floor.
 
     Args:
         histogram: [N, C, H, W] uint16, contiguous.

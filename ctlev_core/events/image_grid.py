@@ -33,7 +33,8 @@ class ImageFit(Frozen):
         description="how another image size is reached: `area` encodes at the size of the sensor and draws each image "
         "pixel as the average over its area; `events` puts every event into the image pixel that holds its centre "
         "before anything is counted, which leaves black gaps where the image is larger, and whole counts of image "
-        "pixels, as round_to_counts and export need. Event images that come finished are always averaged over areas",
+        "pixels, as stochastic_rounding and export need. Event images that come finished are always averaged over "
+        "areas",
     )
 
 

@@ -31,12 +31,12 @@ def cut(events: Events, windows: Windows) -> np.ndarray:
 
 
 def cut_chunks(chunks: Iterable[np.ndarray], windows: Windows) -> np.ndarray:
-    """What `cut` returns, for a recording whose time stamps come in pieces because they do not fit into memory.
+    """What `cut` returns, for a recording whose time stamps come in chunks because they do not fit into memory.
 
-    Only the ranges are kept, 16 bytes a window; how the stamps are divided into pieces changes nothing.
+    Only the ranges are kept, 16 bytes a window; how the stamps are divided into chunks changes nothing.
 
     Args:
-        chunks: [N_i] int64, us, non-decreasing from piece to piece; pieces may be empty.
+        chunks: [N_i] int64, us, non-decreasing from chunk to chunk; chunks may be empty.
         windows: how to cut.
     Returns:
         [W, 2] int64, start and stop of each window in events of the whole recording.
@@ -72,7 +72,7 @@ def window_around(t_us: np.ndarray, moment_us: int, duration_us: int, windows: W
 
 
 class Cutter:
-    """Windows of a recording that is read piece by piece: those that `add` completes, then those that `finish` does.
+    """Windows of a recording that is read chunk by chunk: those that `add` completes, then those that `finish` does.
 
     `max_windows` is not heeded, because which windows it keeps is only known at the end: see `spread`.
     """
@@ -95,7 +95,7 @@ class Cutter:
         """Take the next time stamps.
 
         Args:
-            t: [N] int64, us, non-decreasing, none before those of earlier pieces.
+            t: [N] int64, us, non-decreasing, none before those of earlier chunks.
         Returns:
             [W, 2] int64, the windows that are complete now and were not before.
         """

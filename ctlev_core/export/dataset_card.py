@@ -31,7 +31,7 @@ class Card:
         notice: what data it was learnt from.
         table: the exported rows, columns of `data_contracts.image_folder.IMAGES`.
         image_size: (width, height) px.
-        num_refused: rows that were left out because the gate refused them.
+        num_rejected: rows that were left out because the quality filter rejected them.
         event_suffix: of the files of event streams; empty without.
         records: provenance; the first is that of the frames.
     """
@@ -40,7 +40,7 @@ class Card:
     notice: str
     table: pa.Table
     image_size: tuple[int, int]
-    num_refused: int
+    num_rejected: int
     event_suffix: str
     records: Sequence[Record]
 
@@ -60,8 +60,8 @@ def _head(card: Card) -> str:
         f"Images of an event camera, {width} x {height} px, made by a generator that was trained on recordings, each "
         "from the label in its row. No camera took them. A label is what was asked for; an image may show it badly."
     )
-    if card.num_refused:
-        text += f" {card.num_refused:,} more images came out as no event images at all and were left out."
+    if card.num_rejected:
+        text += f" {card.num_rejected:,} more images came out as no event images at all and were left out."
     return "\n\n".join([*lines, text])
 
 

@@ -71,8 +71,8 @@ class EventDataset(Dataset[Sample]):
         split: the rows of this split alone.
         conditions: also read condition images, where there are any: beside an exported image, or in the artefact that
             generated frames were sampled from. Encoded frames have none.
-        refused: of an artefact, also the frames that the gate refused to the last; an exported folder has none.
-        class_names: what `class_index` counts; default: all classes of the table, sorted. Where datasets are used
+        rejected: of an artefact, also the frames that the quality filter rejected to the last; an exported folder has
+        none. class_names: what `class_index` counts; default: all classes of the table, sorted. Where datasets are used
             together, give one the `class_names` of the other.
         transform: from the whole sample to what is returned for it, so that labels can move with the image.
 
@@ -93,7 +93,7 @@ class EventDataset(Dataset[Sample]):
         *,
         split: str | None = None,
         conditions: bool = True,
-        refused: bool = False,
+        rejected: bool = False,
         class_names: Sequence[str] | None = None,
         transform: Callable[[Sample], Any] | None = None,
     ) -> None:
@@ -105,7 +105,7 @@ class EventDataset(Dataset[Sample]):
         else:
             table, self._images, self._conditions = _open_folder(self.place, conditions)
         self.class_names = _class_names(table, class_names, self.place)
-        rows = _chosen(table, split, refused, self.place)
+        rows = _chosen(table, split, rejected, self.place)
         self.table = table.take(pa.array(rows))
         self.labels = labels_of(self.table.select(["class_name", "joint_set", *LABEL_COLUMNS.values()]))
         self.joint_set = self.labels.joint_set
@@ -257,18 +257,18 @@ def _class_names(table: pa.Table, given: Sequence[str] | None, place: Path) -> t
     return tuple(given) if found else ()
 
 
-def _chosen(table: pa.Table, split: str | None, refused: bool, place: Path) -> np.ndarray:
+def _chosen(table: pa.Table, split: str | None, rejected: bool, place: Path) -> np.ndarray:
     """Numbers of the rows that are asked for, ascending."""
     keep = np.ones(table.num_rows, bool)
-    if not refused and "refused" in table.column_names:
-        keep &= np.array([cause == "" for cause in table["refused"].to_pylist()], bool)
+    if not rejected and "rejected" in table.column_names:
+        keep &= np.array([cause == "" for cause in table["rejected"].to_pylist()], bool)
     if split is not None:
         splits = table["split"].to_pylist()
         keep &= np.array([name == split for name in splits], bool)
         if not keep.any():
             raise DataError(f"{place}: no image is in split {split!r}; splits are {dict(Counter(splits))}")
     if not keep.any():
-        raise DataError(f"{place}: holds no image; the gate refused all {table.num_rows}")
+        raise DataError(f"{place}: holds no image; the quality filter rejected all {table.num_rows}")
     return np.flatnonzero(keep)
 
 

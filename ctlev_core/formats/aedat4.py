@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -35,27 +35,27 @@ def read(path: Path) -> Events:
     Raises:
         DataError: a cut or corrupt file, no or several event streams, or events that break `check_events`.
     """
-    return event_pieces.concatenate(_read_packets(path))
+    return event_chunks.concatenate(_read_packets(path))
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces, put together from the file's packets.
+    """The events of `read` in chunks, put together from the file's packets.
 
     Raises:
         DataError: as `read`.
     """
-    return event_pieces.regroup(_read_packets(path), num_events)
+    return event_chunks.regroup(_read_packets(path), num_events)
 
 
 def _read_packets(path: Path) -> Iterator[Events]:
-    """An empty piece, then one a packet."""
+    """An empty chunk, then one a packet."""
     decoder, streams = _decode(path, lambda: _open(path))
     if len(streams) != 1:
         raise DataError(f"{path}: expected one event stream, got {len(streams)}")
     sensor_size = (int(streams[0]["width"]), int(streams[0]["height"]))
 
     def packets() -> Iterator[Events]:
-        yield event_pieces.empty_events(sensor_size)
+        yield event_chunks.empty_events(sensor_size)
         while (packet := _decode(path, lambda: next(decoder, None))) is not None:
             if "events" in packet:
                 # Past 2^63 the unsigned stamps of a corrupt file turn negative, which the check reports.
@@ -63,7 +63,7 @@ def _read_packets(path: Path) -> Iterator[Events]:
                 columns = (t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
                 yield Events(*columns, sensor_size)
 
-    yield from event_pieces.check_pieces(packets(), str(path))
+    yield from event_chunks.check_chunks(packets(), str(path))
 
 
 def _open(path: Path) -> tuple[Any, list[dict]]:

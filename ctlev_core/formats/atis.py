@@ -68,12 +68,12 @@ def read(path: Path) -> Events:
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces; the file is read twice, first for the sensor size.
+    """The events of `read` in chunks; the file is read twice, first for the sensor size.
 
     Raises:
         DataError: as `read`.
     """
-    return record_files.read_pieces(_open(path), num_events)
+    return record_files.read_chunks(_open(path), num_events)
 
 
 def _open(path: Path) -> record_files.RecordFile:

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.events.decoding import event_pieces, event_tables
+from ctlev_core.events.decoding import event_chunks, event_tables
 from ctlev_core.events.decoding.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
@@ -69,16 +69,16 @@ def read(path: Path) -> Events:
         DataError: no rows, a row with too few or too many fields or with something else than numbers (named by its
             line), or events that break `check_events`.
     """
-    return event_pieces.concatenate(_pieces(path))
+    return event_chunks.concatenate(_chunks(path))
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces; the file is read twice, first for its sensor and its unit of time.
+    """The events of `read` in chunks; the file is read twice, first for its sensor and its unit of time.
 
     Raises:
         DataError: as `read`.
     """
-    return event_pieces.regroup(_pieces(path), num_events)
+    return event_chunks.regroup(_chunks(path), num_events)
 
 
 def write(path: Path, events: Events) -> None:
@@ -97,7 +97,7 @@ def write(path: Path, events: Events) -> None:
             file.writelines(f"{t},{x},{y},{p}\n" for t, x, y, p in rows)
 
 
-def _pieces(path: Path) -> Iterator[Events]:
+def _chunks(path: Path) -> Iterator[Events]:
     layout = _find_layout(path)
     if layout is None:
         raise DataError(f"{path}: expected rows of t x y p, or a header line that names these columns")
@@ -117,7 +117,7 @@ def _pieces(path: Path) -> Iterator[Events]:
         for rows, _ in _read_rows(path, layout, has_points and not layout.says_us):
             yield dict(zip(EVENT_DTYPES, rows.T, strict=True))
 
-    yield event_pieces.empty_events(sensor_size)
+    yield event_chunks.empty_events(sensor_size)
     yield from event_tables.to_events(columns, str(path), sensor_size)
 
 

@@ -49,12 +49,12 @@ def read(path: Path) -> Events:
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces; without a sensor size in the header, the file is read twice.
+    """The events of `read` in chunks; without a sensor size in the header, the file is read twice.
 
     Raises:
         DataError: as `read`.
     """
-    return record_files.read_pieces(_open(path), num_events)
+    return record_files.read_chunks(_open(path), num_events)
 
 
 def _read_type(path: Path, header: prophesee.Header) -> bytes:

@@ -35,7 +35,7 @@ def read(path: Path) -> Events:
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces; without a sensor size in the header, the file is read twice.
+    """The events of `read` in chunks; without a sensor size in the header, the file is read twice.
 
     Raises:
         DataError: as `read`.

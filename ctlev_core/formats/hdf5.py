@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.events.decoding import event_pieces, event_tables
+from ctlev_core.events.decoding import event_chunks, event_tables
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
@@ -50,16 +50,16 @@ def read(path: Path, camera: str = "left") -> Events:
         DataError: a cut or corrupt file, no events, a missing column (named), a compression filter that is not
             installed, or events that break `check_events`.
     """
-    return event_pieces.concatenate(_pieces(path, 1 << 62, camera))
+    return event_chunks.concatenate(_chunks(path, 1 << 62, camera))
 
 
 def read_chunks(path: Path, num_events: int, camera: str = "left") -> Iterator[Events]:
-    """The events of `read` in pieces; without a sensor size in the file, it is read twice.
+    """The events of `read` in chunks; without a sensor size in the file, it is read twice.
 
     Raises:
         DataError: as `read`.
     """
-    return event_pieces.regroup(_pieces(path, min(num_events, _BLOCK), camera), num_events)
+    return event_chunks.regroup(_chunks(path, min(num_events, _BLOCK), camera), num_events)
 
 
 def write(path: Path, events: Events) -> None:
@@ -86,16 +86,16 @@ def write(path: Path, events: Events) -> None:
         file.create_dataset("t_offset", data=np.int64(offset))
 
 
-def _pieces(path: Path, num_events: int, camera: str) -> Iterator[Events]:
+def _chunks(path: Path, num_events: int, camera: str) -> Iterator[Events]:
     with _open(path) as file:
         source = _find_matrix(file, path, camera) or _find_columns(file, path)
         length, read_block, sensor_size = source
 
-        def pieces() -> Iterator[event_tables.Columns]:
+        def chunks() -> Iterator[event_tables.Columns]:
             for start in range(0, max(length, 1), num_events):
                 yield read_block(slice(start, min(start + num_events, length)))
 
-        yield from event_tables.to_events(pieces, str(path), sensor_size)
+        yield from event_tables.to_events(chunks, str(path), sensor_size)
 
 
 @contextmanager

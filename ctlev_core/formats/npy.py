@@ -16,7 +16,7 @@ from typing import IO
 
 import numpy as np
 
-from ctlev_core.events.decoding import array_files, event_pieces, event_tables
+from ctlev_core.events.decoding import array_files, event_chunks, event_tables
 from ctlev_core.events.decoding.sensor_sizes import smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, check_events
@@ -41,16 +41,16 @@ def read(path: Path) -> Events:
     Raises:
         DataError: a cut file, another layout, Python objects, no events, or events that break `check_events`.
     """
-    return event_pieces.concatenate(_pieces(path, 1 << 62))
+    return event_chunks.concatenate(_chunks(path, 1 << 62))
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces; the file is read twice, first for its sensor and its unit of time.
+    """The events of `read` in chunks; the file is read twice, first for its sensor and its unit of time.
 
     Raises:
         DataError: as `read`.
     """
-    return event_pieces.regroup(_pieces(path, min(num_events, _BLOCK)), num_events)
+    return event_chunks.regroup(_chunks(path, min(num_events, _BLOCK)), num_events)
 
 
 def write(path: Path, events: Events) -> None:
@@ -75,11 +75,11 @@ def write(path: Path, events: Events) -> None:
         np.save(file, records, allow_pickle=False)
 
 
-def _pieces(path: Path, num_events: int) -> Iterator[Events]:
-    def pieces() -> Iterator[event_tables.Columns]:
+def _chunks(path: Path, num_events: int) -> Iterator[Events]:
+    def chunks() -> Iterator[event_tables.Columns]:
         return _read_columns(path, num_events)
 
-    return event_tables.to_events(pieces, str(path), whole_floats_are_us=True)
+    return event_tables.to_events(chunks, str(path), whole_floats_are_us=True)
 
 
 def _read_columns(path: Path, num_events: int) -> Iterator[event_tables.Columns]:

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.events.decoding import array_files, event_pieces, event_tables
+from ctlev_core.events.decoding import array_files, event_chunks, event_tables
 from ctlev_core.events.decoding.sensor_sizes import COMMON_SENSORS
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
@@ -55,16 +55,16 @@ def read(path: Path) -> Events:
     Raises:
         DataError: a cut or corrupt archive, a missing column, pickled objects, or events that break `check_events`.
     """
-    return event_pieces.concatenate(_pieces(path, 1 << 62))
+    return event_chunks.concatenate(_chunks(path, 1 << 62))
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces; the archive is decompressed twice, first for its sensor and its unit of time.
+    """The events of `read` in chunks; the archive is decompressed twice, first for its sensor and its unit of time.
 
     Raises:
         DataError: as `read`.
     """
-    return event_pieces.regroup(_pieces(path, min(num_events, _BLOCK)), num_events)
+    return event_chunks.regroup(_chunks(path, min(num_events, _BLOCK)), num_events)
 
 
 def write(path: Path, events: Events, compressed: bool = True) -> None:
@@ -86,7 +86,7 @@ def write(path: Path, events: Events, compressed: bool = True) -> None:
             np.savez(file, x_pos=events.x, y_pos=events.y, timestamp=events.t, polarity=events.p, sensor_size=size)
 
 
-def _pieces(path: Path, num_events: int) -> Iterator[Events]:
+def _chunks(path: Path, num_events: int) -> Iterator[Events]:
     with _as_data_error(path), zipfile.ZipFile(path) as archive:
         keys = {name.removesuffix(".npy"): name for name in archive.namelist()}
         size = _sensor_size(archive, keys, path)
@@ -97,10 +97,10 @@ def _pieces(path: Path, num_events: int) -> Iterator[Events]:
             found = event_tables.require_columns((key for key in keys if key != "sensor_size"), str(path))
             members = {column: keys[key] for column, key in found.items()}
 
-        def pieces() -> Iterator[event_tables.Columns]:
+        def chunks() -> Iterator[event_tables.Columns]:
             return _read_members(archive, members, num_events, path)
 
-        yield from event_tables.to_events(pieces, str(path), size, whole_floats_are_us=True, sensors=_SENSORS)
+        yield from event_tables.to_events(chunks, str(path), size, whole_floats_are_us=True, sensors=_SENSORS)
 
 
 @contextmanager
@@ -128,7 +128,7 @@ def _sensor_size(archive: zipfile.ZipFile, keys: dict[str, str], path: Path) -> 
 def _read_members(
     archive: zipfile.ZipFile, members: dict[str, str], num_events: int, path: Path
 ) -> Iterator[event_tables.Columns]:
-    """Columns in pieces; `members` maps column to archive member, the empty column to a structured array."""
+    """Columns in chunks; `members` maps column to archive member, the empty column to a structured array."""
     with ExitStack() as stack:
         files, headers = {}, {}
         for column, name in members.items():

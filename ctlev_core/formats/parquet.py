@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from ctlev_core.events.decoding.event_tables import parse_sensor_size
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
@@ -48,15 +48,15 @@ def read(path: Path) -> Events:
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces.
+    """The events of `read` in chunks.
 
     Raises:
         DataError: as `read`.
     """
     with _open(path) as (file, sensor_size):
 
-        def pieces() -> Iterator[Events]:
-            yield event_pieces.empty_events(sensor_size)
+        def chunks() -> Iterator[Events]:
+            yield event_chunks.empty_events(sensor_size)
             num_read = 0
             for batch in file.iter_batches(min(num_events, _BATCH), use_threads=False):
                 num_read += len(batch)
@@ -67,7 +67,7 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
                     f"{path}: not a complete Parquet file: {num_read} rows, expected {file.metadata.num_rows}"
                 )
 
-        yield from event_pieces.regroup(event_pieces.check_pieces(pieces(), str(path)), num_events)
+        yield from event_chunks.regroup(event_chunks.check_chunks(chunks(), str(path)), num_events)
 
 
 def read_range(path: Path, start: int, stop: int) -> Events:
@@ -83,7 +83,7 @@ def read_range(path: Path, start: int, stop: int) -> Events:
         ends = np.cumsum([metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)], dtype=int)
         groups = range(int(np.searchsorted(ends, start, "right")), int(np.searchsorted(ends, stop, "left")) + 1)
         if start == stop:
-            return event_pieces.empty_events(sensor_size)
+            return event_chunks.empty_events(sensor_size)
         first = int(ends[groups[0] - 1]) if groups[0] else 0
         events = _to_events(file.read_row_groups(list(groups), use_threads=False), sensor_size, path)
         where = f"{path} (events counted from event {first})"
@@ -135,10 +135,10 @@ def write(path: Path, events: Events) -> None:
 
 
 def write_chunks(path: Path, chunks: Iterable[Events]) -> None:
-    """Write a recording that comes in pieces, in memory that does not grow with it.
+    """Write a recording that comes in chunks, in memory that does not grow with it.
 
     Raises:
-        DataError: no piece at all, or pieces that break `check_events` or do not join; the file is then unfinished.
+        DataError: no chunk at all, or chunks that break `check_events` or do not join; the file is then unfinished.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -147,11 +147,11 @@ def write_chunks(path: Path, chunks: Iterable[Events]) -> None:
     encodings = {"t": "DELTA_BINARY_PACKED", "x": "PLAIN", "y": "PLAIN", "p": "PLAIN"}
     writer: pq.ParquetWriter | None = None
     try:
-        pieces = event_pieces.check_pieces(_not_none(chunks, path), f"events to be written to {path}")
-        for piece in event_pieces.regroup(pieces, ROW_GROUP):
-            table = pa.table({name: pa.array(getattr(piece, name)) for name in EVENT_DTYPES})
+        chunks = event_chunks.check_chunks(_not_none(chunks, path), f"events to be written to {path}")
+        for chunk in event_chunks.regroup(chunks, ROW_GROUP):
+            table = pa.table({name: pa.array(getattr(chunk, name)) for name in EVENT_DTYPES})
             if writer is None:
-                width, height = piece.sensor_size
+                width, height = chunk.sensor_size
                 schema = table.schema.with_metadata({"sensor_size": f"{width}x{height}"})
                 writer = pq.ParquetWriter(
                     path, schema, compression="zstd", use_dictionary=False, column_encoding=encodings
@@ -168,4 +168,4 @@ def _not_none(chunks: Iterable[Events], path: Path) -> Iterator[Events]:
         any_given = True
         yield chunk
     if not any_given:
-        raise DataError(f"events to be written to {path}: expected at least one piece, got none")
+        raise DataError(f"events to be written to {path}: expected at least one chunk, got none")

@@ -37,7 +37,7 @@ class SampleOptions(Moves):
     exchange_polarity: bool = Field(default=False, description="red and blue of half of the frames are exchanged")
 
 
-def prior_folders(options: Options) -> list[Path]:
+def base_model_folders(options: Options) -> list[Path]:
     """None: nothing is learnt from weights."""
     return []
 

@@ -2,8 +2,8 @@
 
 Source: ControlEvents (Hu et al., WACV 2026), skeleton- and SMPL-conditioned routes: only the trainable copy
 (ControlNet) learns; U-Net, autoencoder and text encoder are frozen; the prompt is always "A moving human". The bundled
-small prior stands in for Stable Diffusion with ControlNet v1.0 unless a folder is given. A small U-Net knows too little
-to be left as it is: with the bundled prior `tune: both` is the better choice.
+small base model stands in for Stable Diffusion with ControlNet v1.0 unless a folder is given. A small U-Net knows too
+little to be left as it is: with the bundled base model `tune: both` is the better choice.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Options(FineTuningOptions):
     controlnet: Path | None = Field(
         default=None,
         json_schema_extra=RUN_SETTING,
-        description="subfolder of the prior, such as `controlnet_normals` of the bundled one, or a diffusers folder "
-        "elsewhere; the prior's subfolder `controlnet` when null",
+        description="subfolder of the base model, such as `controlnet_normals` of the bundled one, or a diffusers "
+        "folder elsewhere; the base model's subfolder `controlnet` when null",
     )
 
 
@@ -42,20 +42,20 @@ class SampleOptions(SamplingOptions):
     """Sampling options."""
 
 
-def prior_folders(options: Options) -> list[Path]:
-    """The folders and files the weights come from: the prior, and the ControlNet where it lies apart.
+def base_model_folders(options: Options) -> list[Path]:
+    """The folders and files the weights come from: the base model, and the ControlNet where it lies apart.
 
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.pretrained.paths import find_controlnet, prior_places
+    from ctlev_core.diffusion.pretrained.paths import base_model_places, find_controlnet
 
     try:
-        return prior_places(options.prior, controlnet=options.controlnet, needs_controlnet=True)
+        return base_model_places(options.base_model, controlnet=options.controlnet, needs_controlnet=True)
     except DataError as error:
-        if options.prior is not None and not options.prior.exists() and options.controlnet is not None:
+        if options.base_model is not None and not options.base_model.exists() and options.controlnet is not None:
             try:
-                find_controlnet(options.prior, options.controlnet)
+                find_controlnet(options.base_model, options.controlnet)
             except DataError as other:  # neither is there: better said at once
                 raise DataError(f"{error}; {other}") from other
         raise
@@ -65,7 +65,7 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
     """Fine-tune on event images and write a `StableDiffusionControlNetPipeline` folder.
 
     Args:
-        frames: [N, H, W, 3] uint8, of the prior's image size.
+        frames: [N, H, W, 3] uint8, of the base model's image size.
         conditions: N prompts and [N, H, W, 3] uint8 condition images.
         options: see `Options`.
         seed: of order and noise.
@@ -75,7 +75,7 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
         Loss curves, and the step whose weights were kept.
     Raises:
         TrainingError: losses or gradients stayed not finite, or one of several processes failed.
-        ValueError: options do not go together, frames do not fit the prior or the conditions, or
+        ValueError: options do not go together, frames do not fit the base model or the conditions, or
             there are no condition images.
     """
     from ctlev_core.diffusion.training.entry import train_checkpoint

@@ -38,7 +38,7 @@ class SampleOptions(SamplingOptions):
     """Sampling options."""
 
 
-def prior_folders(options: Options) -> list[Path]:
+def base_model_folders(options: Options) -> list[Path]:
     """None: all weights are drawn from the seed."""
     return []
 

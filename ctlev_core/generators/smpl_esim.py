@@ -1,4 +1,4 @@
-"""Baseline: SMPL-ESIM films a moving body and sends the pictures through an ideal event camera.
+"""Baseline: SMPL-ESIM records a moving body and sends the pictures through an ideal event camera.
 
 Source: ControlEvents (Hu et al., WACV 2026) compares with the SMPL-ESIM of Xue et al. (Event-based Non-Rigid
 Reconstruction from Contours, BMVC 2022; E-LnR, IJCV 2024), a simulator that renders an SMPL body in motion and derives
@@ -111,10 +111,10 @@ def sample_events(
     check_body_motions(motions, "generator 'smpl_esim'")
     body = load_body(options.body)
     # Checked now rather than when the first row is asked for.
-    return (_film(motions, row, sensor_size, options, seed, body) for row, seed in enumerate(seeds))
+    return (_record(motions, row, sensor_size, options, seed, body) for row, seed in enumerate(seeds))
 
 
-def _film(
+def _record(
     motions: BodyMotions, row: int, sensor_size: SensorSize, options: SampleOptions, seed: int, body: BodyModel
 ) -> Events:
     """The events of one row."""

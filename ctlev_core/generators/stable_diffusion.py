@@ -1,7 +1,7 @@
 """Text route: fine-tune the U-Net of a text-to-image diffusion model, then sample frames from prompts.
 
 Source: ControlEvents (Hu et al., WACV 2026), class-conditioned route: Stable Diffusion v1.4, U-Net trained,
-autoencoder and text encoder frozen, prompts "A photo of {class}". The bundled small prior of objects stands in for
+autoencoder and text encoder frozen, prompts "A photo of {class}". The bundled small base model of objects stands in for
 Stable Diffusion unless a folder is given. Differences: averaged weights, which can be switched off; a 20-step solver
 instead of 1000 DDPM steps.
 """
@@ -32,22 +32,22 @@ class SampleOptions(SamplingOptions):
     """Sampling options."""
 
 
-def prior_folders(options: Options) -> list[Path]:
+def base_model_folders(options: Options) -> list[Path]:
     """The folder, or the files, the weights come from.
 
     Raises:
         DataError: it is missing, or a part of it is.
     """
-    from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_PRIOR, prior_places
+    from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_MODEL, base_model_places
 
-    return prior_places(options.prior or BUNDLED_OBJECT_PRIOR)
+    return base_model_places(options.base_model or BUNDLED_OBJECT_MODEL)
 
 
 def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
     """Fine-tune on event images and write a `StableDiffusionPipeline` folder.
 
     Args:
-        frames: [N, H, W, 3] uint8, of the prior's image size.
+        frames: [N, H, W, 3] uint8, of the base model's image size.
         conditions: N prompts, no images.
         options: see `Options`.
         seed: of order and noise.
@@ -57,17 +57,17 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
         Loss curves, and the step whose weights were kept.
     Raises:
         TrainingError: losses or gradients stayed not finite, or one of several processes failed.
-        ValueError: options do not go together, frames do not fit the prior or the conditions, or
+        ValueError: options do not go together, frames do not fit the base model or the conditions, or
             the conditions have images.
     """
-    from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_PRIOR
+    from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_MODEL
     from ctlev_core.diffusion.training.entry import train_checkpoint
 
     _check_text_only(conditions)
     return train_checkpoint(
         frames,
         conditions,
-        options.model_copy(update={"prior": options.prior or BUNDLED_OBJECT_PRIOR}),
+        options.model_copy(update={"base_model": options.base_model or BUNDLED_OBJECT_MODEL}),
         tune=options.tune,
         with_controlnet=False,
         class_names=conditions.class_names,

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctlev_core import plugins
 from ctlev_core.events.image_resampling import resample_images
-from ctlev_core.labels import moments
+from ctlev_core.labels import label_windows
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
@@ -109,7 +109,7 @@ def as_different_as_training(rows: LabelledRows, recordings: Manifest, frames: M
     """
     learnt = rows_of_frames(recordings, frames, frames.rows_where(split="train"))
     differences = [
-        moments.picture_difference(images[first], images[last])
+        label_windows.picture_difference(images[first], images[last])
         for name, members, images, t_us in _tracks(learnt)
         for first, last in _nearest(learnt, members, t_us, name)
     ]
@@ -118,7 +118,7 @@ def as_different_as_training(rows: LabelledRows, recordings: Manifest, frames: M
     for name, members, images, t_us in _tracks(rows):
         for row in members:
             moment_us = int(rows.labelled.t_us[row])
-            ends[row] = moments.equally_different_window(images, t_us, moment_us, reach_us, wanted, name)
+            ends[row] = label_windows.equally_different_window(images, t_us, moment_us, reach_us, wanted, name)
     return replace(rows, t_start_us=ends[:, 0], t_end_us=ends[:, 1])
 
 
@@ -133,8 +133,8 @@ def read_motions(rows: LabelledRows, recordings: Manifest, frames: Manifest, enc
         track = labels_of(tracks[name])
         for row in members.tolist():
             moment_us = int(rows.labelled.t_us[row])
-            found[row] = moments.motion_around(track, moment_us, reach_us, f"{where}, {name}")
-    motions = moments.body_motions([found[row] for row in range(len(found))], rows.labelled, rows.labels, where)
+            found[row] = label_windows.motion_around(track, moment_us, reach_us, f"{where}, {name}")
+    motions = label_windows.body_motions([found[row] for row in range(len(found))], rows.labelled, rows.labels, where)
     # Simulated events are encoded as the real ones are, so they come from a sensor of the real one's size.
     plugin, size = plugins.load_options(encoding), sensor_size_of(recordings)
     offset, unit = plugin.module.map_points(np.array([[0.0, 0.0], [1.0, 1.0]]), size, plugin.options)
@@ -156,7 +156,7 @@ def _tracks(rows: LabelledRows) -> Iterator[tuple[str, np.ndarray, np.ndarray, n
 def _nearest(rows: LabelledRows, members: np.ndarray, t_us: np.ndarray, name: str) -> np.ndarray:
     """The pictures [M, 2] at the ends of the windows of some rows."""
     spans = zip(rows.t_start_us[members].tolist(), rows.t_end_us[members].tolist(), strict=True)
-    return np.array([moments.nearest_pair(t_us, start, end, name) for start, end in spans])
+    return np.array([label_windows.nearest_pair(t_us, start, end, name) for start, end in spans])
 
 
 def _by_name(names: Sequence[str]) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field, field_validator
 
-from ctlev_core.scoring.kid import kernel_distance
+from ctlev_core.scoring.kid import compute_kid
 from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 
@@ -43,7 +43,7 @@ def compute(predicted: np.ndarray, target: np.ndarray, options: Options) -> dict
     Raises:
         ValueError: shapes do not fit, fewer than two rows, or a value that is not finite.
     """
-    value = kernel_distance(
+    value = compute_kid(
         predicted,
         target,
         subset_size=options.subset_size,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.scoring.prdc import neighbour_scores
+from ctlev_core.scoring.prdc import compute_prdc
 from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 
@@ -39,5 +39,5 @@ def compute(predicted: np.ndarray, target: np.ndarray, options: Options) -> dict
     Raises:
         ValueError: shapes do not fit, too few rows, or a value that is not finite.
     """
-    found = neighbour_scores(predicted, target, options.num_neighbours)
+    found = compute_prdc(predicted, target, options.num_neighbours)
     return {f"{name}_k{options.num_neighbours}": value for name, value in found.items()}

@@ -38,8 +38,8 @@ def move_image(
         image: [H, W, C] uint8.
         moves: how far at most.
         rng: what is drawn: angle, size, shift in x and y, and the mirror.
-        interpolation: `linear` for pictures; `nearest` for event images, whose values are counts and whose lone pixels
-            would be smeared.
+        interpolation: `linear` for pictures; `nearest` for event images, whose values are counts and whose isolated
+            pixels would be smeared.
         border: the colour of what comes into view.
     Returns:
         [H, W, C] uint8.

@@ -1,4 +1,5 @@
-"""Ordinary labelled pictures: what things look like and are called. A base model learns from them, or they are filmed.
+"""Ordinary labelled pictures: what things look like and are called. A base model learns from them, or they are
+recorded.
 
 Three layouts are read:
 

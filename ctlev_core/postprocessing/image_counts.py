@@ -12,8 +12,8 @@ saturated pixels. Both are found again from what real windows say (`fit_counts`)
   full scale follows from all counts, so they are then changed, event by event, until it does.
 
 Rendered again, the counts give a real image exactly. For a generated image there are in general no counts that do;
-`CountEstimate` says how far it moved. Exactness ends where full scales are above 255: with `three_sigma` lone events
-are then black.
+`CountEstimate` says how far it moved. Exactness ends where full scales are above 255: with `three_sigma` isolated
+events are then black.
 """
 
 from __future__ import annotations

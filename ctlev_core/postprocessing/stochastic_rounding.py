@@ -1,9 +1,9 @@
-"""Whole event counts from the grey values of a sampled image, by dithering.
+"""Whole event counts from the grey values of a sampled image, by stochastic rounding.
 
 A decoder spreads what it is unsure of: where every other real window has one event it gives half of one, and such
-values no real image has. Dithering keeps the expected count of each pixel, so that sparse noise stays as dense as it
-was; the most probable count, which `ctlev_core.postprocessing.image_counts` finds, would remove it. The number of
-events is that of a real window drawn at random: normalised images say nothing about it.
+values no real image has. Stochastic rounding keeps the expected count of each pixel, so that sparse noise stays as
+dense as it was; the most probable count, which `ctlev_core.postprocessing.image_counts` finds, would remove it. The
+number of events is that of a real window drawn at random: normalised images say nothing about it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 
-def dither_counts(frames: np.ndarray, num_events: np.ndarray, *, polarity: bool, seeds: Sequence[int]) -> np.ndarray:
+def round_stochastically(
+    frames: np.ndarray, num_events: np.ndarray, *, polarity: bool, seeds: Sequence[int]
+) -> np.ndarray:
     """Counts of each image: floor(expected count + u), u uniform between 0 and 1.
 
     Args:

@@ -15,8 +15,8 @@ from data_contracts.tables import Column, TableSchema
 
 Row = dict[str, Any]
 _DIGESTS = pa.list_(pa.string())
-TRACED_SCORES = TableSchema(
-    "traced_scores",
+SCORE_LINEAGE = TableSchema(
+    "score_lineage",
     1,
     None,
     (
@@ -37,9 +37,9 @@ PAIRED_SAMPLES = TableSchema(
     2,
     None,
     (
-        Column("setting", pa.string(), "what the model was trained on"),
+        Column("subject", pa.string(), "what the model was trained on"),
         Column("metric", pa.string(), "the score that is the mean of these values by their weights"),
-        Column("training", pa.int32(), "number of the training within its setting", minimum=0),
+        Column("training", pa.int32(), "number of the training within its subject", minimum=0),
         Column("sample_id", pa.string(), "the join key"),
         Column("recording_id", pa.string(), "its recording"),
         Column("value", pa.float64(), "score of this sample; missing where it has none", nullable=True),
@@ -49,8 +49,8 @@ PAIRED_SAMPLES = TableSchema(
 )
 
 
-def trace_scores(scores: Sequence[tuple[str, pa.Table]], records: Sequence[Record]) -> pa.Table:
-    """All scores in one table of the schema `TRACED_SCORES`.
+def trace_lineage(scores: Sequence[tuple[str, pa.Table]], records: Sequence[Record]) -> pa.Table:
+    """All scores in one table of the schema `SCORE_LINEAGE`.
 
     Args:
         scores: (key, table) of each artefact of scores.
@@ -71,11 +71,11 @@ def trace_scores(scores: Sequence[tuple[str, pa.Table]], records: Sequence[Recor
             "code_digest": digest_of(versions_of(origin)),
         }
         columns = {name: table[name] for name in table.column_names}
-        for column in TRACED_SCORES.columns:
+        for column in SCORE_LINEAGE.columns:
             if column.name in extra:
                 columns[column.name] = pa.array([extra[column.name]] * len(table), column.type)
-        parts.append(pa.table(columns).select([column.name for column in TRACED_SCORES.columns]))
-    return pa.concat_tables([part.cast(TRACED_SCORES.arrow()) for part in parts])
+        parts.append(pa.table(columns).select([column.name for column in SCORE_LINEAGE.columns]))
+    return pa.concat_tables([part.cast(SCORE_LINEAGE.arrow()) for part in parts])
 
 
 def _keys(value: Any) -> list[str]:
@@ -96,13 +96,13 @@ def paired_samples(scored: Iterable[tuple[list[Row], pa.Table, str]]) -> pa.Tabl
     parts: list[pa.Table] = []
     counts: dict[tuple[str, str], int] = {}
     for rows, samples, digest in scored:
-        setting = rows[0]["setting"]
+        subject = rows[0]["subject"]
         names = np.array(samples["metric"].to_pylist())
         for metric in dict.fromkeys(names.tolist()):
             column = samples.filter(pa.array(names == metric))
-            number = counts.get((setting, metric), 0)
-            counts[setting, metric] = number + 1
-            same = {"setting": setting, "metric": metric, "training": number, "samples_digest": digest}
+            number = counts.get((subject, metric), 0)
+            counts[subject, metric] = number + 1
+            same = {"subject": subject, "metric": metric, "training": number, "samples_digest": digest}
             columns = {name: column[name] for name in ("sample_id", "recording_id", "value", "weight")}
             types = {one.name: one.type for one in PAIRED_SAMPLES.columns}
             columns |= {name: pa.array([value] * len(column), types[name]) for name, value in same.items()}

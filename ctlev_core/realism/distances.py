@@ -33,7 +33,7 @@ DISTRIBUTIONS = TableSchema(
     None,
     (
         Column("group", pa.string(), "events or frames"),
-        Column("setting", pa.string(), "which set of recordings or frames"),
+        Column("subject", pa.string(), "which set of recordings or frames"),
         Column("axis", pa.string(), "what is distributed (ctlev_core.realism.summary.AXES)"),
         Column("centre", pa.float64(), "middle of the bin, in the unit of the axis"),
         Column("share", pa.float64(), "share of the bin, mean over recordings", minimum=0, maximum=1.000001),

@@ -1,4 +1,4 @@
-"""Statistics of single event images: lone and hot pixels, contrast, correlation of neighbours, power spectrum.
+"""Statistics of single event images: isolated and hot pixels, contrast, correlation of neighbours, power spectrum.
 
 All are of a pixel's value, its largest channel, 0 .. 255, and of whole frames, dark borders included.
 """

@@ -20,7 +20,7 @@ def realism_of_samples(
     """`c2st` against held-out real frames, and statistics of the samples.
 
     Args:
-        frames: [N, H, W, 3] uint8, samples of one setting.
+        frames: [N, H, W, 3] uint8, samples of one subject.
         groups: [N] condition of each.
         real: [M, H, W, 3] uint8, held-out real frames.
         recordings: [M] recording of each.

@@ -23,7 +23,7 @@ from 25 of 255 on: one event counts where ten are white, the faint rest that a d
 
     active_pixel_share      active pixels / pixels
     positive_share          sum of red / (sum of red + sum of blue); only of images with colour
-    speckle_share           active pixels in 8-connected pieces of at most 2 pixels / active pixels
+    speckle_share           active pixels in 8-connected components of at most 2 pixels / active pixels
     isolated_pixel_share    active pixels without an active one among their 8 neighbours / active pixels
     hot_pixel_share         pixels of at least 128 and more than 4 times the second largest value of their neighbours,
                             / pixels

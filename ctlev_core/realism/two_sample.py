@@ -45,7 +45,7 @@ TWO_SAMPLE_TESTS = TableSchema(
     None,
     (
         Column("group", pa.string(), "whose frames: as in the table of scores"),
-        Column("setting", pa.string(), "`A against B`: which sets are told apart"),
+        Column("subject", pa.string(), "`A against B`: which sets are told apart"),
         Column("value", pa.float64(), "area under the ROC curve, mean over trainings", nullable=True),
         Column("low", pa.float64(), "lower end of its 95 % interval", nullable=True),
         Column("high", pa.float64(), "upper end", nullable=True),

@@ -159,11 +159,11 @@ def _draw(vertices, faces, attributes, K, near, cull_back, unit_length, image, d
     _fill(screen, faces, attributes, cull_back, unit_length, image, depth_inverse)
     crossing = 0 if all_in_front else _count_crossing(screen, faces)
     if crossing > 0:
-        points, values, pieces = _clip_near(vertices, faces, attributes, screen, near, crossing)
+        points, values, chunks = _clip_near(vertices, faces, attributes, screen, near, crossing)
         screen = np.empty((points.shape[0], 3))
         # A corner cut off exactly on the plane must count as in front of it: hence half.
         _project(points, K, 0.5 * near, screen)
-        _fill(screen, pieces, values, cull_back, unit_length, image, depth_inverse)
+        _fill(screen, chunks, values, cull_back, unit_length, image, depth_inverse)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -202,7 +202,7 @@ def _clip_near(vertices, faces, attributes, screen, near, crossing):
     """The parts beyond z = near of the triangles that cross it, as a mesh (Sutherland-Hodgman: 3 or 4 corners each)."""
     points = np.empty((4 * crossing, 3), vertices.dtype)
     values = np.empty((4 * crossing, attributes.shape[1]), attributes.dtype)
-    pieces = np.empty((2 * crossing, 3), faces.dtype)
+    chunks = np.empty((2 * crossing, 3), faces.dtype)
     corners = triangles = 0
     for f in range(faces.shape[0]):
         inside = (screen[faces[f, 0], 2] > 0.0) + (screen[faces[f, 1], 2] > 0.0) + (screen[faces[f, 2], 2] > 0.0)
@@ -223,9 +223,9 @@ def _clip_near(vertices, faces, attributes, screen, near, crossing):
                 _interpolate(attributes, current, following, cut, values, corners)
                 corners += 1
         for i in range(first + 1, corners - 1):
-            pieces[triangles, 0], pieces[triangles, 1], pieces[triangles, 2] = first, i, i + 1
+            chunks[triangles, 0], chunks[triangles, 1], chunks[triangles, 2] = first, i, i + 1
             triangles += 1
-    return points[:corners], values[:corners], pieces[:triangles]
+    return points[:corners], values[:corners], chunks[:triangles]
 
 
 @numba.njit(cache=True, nogil=True)

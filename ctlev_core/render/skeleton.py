@@ -3,7 +3,7 @@
 Two drawings of OpenPose's 18 joints and 17 limbs, as far as a joint set has them:
 
 - `smooth`: anti-aliased, in fractions of a pixel and of the image, limbs below joints; a joint that moves by a tenth of
-  a pixel moves the picture, also at 64 px. The bundled prior was trained with it.
+  a pixel moves the picture, also at 64 px. The bundled base model was trained with it.
 - `openpose`: ControlNet v1.0's, pixel by pixel, for its published checkpoints.
 
 Source: limbs and colours of Cao et al., OpenPose (CVPR 2017); `openpose` as `draw_bodypose` of lllyasviel/ControlNet,

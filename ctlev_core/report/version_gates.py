@@ -17,49 +17,49 @@ REAL = "real"
 
 
 def check_gates(
-    gates: Gates, scores: Sequence[dict[str, Any]], *, task: str, labels_of: str, refused_share: float
+    gates: Gates, scores: Sequence[dict[str, Any]], *, task: str, labels_of: str, rejected_share: float
 ) -> list[GateCheck]:
     """Every gate that is asked for, with the number it judges.
 
     Args:
         gates: thresholds; those that are None are left out.
         scores: rows of the table `scores`: distances of `HELD_OUT` and `SYNTHETIC` frames, of equally many; scores of
-            the model trained on real frames, setting `REAL`, and of that model on the version's frames; copies;
+            the model trained on real frames, subject `REAL`, and of that model on the version's frames; copies;
             realism.
         task: of that model; its first score decides.
-        labels_of: setting of its scores on the version's frames.
-        refused_share: of frames that are no event images.
+        labels_of: subject of its scores on the version's frames.
+        rejected_share: of frames that are no event images.
     Raises:
         DataError: a score that a gate needs is missing.
     """
     checks: list[GateCheck] = []
     if gates.max_distance_ratio is not None:
-        floor, value = (_find(scores, "distance", setting, ("fd_event_", "fid")) for setting in (HELD_OUT, SYNTHETIC))
+        floor, value = (_find(scores, "distance", subject, ("fd_event_", "fid")) for subject in (HELD_OUT, SYNTHETIC))
         score = "Frechet distance to the real training frames"
         checks.append(_check("max_distance_ratio", score, value["value"], gates.max_distance_ratio * floor["value"]))
     if gates.max_label_error_ratio is not None:
-        floor, value = (_find(scores, task, setting) for setting in (REAL, labels_of))
+        floor, value = (_find(scores, task, subject) for subject in (REAL, labels_of))
         score = f"error of labels, {value['metric']}"
         checks.append(
             _check("max_label_error_ratio", score, _error(value), gates.max_label_error_ratio * _error(floor))
         )
-    if gates.max_copies_share is not None:
-        copies = [row for row in scores if row["task"] == "copies"]
+    if gates.max_memorised_share is not None:
+        copies = [row for row in scores if row["task"] == "memorisation"]
         shares = [row["value"] for row in copies if row["metric"] == "close_share"]
         if not shares:
-            raise DataError("gate max_copies_share: nothing was searched for copies")
+            raise DataError("gate max_memorised_share: nothing was searched for copies")
         # Where many real frames are alike the threshold of `close_share` is 0, which no distance is below.
         shares += [row["value"] / row["num_samples"] for row in copies if row["metric"] == "duplicates"]
-        checks.append(_check("max_copies_share", "share of copies", max(shares), gates.max_copies_share))
-    if gates.max_refused_share is not None:
+        checks.append(_check("max_memorised_share", "share of copies", max(shares), gates.max_memorised_share))
+    if gates.max_rejected_share is not None:
         score = "share of frames that are no event images"
-        checks.append(_check("max_refused_share", score, refused_share, gates.max_refused_share))
+        checks.append(_check("max_rejected_share", score, rejected_share, gates.max_rejected_share))
     return checks + _check_realism(gates, scores)
 
 
 def _check_realism(gates: Gates, scores: Sequence[dict[str, Any]]) -> list[GateCheck]:
     """Gates of the task `realism`."""
-    found = {(row["setting"], row["metric"]): row["value"] for row in scores if row["task"] == "realism"}
+    found = {(row["subject"], row["metric"]): row["value"] for row in scores if row["task"] == "realism"}
     checks: list[GateCheck] = []
     if gates.max_c2st is not None:
         value = found.get((f"{SYNTHETIC} against test", C2ST))
@@ -70,7 +70,7 @@ def _check_realism(gates: Gates, scores: Sequence[dict[str, Any]]) -> list[GateC
             )
         score = "area under the ROC curve, told from held-out real frames"
         checks.append(_check("max_c2st", score, value, gates.max_c2st))
-    known = {name: value for (setting, name), value in found.items() if setting == f"{SYNTHETIC} against real"}
+    known = {name: value for (subject, name), value in found.items() if subject == f"{SYNTHETIC} against real"}
     for name, limit in (gates.max_realism_distances or {}).items():
         if name not in known:
             raise DataError(f"gate max_realism_distances: expected names of {', '.join(sorted(known))}; got {name!r}")
@@ -83,13 +83,13 @@ def _check(gate: str, score: str, value: float, limit: float) -> GateCheck:
 
 
 def _find(
-    scores: Sequence[dict[str, Any]], task: str, setting: str, metric: str | tuple[str, ...] = ""
+    scores: Sequence[dict[str, Any]], task: str, subject: str, metric: str | tuple[str, ...] = ""
 ) -> dict[str, Any]:
-    """The first score of a task and setting, of all data, whose name starts so."""
+    """The first score of a task and subject, of all data, whose name starts so."""
     for row in scores:
-        if (row["task"], row["setting"], row["group"]) == (task, setting, "all") and row["metric"].startswith(metric):
+        if (row["task"], row["subject"], row["group"]) == (task, subject, "all") and row["metric"].startswith(metric):
             return row
-    raise DataError(f"gates: {task!r} has no score {metric!r} of setting {setting!r}")
+    raise DataError(f"gates: {task!r} has no score {metric!r} of subject {subject!r}")
 
 
 def _error(row: dict[str, Any]) -> float:

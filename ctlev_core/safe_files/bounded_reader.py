@@ -14,7 +14,7 @@ class _Readable(Protocol):
 
 
 class BoundedReader:
-    """Reads exactly what is asked for, in pieces, so that memory grows only with bytes that are there.
+    """Reads exactly what is asked for, in chunks, so that memory grows only with bytes that are there.
 
     Args:
         stream: a file, or what decompresses one.
@@ -33,15 +33,15 @@ class BoundedReader:
         """
         if not 0 <= size <= self._left:
             raise DataError(f"it claims {size} more bytes where at most {self._left} of {self._limit} are left")
-        pieces, missing = [], size
+        chunks, missing = [], size
         while missing:
-            piece = self._stream.read(min(missing, _PIECE))
-            if not piece:
+            chunk = self._stream.read(min(missing, _PIECE))
+            if not chunk:
                 raise DataError(f"it ends {missing} bytes early")
-            pieces.append(piece)
-            missing -= len(piece)
+            chunks.append(chunk)
+            missing -= len(chunk)
         self._left -= size
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+        return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
     def readline(self) -> bytes:
         """The bytes up to and with the next line feed."""
@@ -52,7 +52,7 @@ class BoundedReader:
 
     def read_to_end(self) -> None:
         """Read and forget the rest: a decompressor compares the checksum only there."""
-        while piece := self._stream.read(_PIECE):
-            self._left -= len(piece)
+        while chunk := self._stream.read(_PIECE):
+            self._left -= len(chunk)
             if self._left < 0:
                 raise DataError(f"it holds more than {self._limit} bytes")

@@ -97,9 +97,9 @@ class _ZlibFile:
     def read(self, size: int, /) -> bytes:
         while not self._inflate.eof:
             packed = self._inflate.unconsumed_tail or self._stream.read(_PIECE)
-            piece = self._inflate.decompress(packed, size)
-            if piece or self._inflate.eof:
-                return piece
+            chunk = self._inflate.decompress(packed, size)
+            if chunk or self._inflate.eof:
+                return chunk
             if not packed:
                 raise DataError("the compressed stream ends early")
         return b""

@@ -111,15 +111,15 @@ def mean_and_covariance(features: np.ndarray, origin: np.ndarray) -> tuple[np.nd
 
     width = features.shape[1]
     block = np.empty((min(len(features), max(256, BLOCK_NUMBERS // width)), width))
-    pieces = [features[start : start + len(block)] for start in range(0, len(features), len(block))]
+    chunks = [features[start : start + len(block)] for start in range(0, len(features), len(block))]
     mean, covariance = np.zeros(width), np.zeros((width, width), order="F")
     # Both add to the lower triangle of the matrix in place.
     syrk, syr = get_blas_funcs(("syrk", "syr"), (covariance,))
-    for rows in pieces:
+    for rows in chunks:
         mean += np.subtract(rows, origin, out=block[: len(rows)]).sum(axis=0)
     mean /= len(features)
     left_over = np.zeros(width)
-    for rows in pieces:
+    for rows in chunks:
         centred = np.subtract(rows, origin, out=block[: len(rows)])
         centred -= mean
         left_over += centred.sum(axis=0)

@@ -17,7 +17,7 @@ from ctlev_core.scoring.gaussians import check_features, check_same_width
 _BLOCK_NUMBERS = 4_000_000
 
 
-def kernel_distance(
+def compute_kid(
     features_a: np.ndarray,
     features_b: np.ndarray,
     *,
@@ -66,7 +66,7 @@ def _unbiased(a: np.ndarray, b: np.ndarray, origin: np.ndarray) -> float:
 
 
 def _kernel_sum(a: np.ndarray, b: np.ndarray, origin: np.ndarray) -> float:
-    """Sum of the centred kernel over all pairs of rows, in pieces that fit into memory."""
+    """Sum of the centred kernel over all pairs of rows, in chunks that fit into memory."""
     width = len(origin)
     from_b = (b @ origin) / width
     step = max(1, _BLOCK_NUMBERS // max(len(b), 1))

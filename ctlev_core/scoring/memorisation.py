@@ -27,7 +27,7 @@ CLOSEST_PAIRS = TableSchema(
     1,
     None,
     (
-        Column("setting", pa.string(), "which generated frames"),
+        Column("subject", pa.string(), "which generated frames"),
         Column("features", pa.string(), "what frames were compared in"),
         Column("generated_id", pa.string(), "sample_id of a generated frame"),
         Column("training_id", pa.string(), "sample_id of the training frame nearest to it"),
@@ -46,7 +46,7 @@ _ROUNDING = 4 * float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, eq=False)
-class CopyCheck:
+class MemorisationCheck:
     """Distances of N generated and M other real frames to their nearest training frames.
 
     Attributes:
@@ -84,7 +84,7 @@ class CopyCheck:
         return found
 
 
-def check_copies(
+def check_memorisation(
     generated: np.ndarray,
     training: np.ndarray,
     real: np.ndarray,
@@ -92,7 +92,7 @@ def check_copies(
     training_recordings: Sequence[str] | np.ndarray,
     real_recordings: Sequence[str] | np.ndarray,
     seed: int = 0,
-) -> CopyCheck:
+) -> MemorisationCheck:
     """Compare generated with training frames; see the head of this file.
 
     With fewer than 100 other real frames the threshold is hardly more than the smallest of their distances.
@@ -113,7 +113,7 @@ def check_copies(
     threshold = float(np.quantile(real_distances, NEAR_QUANTILE))
     low, high = _interval(distances, real_distances, np.asarray(real_recordings), seed)
     median = float(np.median(real_distances))
-    return CopyCheck(
+    return MemorisationCheck(
         distances=distances,
         nearest=nearest,
         real_distances=real_distances,

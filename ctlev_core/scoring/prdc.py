@@ -22,7 +22,7 @@ _ROUNDING = 1e-12
 """Of squared distances, relative to the squared norms they are the difference of."""
 
 
-def neighbour_scores(judged: np.ndarray, reference: np.ndarray, num_neighbours: int = 5) -> dict[str, float]:
+def compute_prdc(judged: np.ndarray, reference: np.ndarray, num_neighbours: int = 5) -> dict[str, float]:
     """`precision`, `recall`, `density` and `coverage`; all but density lie in [0, 1].
 
     Args:

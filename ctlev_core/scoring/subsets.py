@@ -2,7 +2,7 @@
 could have learnt from them.
 
 A group is a name and the numbers of its rows. Whatever a model was trained on, the same rows are in a group: what it
-had to learn from is that of the whole experiment, so that settings compare.
+had to learn from is that of the whole experiment, so that training sets compare.
 """
 
 from __future__ import annotations

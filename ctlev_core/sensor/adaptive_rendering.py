@@ -100,19 +100,19 @@ def simulate_rendered(
     else:
         frames = _by_speed(canvas, start_us, stop_us, speed_bound, options)
     sensor: Sensor | None = None
-    pieces: list[Events] = []
+    chunks: list[Events] = []
     times_us = []
     for time_us, frame in frames:
         size = (frame.shape[1], frame.shape[0])
         # The budget is counted here: a sensor with one keeps a copy of its state for every portion of frames.
         sensor = sensor or Sensor(size, sensor_options, sensor_seed=sensor_seed, seed=seed)
-        pieces.append(sensor.push(frame[None], np.array([time_us])))
+        chunks.append(sensor.push(frame[None], np.array([time_us])))
         if max_events is not None and sensor.num_events > max_events:
             message = f"rendering: more than max_events = {max_events} events by t = {time_us} us of {stop_us} us"
-            raise EventBudgetError(message, join(pieces[:-1], size))
+            raise EventBudgetError(message, join(chunks[:-1], size))
         times_us.append(time_us)
     assert sensor is not None  # there are at least the frames at start and stop
-    return join(pieces, sensor.sensor_size), np.array(times_us, np.int64)
+    return join(chunks, sensor.sensor_size), np.array(times_us, np.int64)
 
 
 class _Canvas:

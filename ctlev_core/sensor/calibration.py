@@ -117,7 +117,7 @@ def _measure_noise(events: Events, is_hot: np.ndarray, found: dict, measured: di
     keep = ~is_hot[events.y, events.x]
     t, x, y, p = (getattr(events, name)[keep] for name in "txyp")
     if len(t) == 0 or t[0] == t[-1]:
-        for name in ("leak_rate_hz", "shot_rate_hz", "shot_rate_bright", "rate_spread"):
+        for name in ("leak_rate_hz", "shot_noise_rate_hz", "shot_noise_rate_bright", "rate_spread"):
             assumed[name] = "nothing but hot pixels"
         return
     scratch = np.empty((2, *is_hot.shape), np.int64)
@@ -134,15 +134,17 @@ def _measure_noise(events: Events, is_hot: np.ndarray, found: dict, measured: di
     # Few events in much time are a measurement as well: there is little noise.
     if free_s < MIN_FREE_S:
         note = f"noise shows in {free_s:.3g} pixel-seconds without other events nearby; {MIN_FREE_S:g} are wanted"
-        assumed |= {name: note for name in ("leak_rate_hz", "shot_rate_hz", "shot_rate_bright", "rate_spread")}
+        assumed |= {
+            name: note for name in ("leak_rate_hz", "shot_noise_rate_hz", "shot_noise_rate_bright", "rate_spread")
+        }
         return
     on_hz, off_hz = num_on / free_s, num_off / free_s
-    found["shot_rate_hz"] = measured["shot_rate_hz"] = 2 * off_hz
+    found["shot_noise_rate_hz"] = measured["shot_noise_rate_hz"] = 2 * off_hz
     found["leak_rate_hz"] = measured["leak_rate_hz"] = max(on_hz - off_hz, 0.0)
     measured["leak_rate_error_hz"] = math.sqrt(num_on + num_off) / free_s
     # The rate is that at the light of the recording, whatever it was.
-    found["shot_rate_bright"] = 1.0
-    assumed["shot_rate_bright"] = "the rate is that at the light of the recording; taken as that at any light"
+    found["shot_noise_rate_bright"] = 1.0
+    assumed["shot_noise_rate_bright"] = "the rate is that at the light of the recording; taken as that at any light"
     off = is_isolated & (p == 0)
     cell = y[off].astype(np.int64) * is_hot.shape[1] + x[off]
     per_pixel = np.bincount(cell, minlength=is_hot.size)[is_still.ravel()]

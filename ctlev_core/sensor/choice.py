@@ -43,7 +43,7 @@ def read_sensor(preset: str, noise: float = 1.0) -> SensorOptions:
         update={
             "threshold_sigma": noise * options.threshold_sigma,
             "leak_rate_hz": noise * options.leak_rate_hz,
-            "shot_rate_hz": noise * options.shot_rate_hz,
+            "shot_noise_rate_hz": noise * options.shot_noise_rate_hz,
             "hot_pixel_fraction": min(noise * options.hot_pixel_fraction, 1.0),
         }
     )

@@ -40,11 +40,11 @@ __all__ = [
 ]  # fmt: skip
 
 PIECE_FRAMES = 64
-"""`simulate_events` goes through a recording in pieces of so many frames."""
+"""`simulate_events` goes through a recording in chunks of so many frames."""
 
 
 class EventBudgetError(DataError):
-    """More events than asked for at most; `events` are those up to the last piece that was within the budget."""
+    """More events than asked for at most; `events` are those up to the last chunk that was within the budget."""
 
     def __init__(self, message: str, events: Events) -> None:
         super().__init__(message)
@@ -88,14 +88,14 @@ class Sensor:
             self.maps.threshold_on.ravel(),
             self.maps.threshold_off.ravel(),
             1e-6 * self.maps.leak.ravel(),
-            1e-6 * self.maps.shot_rate_hz.ravel(),
+            1e-6 * self.maps.shot_noise_rate_hz.ravel(),
             1e-6 * self.maps.hot_rate_hz.ravel(),
         )
         self._physics = kernels.Physics(
             options.log_floor,
             options.cutoff_dark_hz or 0.0,
             options.cutoff_bright_hz,
-            options.shot_rate_bright,
+            options.shot_noise_rate_bright,
             float(options.refractory_us),
         )
         self._seed = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
@@ -221,21 +221,21 @@ def simulate_events(
     size = (intensity.shape[2], intensity.shape[1])
     intensity = _check_frames(intensity, t_us, size, None)
     sensor = Sensor(size, options, sensor_seed=sensor_seed, seed=seed, max_events=max_events)
-    pieces: list[Events] = []
+    chunks: list[Events] = []
     for first in range(0, len(t_us), PIECE_FRAMES):
         try:
-            pieces.append(sensor.push(intensity[first : first + PIECE_FRAMES], t_us[first : first + PIECE_FRAMES]))
+            chunks.append(sensor.push(intensity[first : first + PIECE_FRAMES], t_us[first : first + PIECE_FRAMES]))
         except EventBudgetError as error:
-            raise EventBudgetError(f"{error}; `events` of this error are those before", join(pieces, size)) from None
-    return join(pieces, size)
+            raise EventBudgetError(f"{error}; `events` of this error are those before", join(chunks, size)) from None
+    return join(chunks, size)
 
 
-def join(pieces: list[Events], sensor_size: SensorSize) -> Events:
-    """One recording of successive pieces; none give an empty one."""
-    if not pieces:
+def join(chunks: list[Events], sensor_size: SensorSize) -> Events:
+    """One recording of successive chunks; none give an empty one."""
+    if not chunks:
         t, x, y, p = (np.empty(0, dtype) for dtype in EVENT_DTYPES.values())
     else:
-        t, x, y, p = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in EVENT_DTYPES)
+        t, x, y, p = (np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in EVENT_DTYPES)
     return Events(t, x, y, p, sensor_size)
 
 

@@ -49,7 +49,7 @@ class PixelTraits(NamedTuple):
     threshold_off: np.ndarray
     leak: np.ndarray
     """Log intensity per us."""
-    shot_rate: np.ndarray
+    shot_noise_rate: np.ndarray
     """Per us, in the dark."""
     hot_rate: np.ndarray
     """Per us."""
@@ -68,7 +68,7 @@ class Physics(NamedTuple):
     log_floor: float
     cutoff_dark_hz: float
     cutoff_bright_hz: float
-    shot_rate_bright: float
+    shot_noise_rate_bright: float
     refractory_us: float
 
 
@@ -127,7 +127,7 @@ def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exac
                 continue
             (knot_us, signal, lag, difference, allowance, sent_us, random, due), end = _advance_pixel(
                 light_before, light, responses[i - first], begin_us, end_us,
-                traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_rate[i],
+                traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_noise_rate[i],
                 traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i],
                 state.allowance[i], state.sent_us[i], state.random[i], exact_us, polarity, count,
             )  # fmt: skip
@@ -150,16 +150,16 @@ def _advance_pixel(
     still_us = begin_us - knot_us
     is_still = light == light_before
     if is_still:
-        rate = hot + _shot_rate(light, shot, physics)
+        rate = hot + _shot_noise_rate(light, shot, physics)
         s, s_end, slope, gain, lag_us = still_us, end_us - knot_us, leak, -lag, _lag_us(light, physics)
     else:
         if still_us > 0.0:
             settled = lag * _arrived(still_us, _lag_us(light_before, physics), lag)
             difference += leak * still_us - settled
             lag -= settled
-            allowance -= (hot + _shot_rate(light_before, shot, physics)) * still_us
+            allowance -= (hot + _shot_noise_rate(light_before, shot, physics)) * still_us
         middle = 0.5 * (light_before + light)
-        rate = hot + _shot_rate(middle, shot, physics)
+        rate = hot + _shot_noise_rate(middle, shot, physics)
         signal_before, signal = signal, response
         s_end, lag_us = end_us - begin_us, _lag_us(middle, physics)
         ramp = (signal - signal_before) / s_end
@@ -313,9 +313,9 @@ def _due_us(knot_us, difference, lag, leak, on, off, allowance, rate):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _shot_rate(light, shot, physics):
+def _shot_noise_rate(light, shot, physics):
     """Shot noise events a us under this light."""
-    return shot * (1.0 - (1.0 - physics.shot_rate_bright) * min(light, 1.0))
+    return shot * (1.0 - (1.0 - physics.shot_noise_rate_bright) * min(light, 1.0))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

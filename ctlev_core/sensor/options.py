@@ -35,10 +35,12 @@ class SensorOptions(Frozen):
         description="ON events a second of a pixel that sees nothing happen; half of them in the first 1 / rate "
         "seconds of a recording that starts settled.",
     )
-    shot_rate_hz: float = Field(
+    shot_noise_rate_hz: float = Field(
         default=0.0, ge=0, description="Noise events a second of a dark pixel, either polarity."
     )
-    shot_rate_bright: float = Field(default=0.25, ge=0, le=1, description="Share of the shot noise left at white.")
+    shot_noise_rate_bright: float = Field(
+        default=0.25, ge=0, le=1, description="Share of the shot noise left at white."
+    )
     rate_spread: float = Field(default=0.0, ge=0, description="Log-normal spread of leak and shot rates over pixels.")
     hot_pixel_fraction: float = Field(default=0.0, ge=0, le=1, description="Pixels that fire on their own.")
     hot_rate_hz: tuple[float, float] = Field(default=(20.0, 150.0), description="Their rates, uniform in this range.")
@@ -73,7 +75,7 @@ PRESETS = {
         cutoff_dark_hz=20.0,
         refractory_us=500,
         leak_rate_hz=0.25,
-        shot_rate_hz=0.6,
+        shot_noise_rate_hz=0.6,
         rate_spread=0.5,
         hot_pixel_fraction=0.0034,
     ),
@@ -88,7 +90,7 @@ PRESETS = {
         cutoff_bright_hz=300.0,
         refractory_us=500,
         leak_rate_hz=0.1,
-        shot_rate_hz=1.0,
+        shot_noise_rate_hz=1.0,
         rate_spread=0.5,
         hot_pixel_fraction=0.0008,
     ),
@@ -102,8 +104,8 @@ PRESETS = {
         cutoff_dark_hz=20.0,
         refractory_us=197,
         leak_rate_hz=0.01,
-        shot_rate_hz=0.081,
-        shot_rate_bright=1.0,
+        shot_noise_rate_hz=0.081,
+        shot_noise_rate_bright=1.0,
         rate_spread=1.84,
         hot_pixel_fraction=0.00078,
         hot_rate_hz=(34.0, 498.0),
@@ -119,14 +121,14 @@ class PixelMaps:
         threshold_on: log-intensity step of an ON event.
         threshold_off: log-intensity step of an OFF event, positive.
         leak: fall of the reference level, log intensity per second.
-        shot_rate_hz: noise events a second in the dark.
+        shot_noise_rate_hz: noise events a second in the dark.
         hot_rate_hz: ON events a second of a hot pixel, 0 elsewhere.
     """
 
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak: np.ndarray
-    shot_rate_hz: np.ndarray
+    shot_noise_rate_hz: np.ndarray
     hot_rate_hz: np.ndarray
 
 
@@ -144,11 +146,11 @@ def sample_pixel_maps(sensor_size: SensorSize, options: SensorOptions, seed: int
 
     threshold_on = thresholds(options.threshold)
     threshold_off = thresholds(options.threshold_off or options.threshold)
-    leak, shot_rate_hz = rates(options.leak_rate_hz) * threshold_on, rates(options.shot_rate_hz)
+    leak, shot_noise_rate_hz = rates(options.leak_rate_hz) * threshold_on, rates(options.shot_noise_rate_hz)
     hot = rng.choice(math.prod(shape), round(options.hot_pixel_fraction * math.prod(shape)), replace=False)
     hot_rate_hz = np.zeros(shape)
     hot_rate_hz.ravel()[hot] = rng.uniform(*options.hot_rate_hz, len(hot))
-    return PixelMaps(threshold_on, threshold_off, leak, shot_rate_hz, hot_rate_hz)
+    return PixelMaps(threshold_on, threshold_off, leak, shot_noise_rate_hz, hot_rate_hz)
 
 
 def read_preset(path: Path) -> SensorOptions:

@@ -1,4 +1,4 @@
-"""Fit a simulation of filmed pictures to real recordings: thresholds, noise, silence, place and sign of the picture.
+"""Fit a simulation of recorded pictures to real recordings: thresholds, noise, silence, place and sign of the picture.
 
 What is fitted, and from what:
 
@@ -13,7 +13,7 @@ What is fitted, and from what:
     thresholds     the number of events without noise of either polarity: contrast and threshold enter as their quotient
                    alone, so this is the threshold at the contrast that the options give
 
-Each recording is compared with a picture of its class, not with the very picture it was filmed from.
+Each recording is compared with a picture of its class, not with the very picture it was recorded from.
 """
 
 from __future__ import annotations
@@ -77,9 +77,9 @@ def fit(
         recordings: N real ones.
         class_names: N.
         picture_names: classes of the pictures that there are.
-        simulate: films some of them.
+        simulate: records some of them.
         start: first values of the options `centre_px`, `picture_share`, `negative`, `flipped`, `threshold`,
-            `threshold_off`, `refractory_us`, `leak_rate_hz`, `shot_rate_hz` and `hot_pixels`.
+            `threshold_off`, `refractory_us`, `leak_rate_hz`, `shot_noise_rate_hz` and `hot_pixels`.
         given: those of them that stay as they are.
         duration_us: of a simulated recording.
     Returns:
@@ -97,7 +97,7 @@ def fit(
     def simulated(**changes: Any) -> Sums:
         return _sum_up(simulate(rows, size, found | changes), duration_us)[0]
 
-    silent = {"leak_rate_hz": 0.0, "shot_rate_hz": 0.0, "hot_pixels": ()}
+    silent = {"leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0, "hot_pixels": ()}
     if real.intervals_us:
         set_open(refractory_us=round(float(np.median(real.intervals_us))))
     set_open(hot_pixels=_take_hot(real))
@@ -111,7 +111,7 @@ def fit(
         excess_hz = abs(noise_hz[1] - noise_hz[0])
         set_open(flipped=bool(noise_hz[0] > noise_hz[1] and excess_hz > LEAK_SIGMAS * error_hz))
         early = excess_hz * real.seconds / real.num < 0.5
-        set_open(leak_rate_hz=float(excess_hz * (2 if early else 1)), shot_rate_hz=float(2 * noise_hz.min()))
+        set_open(leak_rate_hz=float(excess_hz * (2 if early else 1)), shot_noise_rate_hz=float(2 * noise_hz.min()))
     # Where there is noise alone, the sums of what is left of it would blur place and size.
     signal = np.where(quiet, 0.0, real.counts - (noise_hz * real.seconds)[:, None, None])
     set_open(negative=bool(found["negative"]) ^ (_agreement(real, simulated(**silent)) < 0))

@@ -159,7 +159,7 @@ def ratio_bootstrap(
 
 
 def _draws(group_count: int, num_resamples: int, seed: int) -> Iterator[np.ndarray]:
-    """How often each group is drawn in each replicate, [replicates, group_count], in pieces that fit into memory."""
+    """How often each group is drawn in each replicate, [replicates, group_count], in chunks that fit into memory."""
     generator = np.random.default_rng(seed)
     chunk = max(1, _CHUNK_NUMBERS // group_count)
     for start in range(0, num_resamples, chunk):

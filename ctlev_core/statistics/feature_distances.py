@@ -33,7 +33,7 @@ DISTANCE_ESTIMATES = TableSchema(
     1,
     None,
     (
-        Column("setting", pa.string(), "which frames are compared with the real training frames"),
+        Column("subject", pa.string(), "which frames are compared with the real training frames"),
         Column("metric", pa.string(), "score, with the extractor"),
         Column("value", pa.float64(), "of all frames"),
         Column("low", pa.float64(), "lower end of its 95 % interval, from halves by recording", nullable=True),
@@ -144,9 +144,9 @@ def estimate_distances(
     return found
 
 
-def estimates_table(setting: str, estimates: Mapping[str, DistanceEstimate]) -> pa.Table:
+def estimates_table(subject: str, estimates: Mapping[str, DistanceEstimate]) -> pa.Table:
     """Estimates by their names as rows of the table `distance_estimates`."""
-    columns = {"setting": pa.array([setting] * len(estimates)), "metric": pa.array(list(estimates), pa.string())}
+    columns = {"subject": pa.array([subject] * len(estimates)), "metric": pa.array(list(estimates), pa.string())}
     for column in DISTANCE_ESTIMATES.columns[len(columns) :]:
         values = np.array([getattr(estimate, column.name) for estimate in estimates.values()])
         columns[column.name] = pa.array(values, column.type, from_pandas=True)

@@ -1,10 +1,10 @@
-"""How much better is one training setting than another, and how sure is that? Both are scored on the same samples.
+"""How much better is one training set than another, and how sure is that? Both are scored on the same samples.
 
-Recordings are drawn, the same for both settings, and so are the trainings of each setting, independently: an interval
-covers the choice of test recordings and what varies between trainings with other seeds. Trainings are few: drawing R of
-R with replacement makes the variance of their mean (R - 1)/R of what it is, so that deviations are stretched by
-sqrt(R/(R - 1)) (Rao & Wu, Resampling Inference with Complex Survey Data, JASA 1988). Of a setting with one training
-nothing is known about that spread, and the interval covers recordings alone.
+Recordings are drawn, the same for both training sets, and so are the trainings of each training set, independently: an
+interval covers the choice of test recordings and what varies between trainings with other seeds. Trainings are few:
+drawing R of R with replacement makes the variance of their mean (R - 1)/R of what it is, so that deviations are
+stretched by sqrt(R/(R - 1)) (Rao & Wu, Resampling Inference with Complex Survey Data, JASA 1988). Of a training set
+with one training nothing is known about that spread, and the interval covers recordings alone.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class Trainings:
-    """Scores of N samples by each of R trainings of one setting.
+    """Scores of N samples by each of R trainings of one training set.
 
     Attributes:
         values: [R, N] float64; NaN = no score.
@@ -69,16 +69,16 @@ class Trainings:
 
 
 def read_trainings(samples: pa.Table) -> dict[tuple[str, str], Trainings]:
-    """The trainings by setting and score, from a table of the schema `PAIRED_SAMPLES`.
+    """The trainings by training set and score, from a table of the schema `PAIRED_SAMPLES`.
 
     Settings whose trainings were scored on different samples are left out.
     """
     found: dict[tuple[str, str], dict[int, list]] = {}
-    columns = [samples[name].to_pylist() for name in ("setting", "metric", "training", "sample_id", "recording_id")]
+    columns = [samples[name].to_pylist() for name in ("subject", "metric", "training", "sample_id", "recording_id")]
     values, weights = (samples[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in ("value", "weight"))
     digests = samples["samples_digest"].to_pylist()
-    for row, (setting, metric, training, sample_id, recording) in enumerate(zip(*columns, strict=True)):
-        same = found.setdefault((setting, metric), {}).setdefault(training, [[], [], [], digests[row], []])
+    for row, (training_set, metric, training, sample_id, recording) in enumerate(zip(*columns, strict=True)):
+        same = found.setdefault((training_set, metric), {}).setdefault(training, [[], [], [], digests[row], []])
         for column, value in zip(same[:3] + same[4:], (sample_id, recording, values[row], weights[row]), strict=True):
             column.append(value)
     trainings = {}
@@ -100,16 +100,16 @@ def paired_difference(before: Trainings, after: Trainings, seed: int = 0) -> Dif
     return Difference(float(value[1] - value[0]), *_ends(draws[:, 1] - draws[:, 0]))
 
 
-def share_of_gain(start: Trainings, reached: Trainings, ceiling: Trainings, seed: int = 0) -> Difference | None:
-    """How much of the way from the start to the ceiling was gone: 1 = all of it.
+def share_of_gain(start: Trainings, reached: Trainings, oracle: Trainings, seed: int = 0) -> Difference | None:
+    """How much of the way from the start to the oracle was gone: 1 = all of it.
 
     Returns:
-        The share and its interval; None where it is not certain that the ceiling differs from the start.
+        The share and its interval; None where it is not certain that the oracle differs from the start.
 
     Raises:
         ValueError: as `paired_difference`.
     """
-    value, draws = _means([start, reached, ceiling], seed)
+    value, draws = _means([start, reached, oracle], seed)
     low, high = _ends(draws[:, 2] - draws[:, 0])
     if not (low > 0 or high < 0):
         return None
@@ -121,35 +121,37 @@ def unpaired_difference(before: Trainings, after: Trainings, seed: int = 0) -> D
     """The same for other samples: recordings are drawn independently, too.
 
     Raises:
-        ValueError: no sample is scored by all trainings of a setting.
+        ValueError: no sample is scored by all trainings of a training_set.
     """
     (value_before,), draws_before = _means([before], seed)
     (value_after,), draws_after = _means([after], seed + 1)
     return Difference(float(value_after - value_before), *_ends(draws_after[:, 0] - draws_before[:, 0]))
 
 
-def _means(settings: Sequence[Trainings], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean score of each setting [S], and of its replicates [NUM_RESAMPLES, S]; NaN with too few recordings."""
-    first = settings[0]
-    if not all(first.scores_the_same_as(other) for other in settings):
+def _means(training_sets: Sequence[Trainings], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean score of each training set [S], and of its replicates [NUM_RESAMPLES, S]; NaN with too few recordings."""
+    first = training_sets[0]
+    if not all(first.scores_the_same_as(other) for other in training_sets):
         raise ValueError("paired scores must be about the same samples in the same order")
     weights = np.ones(len(first.recordings)) if first.weights is None else first.weights
-    scored = ~np.any([np.isnan(setting.values).any(axis=0) for setting in settings], axis=0) & (weights > 0)
+    scored = ~np.any([np.isnan(training_set.values).any(axis=0) for training_set in training_sets], axis=0) & (
+        weights > 0
+    )
     if not scored.any():
         raise ValueError(f"none of the {len(scored)} samples is scored by every training")
     names, index = np.unique(np.asarray(first.recordings)[scored], return_inverse=True)
     weights = weights[scored]
     counts = np.bincount(index, weights=weights)
     sums = [
-        np.stack([np.bincount(index, weights=weights * values) for values in setting.values[:, scored]])
-        for setting in settings
+        np.stack([np.bincount(index, weights=weights * values) for values in training_set.values[:, scored]])
+        for training_set in training_sets
     ]
-    found = np.array([of_setting.sum() / (len(of_setting) * counts.sum()) for of_setting in sums])
+    found = np.array([of_set.sum() / (len(of_set) * counts.sum()) for of_set in sums])
     if len(names) < MIN_RECORDINGS:
-        return found, np.full((1, len(settings)), np.nan)
+        return found, np.full((1, len(training_sets)), np.nan)
     generator = np.random.default_rng(seed)
     drawn = [
-        [(times @ of_setting.T) / (times @ counts)[:, None] for of_setting in sums]
+        [(times @ of_set.T) / (times @ counts)[:, None] for of_set in sums]
         for times in _draw_recordings(len(names), generator)
     ]
     of_trainings = [np.concatenate(parts) for parts in zip(*drawn, strict=True)]
@@ -157,7 +159,7 @@ def _means(settings: Sequence[Trainings], seed: int) -> tuple[np.ndarray, np.nda
 
 
 def _draw_recordings(count: int, generator: np.random.Generator) -> Iterator[np.ndarray]:
-    """How often each recording is drawn in each replicate, in pieces that fit into memory."""
+    """How often each recording is drawn in each replicate, in chunks that fit into memory."""
     chunk = max(1, _CHUNK_NUMBERS // count)
     for start in range(0, NUM_RESAMPLES, chunk):
         yield generator.multinomial(count, np.full(count, 1 / count), size=min(chunk, NUM_RESAMPLES - start))

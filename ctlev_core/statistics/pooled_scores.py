@@ -1,13 +1,14 @@
-"""Scores of settings over several draws of the training recordings, and how sure they are.
+"""Scores of training sets over several draws of the training recordings, and how sure they are.
 
 A group of experiments differs in its draw alone: which few recordings each class learnt from. All are tested on the
 same samples. A score is the mean over draws, trainings and samples. What varies is drawn with replacement:
 
-- test recordings, the same for all draws, settings and trainings;
-- draws, the same for all settings: differences of settings are paired by draw;
-- within each draw fine-tunings of the generator, and within these classifier seeds, for each setting independently.
-  Training t learnt from the frames of fine-tuning t % G. Every training has a classifier seed of its own, so that no
-  seed meets two fine-tunings: seeds are drawn within the fine-tuning. Settings without a generator have seeds only.
+- test recordings, the same for all draws, training sets and trainings;
+- draws, the same for all training_sets: differences of training sets are paired by draw;
+- within each draw fine-tunings of the generator, and within these classifier seeds, for each training set
+  independently. Training t learnt from the frames of fine-tuning t % G. Every training has a classifier seed of its
+  own, so that no seed meets two fine-tunings: seeds are drawn within the fine-tuning. Settings without a generator have
+  seeds only.
 
 Deviations of R repetitions are stretched by sqrt(R/(R - 1)), for drawing R with replacement makes the variance of their
 mean (R - 1)/R of what it is (Rao & Wu, Resampling Inference with Complex Survey Data, JASA 1988).
@@ -21,8 +22,8 @@ draws, the larger of the variance found between draws and that explained by the 
 Three draws say little about their own spread. Percentiles of replicates, or 1.96 standard deviations of them, cover the
 truth in only 82 % of studies where draws vary most. The interval is therefore the score and t standard deviations of
 the replicates: half widths of what recordings and of what draws add, each by the t quantile of its own degrees of
-freedom, add up in squares. Those of a sum over settings are Satterthwaite's (Biometrics Bulletin 1946). In simulated
-studies of three draws such intervals cover the truth in 93 to 98 %.
+freedom, add up in squares. Those of a sum over training sets are Satterthwaite's (Biometrics Bulletin 1946). In
+simulated studies of three draws such intervals cover the truth in 93 to 98 %.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ from scipy.stats import t as student
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from ctlev_core.statistics.paired_differences import NUM_RESAMPLES, Difference
 from data_contracts.errors import DataError
-from data_contracts.experiment import LABELS_OF, SHUFFLED
+from data_contracts.training_sets import ORACLE, REAL, LabelAgreement, TrainingSet
 
-WITHOUT_GENERATOR = ("real", "more_real")
+WITHOUT_GENERATOR = (REAL, ORACLE)
 """Settings made of these alone learnt from no generator's frames."""
 _LEVEL = 0.975
 _NORMAL = 1.959964
 _HALVINGS = 20
-_KEY = ("setting", "training", "sample_id", "recording_id", "value", "weight", "samples_digest")
+_KEY = ("subject", "training", "sample_id", "recording_id", "value", "weight", "samples_digest")
 
 
 class DrawsDiffer(DataError):
@@ -82,7 +83,7 @@ class _Tested:
 
 @dataclass(frozen=True, eq=False)
 class _Varied:
-    """What is known of one setting.
+    """What is known of one training set.
 
     Attributes:
         value: its score.
@@ -105,10 +106,10 @@ class PooledScores:
     """Scores of one metric over the experiments of a group; results are those of equal seeds whatever the row order.
 
     Attributes:
-        settings: those that every experiment has, in the order of the first.
+        training_sets: those that every experiment has, in the order of the first.
         num_draws: experiments.
         num_generators: fine-tunings in each.
-        num_trainings: by setting, in each experiment.
+        num_trainings: by training set, in each experiment.
         num_samples: test samples that every training has a score of.
         num_recordings: their recordings. With fewer than `MIN_RECORDINGS` there are no intervals.
     """
@@ -122,8 +123,8 @@ class PooledScores:
 
         Raises:
             DrawsDiffer: experiments were tested on different samples.
-            ValueError: fewer than two experiments, none scored by this metric, settings with other numbers of trainings
-                in other draws, numbers that are no multiple of `num_generators`, or no sample scored by all.
+            ValueError: fewer than two experiments, none scored by this metric, training sets with other numbers of
+                trainings in other draws, numbers that are no multiple of `num_generators`, or no sample scored by all.
         """
         if len(draws) < 2:
             raise ValueError(f"scores are pooled over at least two draws, got {len(draws)}")
@@ -133,10 +134,10 @@ class PooledScores:
             if difference := other.differs_from(tested):
                 raise DrawsDiffer(f"draws 0 and {number} must be tested on the same samples, got {difference}")
         self.num_draws, self.num_generators = len(draws), num_generators
-        self.settings = tuple(name for name in read[0][1] if all(name in found for _, found in read))
-        values = {name: _stacked(name, [found[name] for _, found in read]) for name in self.settings}
-        self.num_trainings = {name: of_setting.shape[1] for name, of_setting in values.items()}
-        scored = ~np.any([np.isnan(of_setting).any(axis=(0, 1)) for of_setting in values.values()], axis=0)
+        self.training_sets = tuple(name for name in read[0][1] if all(name in found for _, found in read))
+        values = {name: _stacked(name, [found[name] for _, found in read]) for name in self.training_sets}
+        self.num_trainings = {name: of_set.shape[1] for name, of_set in values.items()}
+        scored = ~np.any([np.isnan(of_set).any(axis=(0, 1)) for of_set in values.values()], axis=0)
         scored &= tested.weights > 0
         if not scored.any():
             raise ValueError(f"none of the {len(scored)} samples is scored by every training of every draw")
@@ -148,54 +149,54 @@ class PooledScores:
         weights = tested.weights[scored]
         self._of: dict[str, _Varied] = {}
         # In the order of names, so that the order of rows changes nothing.
-        for name in sorted(self.settings):
+        for name in sorted(self.training_sets):
             sums = _add_up(values[name][..., scored] * weights, index, len(names))
             groups = num_generators if _has_generator(name) else 1
             self._of[name] = _vary(name, sums, np.bincount(index, weights), self._times, groups, random)
 
-    def score(self, setting: str) -> Difference:
-        """Mean score of a setting, with its 95 % interval.
+    def score(self, training_set: str) -> Difference:
+        """Mean score of a training set, with its 95 % interval.
 
         Raises:
-            KeyError: not every experiment has this setting; so do the other methods.
+            KeyError: not every experiment has this training set; so do the other methods.
         """
-        return self._contrast({setting: 1.0})[0]
+        return self._contrast({training_set: 1.0})[0]
 
     def difference(self, before: str, after: str) -> Difference:
         """Mean score after minus mean score before, paired by test recording and by draw."""
         return self._contrast(_minus(after, before))[0]
 
-    def probability(self, setting: str, other: str, *, lower_is_better: bool = False) -> float:
-        """How probable it is that the setting beats the other: the share of replicates in which it does.
+    def probability(self, training_set: str, other: str, *, lower_is_better: bool = False) -> float:
+        """How probable it is that the training set beats the other: the share of replicates in which it does.
 
         Replicates are spread as widely as the interval is, so that both say the same. Equal scores count as half.
         NaN with too few recordings. Source: Bouthillier et al., Accounting for Variance in Machine Learning Benchmarks,
         MLSys 2021.
         """
-        replicates = self._contrast(_minus(setting, other))[1] * (-1 if lower_is_better else 1)
+        replicates = self._contrast(_minus(training_set, other))[1] * (-1 if lower_is_better else 1)
         if np.isnan(replicates).any():
             return float("nan")
         return float((replicates > 0).mean() + (replicates == 0).mean() / 2)
 
-    def share_of_gain(self, start: str, reached: str, ceiling: str) -> Difference | None:
-        """How much of the way from the start to the ceiling was gone: 1 = all of it.
+    def share_of_gain(self, start: str, reached: str, oracle: str) -> Difference | None:
+        """How much of the way from the start to the oracle was gone: 1 = all of it.
 
         Returns:
-            The share and its interval: all shares s of which `reached - start - s (ceiling - start)` may be 0 (Fieller,
+            The share and its interval: all shares s of which `reached - start - s (oracle - start)` may be 0 (Fieller,
             Some Problems in Interval Estimation, JRSS B 1954). None where it is not certain that there is a gain.
         """
-        gain, advance = self.difference(start, ceiling), self.difference(start, reached)
+        gain, advance = self.difference(start, oracle), self.difference(start, reached)
         if not gain.is_certain:
             return None
         share = advance.value / gain.value
-        ends = [self._end_of_share(share, step, (start, reached, ceiling)) for step in (-1.0, 1.0)]
+        ends = [self._end_of_share(share, step, (start, reached, oracle)) for step in (-1.0, 1.0)]
         return Difference(share, *ends)
 
     def _end_of_share(self, share: float, step: float, names: tuple[str, str, str]) -> float:
-        start, reached, ceiling = names
+        start, reached, oracle = names
 
         def inside(s: float) -> float:
-            weights = _added((reached, 1.0), (start, s - 1.0), (ceiling, -s))
+            weights = _added((reached, 1.0), (start, s - 1.0), (oracle, -s))
             found = self._contrast(weights)[0]
             return (found.high - found.low) / 2 - abs(found.value)
 
@@ -252,16 +253,16 @@ def pool_values(values: np.ndarray, num_generators: int, seed: int = 0) -> Diffe
 
 
 def _read(table: pa.Table, metric: str, number: int) -> tuple[_Tested, dict[str, np.ndarray]]:
-    """The tested samples, and of each setting the values [R, N], both in the order of the samples' names."""
+    """The tested samples, and of each training set the values [R, N], both in the order of the samples' names."""
     metrics, of_metric = _encoded(table["metric"])
-    settings, of_setting = _encoded(table["setting"])
+    training_sets, of_set = _encoded(table["subject"])
     chosen = np.array([name == metric for name in metrics], bool)[of_metric]
-    chosen &= ~np.array([name.startswith((LABELS_OF, SHUFFLED)) for name in settings], bool)[of_setting]
+    chosen &= ~np.array([LabelAgreement.parse(name) is not None for name in training_sets], bool)[of_set]
     table = table.filter(pa.array(chosen)).select(list(_KEY))
     if not len(table):
         raise ValueError(f"draw {number} has no samples scored by {metric!r}")
     codes, names = {}, {}
-    for column in ("setting", "sample_id", "recording_id", "samples_digest"):
+    for column in ("subject", "sample_id", "recording_id", "samples_digest"):
         names[column], codes[column] = _encoded(table[column])
     training, value, weight = (table[name].to_numpy() for name in ("training", "value", "weight"))
     count = len(names["sample_id"])
@@ -273,19 +274,19 @@ def _read(table: pa.Table, metric: str, number: int) -> tuple[_Tested, dict[str,
         raise DrawsDiffer(f"the trainings of draw {number} must be tested on the same samples, got different ones")
     found = {}
     # In the order of the table's rows.
-    for code in dict.fromkeys(codes["setting"].tolist()):
-        of_setting = codes["setting"] == code
-        trainings, rows = np.unique(training[of_setting], return_inverse=True)
+    for code in dict.fromkeys(codes["subject"].tolist()):
+        of_set = codes["subject"] == code
+        trainings, rows = np.unique(training[of_set], return_inverse=True)
         values, times = np.full((len(trainings), count), np.nan), np.zeros((len(trainings), count), int)
-        place = rows, codes["sample_id"][of_setting]
-        values[place] = value[of_setting]
+        place = rows, codes["sample_id"][of_set]
+        values[place] = value[of_set]
         np.add.at(times, place, 1)
         if (times != 1).any():
             raise DrawsDiffer(
-                f"setting {names['setting'][code]!r} of draw {number}: each training must score each of the {count} "
-                f"samples once, got {times.min()} to {times.max()} times"
+                f"training set {names['subject'][code]!r} of draw {number}: each training must score each of the "
+                f"{count} samples once, got {times.min()} to {times.max()} times"
             )
-        found[names["setting"][code]] = values
+        found[names["subject"][code]] = values
     of_samples = tuple(names["recording_id"][code] for code in recordings)
     return _Tested(tuple(names["sample_id"]), of_samples, weight[first], names["samples_digest"][0]), found
 
@@ -301,7 +302,7 @@ def _encoded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
 def _stacked(name: str, draws: Sequence[np.ndarray]) -> np.ndarray:
     counts = [len(values) for values in draws]
     if len(set(counts)) > 1:
-        raise ValueError(f"setting {name!r} must have as many trainings in every draw, got {counts}")
+        raise ValueError(f"training set {name!r} must have as many trainings in every draw, got {counts}")
     return np.stack(draws)
 
 
@@ -312,8 +313,8 @@ def _add_up(values: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
     return np.add.reduceat(values[..., order], starts, axis=-1)
 
 
-def _has_generator(setting: str) -> bool:
-    return not all(part in WITHOUT_GENERATOR for part in setting.split("+"))
+def _has_generator(training_set: str) -> bool:
+    return not all(name in WITHOUT_GENERATOR for name in TrainingSet.parse(training_set).names)
 
 
 def _stretched(random: np.random.Generator, count: int, shape: tuple[int, ...]) -> np.ndarray:
@@ -327,10 +328,10 @@ def _stretched(random: np.random.Generator, count: int, shape: tuple[int, ...]) 
 def _vary(
     name: str, sums: np.ndarray, counts: np.ndarray, times: np.ndarray, groups: int, random: np.random.Generator
 ) -> _Varied:
-    """Replicates of one setting.
+    """Replicates of one training set.
 
     Args:
-        name: of the setting, for errors.
+        name: of the training set, for errors.
         sums: [D, R, n] weighted values of each recording.
         counts: [n] weights of each recording.
         times: [B, n] how often each recording is drawn.
@@ -340,7 +341,7 @@ def _vary(
     num_draws, num_trainings, _ = sums.shape
     if num_trainings % groups:
         raise ValueError(
-            f"setting {name!r}: the number of trainings must be a multiple of the {groups} fine-tunings, "
+            f"training set {name!r}: the number of trainings must be a multiple of the {groups} fine-tunings, "
             f"got {num_trainings}"
         )
     sampled = (times @ sums.mean(axis=(0, 1))) / (times @ counts)
@@ -385,7 +386,7 @@ def _vary_draws(
         means: [D] of each draw.
         weights: [B, D] of their deviations.
         within: [B] deviations of what was trained within draws.
-        explained: (variance of the mean of a draw, degrees of freedom) of each setting.
+        explained: (variance of the mean of a draw, degrees of freedom) of each training set.
     """
     count = len(means)
     found = float(means.var(ddof=1))
@@ -430,7 +431,7 @@ def _minus(after: str, before: str) -> dict[str, float]:
 
 
 def _added(*terms: tuple[str, float]) -> dict[str, float]:
-    """Weights by setting; those of one that is named twice are added."""
+    """Weights by training set; those of one that is named twice are added."""
     weights: dict[str, float] = {}
     for name, weight in terms:
         weights[name] = weights.get(name, 0.0) + weight

@@ -13,7 +13,7 @@ from itertools import permutations
 from ctlev_core.studio.objects import OBJECTS
 
 RELATIONS = ("on", "with")
-"""Words that the tokenizer of the bundled prior has as a whole."""
+"""Words that the tokenizer of the bundled base model has as a whole."""
 
 NOUNS = tuple(noun for noun in OBJECTS if noun not in ("road", "spot", "street"))
 """All but those that are a ground or a place rather than a thing that stands somewhere."""

@@ -1,4 +1,4 @@
-"""A person in motion, filmed on demand: any moment, and only the part of the picture where the person is."""
+"""A person in motion, recorded on demand: any moment, and only the part of the picture where the person is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everyday objects as a few flat parts each: what the small prior's pictures and `studio_objects` are drawn from.
+"""Everyday objects as a few flat parts each: what the small base model's pictures and `studio_objects` are drawn from.
 
 Every noun is a tuple of parts in a square of [-1, 1] x [-1, 1], x right and y down. A part is a filled polygon, a
 filled ellipse or a thick line, with a tone: 1 takes the object's colour, below 1 darkens it, above 1 lightens it.
@@ -20,7 +20,7 @@ COLOURS = {
 
 @dataclass(frozen=True)
 class Part:
-    """One flat piece of an object: its outline [K, 2] in the unit square, how it is filled, and its tone."""
+    """One flat part of an object: its outline [K, 2] in the unit square, how it is filled, and its tone."""
 
     points: tuple[tuple[float, float], ...]
     tone: float = 1.0

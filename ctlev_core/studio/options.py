@@ -22,7 +22,7 @@ class Options(Frozen):
     num_condition_recordings: int = Field(
         default=1200, ge=0, description="Label-only recordings of random people, UNSEEN motions."
     )
-    film_conditions: bool = Field(
+    record_conditions: bool = Field(
         default=False,
         description="Record events of the people of split `condition` too, as training data: the most that synthetic "
         "data of their poses can give.",

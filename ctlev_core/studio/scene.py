@@ -1,4 +1,4 @@
-"""Random people, light, cameras and backgrounds, and the pictures of them: what `studio` and the prior share."""
+"""Random people, light, cameras and backgrounds, and the pictures of them: what `studio` and the base model share."""
 
 from __future__ import annotations
 

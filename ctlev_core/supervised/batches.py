@@ -52,7 +52,7 @@ class TrainingRows:
 
 
 def batch_rows(count: int, batch_size: int, seed: int, step: int) -> np.ndarray:
-    """Rows [batch_size] of step `step`: consecutive pieces of an endless row of permutations of the training set."""
+    """Rows [batch_size] of step `step`: consecutive chunks of an endless row of permutations of the training set."""
     return _walk(count, step * batch_size, batch_size, (seed, _STREAM_ORDER))
 
 
@@ -130,9 +130,9 @@ def _walk(count: int, first: int, number: int, entropy: tuple[int, ...]) -> np.n
     filled = 0
     while filled < number:
         epoch, offset = divmod(first + filled, count)
-        piece = _permutation(count, (*entropy, epoch))[offset : offset + number - filled]
-        rows[filled : filled + len(piece)] = piece
-        filled += len(piece)
+        chunk = _permutation(count, (*entropy, epoch))[offset : offset + number - filled]
+        rows[filled : filled + len(chunk)] = chunk
+        filled += len(chunk)
     return rows
 
 

@@ -172,7 +172,7 @@ def test_a_new_metric_says_itself_what_its_scores_are():
     assert lower_is_better("worst_joint_px") and not lower_is_better("best_joint_px")
     values = {"real": 6.0, "real+synthetic": 5.0}
     about = {"metric": "worst_joint_px", "group": "all"}
-    rows = [{"setting": name, "value": value, **about} for name, value in values.items()]
+    rows = [{"subject": name, "value": value, **about} for name, value in values.items()]
     told = verdict.verdict(rows, list(values), Difference(-1.0, -1.5, -0.5))
     assert "mean error of a frame's worst joint, in pixels; lower is better" in told
     assert "better: paired difference -1.000" in told
@@ -208,17 +208,17 @@ def test_the_dataset_reads_recordings_and_labels(root, tmp_path):
         dataset.read_labels(recording, wrong)
 
 
-def test_the_format_is_found_and_read_whole_and_in_pieces(tmp_path):
+def test_the_format_is_found_and_read_whole_and_in_chunks(tmp_path):
     events, _, _ = drifting_points(np.random.default_rng(1), 1)
     path = tmp_path / "recording.bin"
     write_plain16(path, events)
     found = event_files.find_format(path)
     assert found.__name__ == "ctlev_core.formats.plain16"
-    whole, pieces = found.read(path), list(found.read_chunks(path, 300))
-    assert [len(piece) for piece in pieces] == [300] * 6 + [200]
+    whole, chunks = found.read(path), list(found.read_chunks(path, 300))
+    assert [len(chunk) for chunk in chunks] == [300] * 6 + [200]
     for name in EVENT_DTYPES:
         np.testing.assert_array_equal(getattr(whole, name), getattr(events, name))
-        np.testing.assert_array_equal(np.concatenate([getattr(piece, name) for piece in pieces]), getattr(events, name))
+        np.testing.assert_array_equal(np.concatenate([getattr(chunk, name) for chunk in chunks]), getattr(events, name))
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(DataError, match="the last record is cut, 15 bytes of 16"):
         found.read(path)

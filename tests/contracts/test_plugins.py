@@ -57,8 +57,8 @@ def test_module_keeps_its_protocol(kind, name):
 def test_a_generator_makes_frames_or_events_and_not_both(name):
     """Callers tell the two apart by `sample_events`; a module with half of each contract would fail late."""
     module = plugins.load("generators", name)
-    functions = [f for f in ("train", "sample", "prior_folders", "sample_events") if hasattr(module, f)]
-    assert functions in (["train", "sample", "prior_folders"], ["sample_events"])
+    functions = [f for f in ("train", "sample", "base_model_folders", "sample_events") if hasattr(module, f)]
+    assert functions in (["train", "sample", "base_model_folders"], ["sample_events"])
 
 
 @pytest.mark.parametrize("name", plugins.names("conditions"))

@@ -45,7 +45,7 @@ def refused(home, *arguments, preset="folder"):
         (("--set", "generator.options.num_steps=many"), "generators 'controlnet': option 'num_steps'"),
         (("--set", "sampling.num_inference_steps=0"), "option 'num_inference_steps': input should be greater"),
         (("--set", "novalue"), "--set expects key=value, got 'novalue'"),
-        (("--set", "generator.options.prior=/does/not/exist"), "/does/not/exist"),
+        (("--set", "generator.options.base_model=/does/not/exist"), "/does/not/exist"),
     ],
 )
 def test_wrong_command_line(tmp_path, arguments, expected):
@@ -148,6 +148,6 @@ def test_what_was_computed_stays(smoke_home, tmp_path):
     before = digests(home)
     refused(home, "--set", "generator.options.batch_size=0", preset="smoke")
     line, _ = refused(home, "--set", "encoding.options.image_size=[48,48]", preset="smoke")
-    assert "the size this prior was trained on" in line
+    assert "the size this base model was trained on" in line
     assert before.items() <= digests(home).items()
     assert not list((home / "tmp").iterdir())

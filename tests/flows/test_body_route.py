@@ -29,7 +29,7 @@ def test_sentences_become_event_frames_in_motion_and_bodies_are_scored(tmp_path)
     sentences = "poses.options.sentences=[a person walks then jumps]"
     report, scores = run("text_motion", tmp_path, 0, sentences, "num_synthetic=10")
     assert report.count("data:image/webp;base64,") == 1 and "a person walks then jumps" in report
-    errors = {(row["setting"], row["metric"]): row["value"] for row in scores if row["group"] == "all"}
+    errors = {(row["subject"], row["metric"]): row["value"] for row in scores if row["group"] == "all"}
     for setting in ("real", "synthetic", "real+synthetic"):
         assert 0 < errors[setting, "mpjpe3d_pa_mm"] <= errors[setting, "mpjpe3d_pelvis_mm"] < 2000
 
@@ -37,11 +37,11 @@ def test_sentences_become_event_frames_in_motion_and_bodies_are_scored(tmp_path)
 @pytest.mark.slow
 def test_one_generator_is_asked_for_poses_of_two_origins(tmp_path):
     foreign = "{poses: {name: text_motion, options: {camera: centred, sentences: [a person jumps]}}}"
-    page, rows = run("body", tmp_path, 2, f"baselines={{foreign_poses: {foreign}}}", "num_synthetic=4")
+    page, rows = run("body", tmp_path, 2, f"baselines={{out_of_domain_poses: {foreign}}}", "num_synthetic=4")
     assert len(artefacts(tmp_path, "finetune")) == 1
     own, foreign = sorted(artefacts(tmp_path, "sample"), key=lambda made: "person" in made.column("class_name")[0])
     assert set(foreign.column("class_name")) == {"a person jumps"} and len(own) == len(foreign) == 4
-    trained = {row["setting"]: row["num_train"] for row in rows if row["group"] == "all"}
+    trained = {row["subject"]: row["num_train"] for row in rows if row["group"] == "all"}
     real = trained["real"]
-    assert trained["real+foreign_poses"] == real + 4 and trained["real+synthetic+foreign_poses"] == real + 8
-    assert "Sampled: foreign_poses" in page and "<td>real+synthetic+foreign_poses</td>" in page
+    assert trained["real+out_of_domain_poses"] == real + 4 and trained["real+synthetic+out_of_domain_poses"] == real + 8
+    assert "Sampled: out_of_domain_poses" in page and "<td>real+synthetic+out_of_domain_poses</td>" in page

@@ -156,11 +156,11 @@ def test_a_run_that_would_overlap_is_cancelled_and_says_why(service, tmp_path):
 
 
 QUICK = (
-    "num_synthetic=3", "baselines={}", "more_real=null", "generator.options.num_steps=2",
+    "num_synthetic=3", "baselines={}", "oracle=null", "generator.options.num_steps=2",
     "sampling.num_inference_steps=2", "downstream.options.num_steps=2", "feature_extractor.options.num_steps=2",
     # Nothing learnt in two steps is good.
-    *(f"gates.{gate}=null" for gate in ("max_distance_ratio", "max_label_error_ratio", "max_refused_share")),
-    "gates.max_copies_share=1",
+    *(f"gates.{gate}=null" for gate in ("max_distance_ratio", "max_label_error_ratio", "max_rejected_share")),
+    "gates.max_memorised_share=1",
 )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ def test_synthesize_ends_in_a_plain_folder(smoke_home, tmp_path):
     assert re.search(r"(\d+) stages, \1 of them cached", finished.output)  # the frames were there
     assert f"exported: {folder}" in finished.output
     (synthetic,) = artefacts(smoke_home, "sample", "generators/controlnet")
-    kept = [row for row, refused in enumerate(synthetic.column("refused")) if not refused]
+    kept = [row for row, refused in enumerate(synthetic.column("rejected")) if not refused]
     dataset, table = EventDataset(folder), pd.read_parquet(folder / "labels.parquet")
     assert len(dataset) == len(table) == len(kept) > 0
     assert "far too small to learn from" in (folder / "README.md").read_text()

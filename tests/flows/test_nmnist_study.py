@@ -25,12 +25,12 @@ experiments:
       - "generator.options.rehearsal.root={images}"
       - "baselines.random_weights.generator.options.rehearsal.root={images}"
       - "baselines.simulator.condition.options.root={images}"
-      - more_real=null
+      - oracle=null
       - dataset.options.recordings_per_class=2
       - num_generators=1
       - base_model.num_processes=1
       - base_model.widths=[32, 32]
-      - base_model.block_scenes=16
+      - base_model.chunk_scenes=16
       - base_model.workers=0
       - base_model.training.num_steps=2
       - base_model.training.batch_size=4
@@ -41,7 +41,7 @@ experiments:
       - sampling.num_inference_steps=2
       - baselines.random_weights.sampling.num_inference_steps=2
       - num_synthetic=6
-      - max_tries=1
+      - max_attempts=1
       - downstream.options.num_steps=3
       - feature_extractor.options.num_steps=3
       - "downstream_seeds=[0, 1]"
@@ -83,8 +83,8 @@ def asked(data, *further):
 def test_the_study_runs_and_tells_every_row(data, tmp_path):
     finished = run_script("full_experiment", *asked(data), home=tmp_path)
     assert finished.status == 0, finished.errors
-    (base,) = artefacts(tmp_path, "pretrain_prior")
-    assert (base.ref.path / "prior" / "unet").is_dir(), "one base model for all draws and generators"
+    (base,) = artefacts(tmp_path, "pretrain")
+    assert (base.ref.path / "base_model" / "unet").is_dir(), "one base model for all draws and generators"
     page = (tmp_path / "reports" / "small.html").read_text()
     for row in ("2 recordings a class", "augmentation", "random", "simulat"):
         assert row in page

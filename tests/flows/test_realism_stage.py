@@ -31,7 +31,7 @@ def test_the_report_sets_synthetic_beside_real(smoke_home):
 
 def test_numbers_are_those_of_the_frames_that_were_sampled(smoke_home):
     rows = only_artefact(smoke_home, "realism").table.to_pylist()
-    found = {(row["group"], row["setting"], row["metric"]): row for row in rows}
+    found = {(row["group"], row["subject"], row["metric"]): row for row in rows}
     (synthetic,) = artefacts(smoke_home, "sample", "generators/controlnet")
     shares = [summarise_frames(frame[None]).numbers["active_pixel_share"] for frame in synthetic.array("frames")]
     row = found["frames", "synthetic", "active_pixel_share"]
@@ -46,7 +46,7 @@ def test_generator_and_baselines_are_told_from_recorded_frames_or_it_says_why_no
     tests = only_artefact(smoke_home, "realism").attached(TWO_SAMPLE_TESTS).to_pylist()
     names = ("synthetic", "event_gan", "smpl_esim")
     expected = {f"{name} against {other}" for name in names for other in ("real", "test")}
-    assert {test["setting"] for test in tests} == expected | {
+    assert {test["subject"] for test in tests} == expected | {
         "real against real",
         "test against test",
         "test against real",
@@ -58,7 +58,7 @@ def test_distributions_add_up_to_1(smoke_home):
     table = only_artefact(smoke_home, "realism").attached(DISTRIBUTIONS).to_pylist()
     sums: dict[tuple, float] = {}
     for row in table:
-        key = (row["group"], row["setting"], row["axis"])
+        key = (row["group"], row["subject"], row["axis"])
         sums[key] = sums.get(key, 0) + row["share"]
     assert {("events", "train", "interval"), ("events", "test", "pixel_rate"), ("frames", "real", "value")} <= set(sums)
     assert ("frames", "synthetic", "power_spectrum") in sums

@@ -24,13 +24,13 @@ from data_contracts.published import Version, latest_frames, published_folder, r
 from tasks.stage import in_one_run, planning
 from tasks.store import Store
 
-GATES = ("max_distance_ratio", "max_label_error_ratio", "max_copies_share", "max_refused_share")
+GATES = ("max_distance_ratio", "max_label_error_ratio", "max_memorised_share", "max_rejected_share")
 OPTIONS = (
-    "num_synthetic=3", "baselines={}", "more_real=null", "max_tries=2", "generator.options.num_steps=2",
+    "num_synthetic=3", "baselines={}", "oracle=null", "max_attempts=2", "generator.options.num_steps=2",
     "sampling.num_inference_steps=2", "downstream.options.num_steps=2", "feature_extractor.options.num_steps=2",
     # Nothing learnt in two steps is good; what is tested is what follows from that.
-    "gates.max_distance_ratio=1.0e+6", "gates.max_label_error_ratio=1.0e+6", "gates.max_copies_share=1",
-    "gates.max_refused_share=1",
+    "gates.max_distance_ratio=1.0e+6", "gates.max_label_error_ratio=1.0e+6", "gates.max_memorised_share=1",
+    "gates.max_rejected_share=1",
 )  # fmt: skip
 UNKEEPABLE = "gates.max_distance_ratio=1.0e-6"
 
@@ -83,7 +83,7 @@ def test_versions_differ_and_can_be_made_again(home, make_version, tmp_path):
     assert not np.array_equal(frames_of(home, first), frames_of(home, second))
     opened = read_manifest(latest_frames(home, "smoke"))
     assert opened.ref.digest == second.synthetic.digest and len(opened) == 3
-    assert second.scores["refused"] == sum(bool(cause) for cause in opened.column("refused"))
+    assert second.scores["rejected"] == sum(bool(cause) for cause in opened.column("rejected"))
     measured = {name.split("_")[0] for name in second.scores if name.startswith("synthetic, all: ")}
     assert measured == {"synthetic, all: fd", "synthetic, all: kid"}
 
@@ -113,7 +113,7 @@ def test_versions_are_sampled_as_the_experiments_own_frames_are(monkeypatch, tmp
             return made(*inputs, **settings)
 
         monkeypatch.setattr(module, "sample", sample)
-    options = ["baselines={}", "more_real=null", "round_to_counts=true", "max_tries=3"]
+    options = ["baselines={}", "oracle=null", "stochastic_rounding=true", "max_attempts=3"]
     with planning():
         regenerate.make_next_version(regenerate.load_regeneration("smoke", options))
         full_experiment.full_experiment.fn(load_experiment("smoke", options))
@@ -134,7 +134,7 @@ def test_a_version_that_breaks_a_gate_is_recorded_and_the_latest_stays(home, mak
     assert [version.passed for version in read_versions(folder_of(home))] == [True, False]
     (broken,) = [check for check in refused.checks if not check.passed]
     assert broken.gate == "max_distance_ratio" and broken.value > broken.limit > 0
-    assert "version 2 of smoke was refused: max_distance_ratio: Frechet distance" in str(refused)
+    assert "version 2 of smoke was rejected: max_distance_ratio: Frechet distance" in str(refused)
     third = make_version(home)
     assert third.number == 3 and third.passed and read_latest(folder_of(home)) == third
 
@@ -142,7 +142,7 @@ def test_a_version_that_breaks_a_gate_is_recorded_and_the_latest_stays(home, mak
 def test_what_no_gate_asks_for_is_not_scored(home, make_version):
     version = make_version(home, *(f"gates.{name}=null" for name in GATES))
     assert version.passed and version.checks == ()
-    assert {artefact.stage for artefact in version.scored_in} == {"score_beside_real", "copy_check"}
+    assert {artefact.stage for artefact in version.scored_in} == {"score_beside_real", "memorisation"}
 
 
 def test_statistics_of_the_frames_can_be_gates(home, make_version):
@@ -180,7 +180,7 @@ def test_a_plan_names_the_stages_of_the_next_version_and_claims_nothing(home, ma
         assert make_version(home) is None
     assert sorted(folder_of(home).iterdir()) == before
     planned = {row.stage: row for row in rows if not row.cached}
-    assert set(planned) == {"condition_samples", "sample", "score_beside_real", "copy_check", "score_model"}
+    assert set(planned) == {"condition_samples", "sample", "score_beside_real", "memorisation", "score_model"}
     assert planned["sample"].key == make_version(home).synthetic.key
 
 

@@ -6,7 +6,7 @@ from simulated_gpu import simulated_gpu
 
 from tasks.stage import in_one_run
 
-COMPUTES = {"finetune", "sample", "train_downstream", "score_model", "score_distance", "take_faithful"}
+COMPUTES = {"finetune", "sample", "train_downstream", "score_model", "score_distance", "take_label_consistent"}
 """Stages with a network in them."""
 
 
@@ -29,4 +29,4 @@ def test_every_stage_with_a_network_uses_the_gpu(tmp_path, monkeypatch):
         made = full_experiment.full_experiment.fn(load_study("smoke", []))
     assert {stage for stage, count in used.items() if count} >= COMPUTES
     scores = pq.read_table(made.path / "scores.parquet").to_pylist()
-    assert {row["setting"] for row in scores} >= {"real", "synthetic", "real+synthetic", "event_gan", "smpl_esim"}
+    assert {row["subject"] for row in scores} >= {"real", "synthetic", "real+synthetic", "event_gan", "smpl_esim"}

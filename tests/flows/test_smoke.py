@@ -26,7 +26,7 @@ from data_contracts.manifest import MANIFEST_FILE, ManifestRef, conditions_of, r
 # The report's digest covers the time each stage took.
 DETERMINISTIC = (
     "ingest", "encode", "condition_frames", "condition_samples", "finetune", "sample", "simulate", "train_downstream",
-    "score_model", "score_distance", "realism", "copy_check", "take_share", "take_faithful",
+    "score_model", "score_distance", "realism", "memorisation", "take_share", "take_label_consistent",
 )  # fmt: skip
 
 
@@ -100,7 +100,7 @@ def test_every_generator_is_asked_for_the_same_labels(smoke_home):
 
 
 def test_simulated_events_lie_on_the_body_they_were_asked_for(smoke_home):
-    """They lie within the box of its joints in all that it does while it is filmed, widened by flesh and clothes."""
+    """They lie within the box of its joints in all that it does while it is recorded, widened by flesh and clothes."""
     (simulated,) = artefacts(smoke_home, "simulate")
     (conditions,) = artefacts(smoke_home, "condition_samples", "conditions/body_motion")
     motions = conditions_of(conditions).motions
@@ -188,7 +188,7 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
     [
         (
             "downstream.options.num_steps=21",
-            {"train_downstream: pose2d", "judge of labels", "faithful", "score_model", "report"},
+            {"train_downstream: pose2d", "judge of labels", "label_consistent", "score_model", "report"},
         ),
         (
             "num_synthetic=9",
@@ -197,7 +197,7 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
                 "sample:",
                 "simulate",
                 "synthetic",
-                "faithful",
+                "label_consistent",
                 "on event_gan",
                 "on smpl_esim",
                 "+event_gan",
@@ -205,7 +205,7 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
                 "labels of",
                 "score_distance: event_gan",
                 "score_distance: smpl_esim",
-                "copy_check",
+                "memorisation",
                 "report",
                 "contact_sheet",
             },
@@ -217,10 +217,10 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
                 "sample: event_gan",
                 "on event_gan",
                 "+event_gan",
-                "labels of event_gan",
+                "label agreement of event_gan",
                 "score_distance: event_gan",
                 "realism",
-                "copy_check: event_gan",
+                "memorisation: event_gan",
                 "report",
             },
         ),
@@ -235,7 +235,7 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
                 "train",
                 "take_",
                 "score",
-                "copy_check",
+                "memorisation",
                 "report",
             },
         ),
@@ -321,8 +321,8 @@ def test_scores_are_tables(smoke_home):
     assert len(tables) == 1
     scores = pq.read_table(tables[0]).to_pylist()
     trained = {"real"} | {f"{real}{name}" for real in ("", "real+") for name in GENERATORS}
-    trained |= {"faithful", "real+faithful", "more_real", "real+more_real", "real+synthetic@0.5"}
-    judged = {f"labels of {name}" for name in GENERATORS} | {"shuffled labels of synthetic"}
-    assert {row["setting"] for row in scores if row["task"] == "pose2d"} == trained | judged
-    assert {row["setting"] for row in scores if row["task"] == "distance"} == {"held-out real", *GENERATORS}
+    trained |= {"label_consistent", "real+label_consistent", "oracle", "real+oracle", "real+synthetic@0.5"}
+    judged = {f"label agreement of {name}" for name in GENERATORS} | {"shuffled label agreement of synthetic"}
+    assert {row["subject"] for row in scores if row["task"] == "pose2d"} == trained | judged
+    assert {row["subject"] for row in scores if row["task"] == "distance"} == {"held-out real", *GENERATORS}
     assert all(np.isfinite(row["value"]) for row in scores)

@@ -10,11 +10,11 @@ from flow_scripts import artefacts, run_script
 from ctlev_core.downstream import classifier
 from ctlev_core.generators import controlnet
 from ctlev_core.scoring.frechet import frechet_distance
-from ctlev_core.seeds import row_seeds
+from ctlev_core.seeds import sample_seeds
 from data_contracts.labels import Conditions
 
 # So many test recordings that intervals, and with them a recommendation, can be given; nothing that is not measured.
-SETTINGS = ("experiment.dataset.options.num_test_recordings=6", "experiment.more_real=null")
+SETTINGS = ("experiment.dataset.options.num_test_recordings=6", "experiment.oracle=null")
 OPTIONS = ["--preset", "smoke", *(word for setting in SETTINGS for word in ("--set", setting))]
 
 
@@ -85,7 +85,7 @@ def test_samples_are_those_of_the_experiment(measured, tmp_path):
     names = conditions.column("sample_id")
     asked = [names.index(name) for name in samples.column("condition_id")]
     assert len(asked) == 6 < len(names)
-    seeds = [row_seeds(0, len(names))[row] for row in asked]
+    seeds = [sample_seeds(0, len(names))[row] for row in asked]
     assert samples.column("seed") == seeds
     prompts = tuple(conditions.column("prompt")[row] for row in asked)
     expected = controlnet.sample(

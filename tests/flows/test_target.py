@@ -14,7 +14,7 @@ from flows.command_line import load_experiment
 
 TINY = (
     "generator.options.num_steps=2", "generator.options.batch_size=2", "sampling.num_inference_steps=2",
-    "downstream={name: classifier, options: {num_steps: 2, batch_size: 2}}", "num_synthetic=6", "max_tries=1",
+    "downstream={name: classifier, options: {num_steps: 2, batch_size: 2}}", "num_synthetic=6", "max_attempts=1",
     "feature_extractor={name: classifier, options: {num_steps: 2, batch_size: 2}}",
 )  # fmt: skip
 SEEN = {names.partition(",")[0] for names in CLASSES.values()}
@@ -51,7 +51,7 @@ def test_only_the_targets_classes_are_sampled_learnt_and_tested(made):
     assert set(only(home, "sample").column("class_name")) == UNSEEN
     (of_target,) = (m for m in artefacts(home, "encode") if set(m.column("class_name")) == UNSEEN)
     scored = [row for m in artefacts(home, "score_model") for row in m.table.to_pylist()]
-    tested = {row["data_digest"] for row in scored if row["setting"] in ("real", "synthetic")}
+    tested = {row["data_digest"] for row in scored if row["subject"] in ("real", "synthetic")}
     assert tested == {of_target.ref.digest}
     assert {row["metric"] for row in scored} >= {"binary_accuracy_bonsai", "binary_accuracy_crocodile head"}
     # The judge of labels knows the target's classes; the features are those of what the generator has learnt.

@@ -1,6 +1,6 @@
 """Feed one reader broken files: whatever the bytes, it must return events that pass `check_events` or raise DataError.
 
-Read whole and in pieces, the file must give the same. With atheris (`pip install atheris`) the mutations follow the
+Read whole and in chunks, the file must give the same. With atheris (`pip install atheris`) the mutations follow the
 coverage of the readers' Python code, without it they are random; both start from valid files of the format.
 
     python tests/fuzz/fuzz_reader.py evt3 --seconds 60
@@ -23,7 +23,7 @@ from types import ModuleType
 import numpy as np
 
 from ctlev_core import plugins
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 
@@ -39,7 +39,7 @@ def check_reader(module: ModuleType, path: Path) -> bool:
     """Read the file in both ways; was it valid?
 
     Raises:
-        Failure: several formats claim the file, another exception than DataError, wrong events, or pieces that differ
+        Failure: several formats claim the file, another exception than DataError, wrong events, or chunks that differ
             from the whole.
     """
     record_files = importlib.import_module("ctlev_core.events.decoding.record_files")
@@ -49,19 +49,19 @@ def check_reader(module: ModuleType, path: Path) -> bool:
     if len(claims) > 1:
         raise Failure(f"claimed by {', '.join(claims)}")
     whole = _attempt(module, lambda: [module.read(path)])
-    pieces = _attempt(module, lambda: list(module.read_chunks(path, 3)))
-    if (whole is None) != (pieces is None):
+    chunks = _attempt(module, lambda: list(module.read_chunks(path, 3)))
+    if (whole is None) != (chunks is None):
         raise Failure(
-            f"whole {'refused' if whole is None else 'read'}, pieces {'refused' if pieces is None else 'read'}"
+            f"whole {'refused' if whole is None else 'read'}, chunks {'refused' if chunks is None else 'read'}"
         )
-    if whole is None or pieces is None:
+    if whole is None or chunks is None:
         return False
-    joined = event_pieces.concatenate(pieces)
+    joined = event_chunks.concatenate(chunks)
     for name in "txyp":
         if not np.array_equal(getattr(whole[0], name), getattr(joined, name)):
-            raise Failure(f"column {name} differs between whole and pieces")
-    if any(piece.sensor_size != whole[0].sensor_size for piece in pieces):
-        raise Failure("sensor size differs between whole and pieces")
+            raise Failure(f"column {name} differs between whole and chunks")
+    if any(chunk.sensor_size != whole[0].sensor_size for chunk in chunks):
+        raise Failure("sensor size differs between whole and chunks")
     return True
 
 
@@ -184,7 +184,7 @@ def main() -> None:
     parser.add_argument("--random", action="store_true", help="random mutations even where atheris is installed")
     arguments = parser.parse_args()
     if arguments.file:
-        print("valid" if check_reader(plugins.load("formats", arguments.format), arguments.file) else "refused")
+        print("valid" if check_reader(plugins.load("formats", arguments.format), arguments.file) else "rejected")
         return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

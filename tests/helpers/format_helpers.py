@@ -1,4 +1,4 @@
-"""What the tests of event files share: making events, and reading a file whole and in pieces."""
+"""What the tests of event files share: making events, and reading a file whole and in chunks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ctlev_core.events import files as event_files
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -25,12 +25,12 @@ def assert_events(events: Events, t=T, x=X, y=Y, p=P) -> None:
 
 
 def read_both_ways(path: Path) -> Events:
-    """Found by content, read whole and in pieces of three, which must agree."""
+    """Found by content, read whole and in chunks of three, which must agree."""
     module = event_files.find_format(path)
     events = module.read(path)
-    pieces = list(module.read_chunks(path, 3))
-    assert all(len(piece) == 3 for piece in pieces[:-1])
-    joined = event_pieces.concatenate(pieces)
+    chunks = list(module.read_chunks(path, 3))
+    assert all(len(chunk) == 3 for chunk in chunks[:-1])
+    joined = event_chunks.concatenate(chunks)
     assert_events(joined, events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist())
     assert joined.sensor_size == events.sensor_size
     return events

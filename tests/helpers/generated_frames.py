@@ -16,7 +16,7 @@ from data_contracts.tables import TableSchema
 from tasks.store import Store
 
 SIZE = (20, 14)
-REFUSED_ROW = 1
+REJECTED_ROW = 1
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def publish(
 
 
 def make_generated(home: Path, count: int = 7, *, seed: int = 0, joints: bool = True, images: bool = True) -> Generated:
-    """`count` noisy frames, of which the gate refused one."""
+    """`count` noisy frames, of which the quality filter rejected one."""
     rng, labels = np.random.default_rng(seed), make_labels(count, joints=joints)
     shape = (count, SIZE[1], SIZE[0], 3)
     frames, pictures = (rng.integers(0, 256, shape, np.uint8) for _ in range(2))
@@ -94,12 +94,12 @@ def make_generated(home: Path, count: int = 7, *, seed: int = 0, joints: bool = 
     made = [f"synthetic/{row:06d}" for row in range(count)]
     same = {
         "split": "train", "generator": "test 1", "checkpoint_digest": "d", "scheduler": "unipc",
-        "num_inference_steps": 3, "guidance_scale": 1.0, "num_tries": 1,
+        "num_inference_steps": 3, "guidance_scale": 1.0, "num_attempts": 1,
     }  # fmt: skip
     columns = {
         "sample_id": made, "recording_id": made, "condition_id": names, **shared,
         **{name: [value] * count for name, value in same.items()}, "seed": list(range(100, 100 + count)),
-        "refused": ["empty: all" if row == REFUSED_ROW else "" for row in range(count)],
+        "rejected": ["empty: all" if row == REJECTED_ROW else "" for row in range(count)],
     }  # fmt: skip
     inputs = {"conditions": conditions}
     synthetic = publish(home, "sample", f"s{key}", columns, tables.SYNTHETIC, inputs, frames=frames)

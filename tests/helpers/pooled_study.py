@@ -16,12 +16,12 @@ from data_contracts.manifest import Manifest, ManifestRef
 from tasks.stage import Output
 from tasks.study_report import study_report
 
-METRIC, LABELS = "accuracy", "labels of synthetic"
-# How much each setting gains over real frames, and how much of it is left with 20 recordings of each class.
+METRIC, LABELS = "accuracy", "label agreement of synthetic"
+# How much each training set gains over real frames, and how much of it is left with 20 recordings of each class.
 GAINS = {
     "real": 0.0, "synthetic": -0.03, "augmentation": -0.01, "random_weights": -0.12, "simulator": -0.09,
-    "more_real": 0.12, "real+synthetic": 0.08, "real+augmentation": 0.03, "real+random_weights": 0.01,
-    "real+simulator": 0.02, "real+more_real": 0.14,
+    "oracle": 0.12, "real+synthetic": 0.08, "real+augmentation": 0.03, "real+random_weights": 0.01,
+    "real+simulator": 0.02, "real+oracle": 0.14,
 }  # fmt: skip
 GENERATORS = ["synthetic", "augmentation", "random_weights", "simulator"]
 COUNTS, DRAWS, NUM_GENERATORS, SEEDS, NUM_TEST = (2, 5, 10, 20), 3, 5, 15, 60
@@ -49,7 +49,7 @@ def write_pooled_study(home: Path, counts=COUNTS, others: tuple[Manifest, ...] =
     made = home / "made"
     made.mkdir()
     arguments = {
-        "title": "numbers", "notice": "Data: made up.", "names": names, "settings": [list(GAINS)] * len(names),
+        "title": "numbers", "notice": "Data: made up.", "names": names, "training_sets": [list(GAINS)] * len(names),
         "generator_names": [GENERATORS] * len(names), "pooled": pooled_groups(counts),
         "num_generators": [NUM_GENERATORS] * len(names),
     }  # fmt: skip
@@ -62,18 +62,23 @@ def _report(folder: Path, name: str, easy: np.ndarray, random: np.random.Generat
     folder.mkdir()
     count = int(name[1:].partition("_")[0])
     draw, values = random.normal(0, 0.06), {}
-    for setting, gain in GAINS.items():
-        tuned = random.normal(0, 0.04, NUM_GENERATORS) * (setting != "real")
+    for training_set, gain in GAINS.items():
+        tuned = random.normal(0, 0.04, NUM_GENERATORS) * (training_set != "real")
         level = 0.25 * np.log2(count) + draw + 8 * gain / np.sqrt(count) + random.normal(0, 0.03)
         trained = level + np.tile(tuned, SEEDS // NUM_GENERATORS)[:, None] + random.normal(0, 0.05, (SEEDS, 1))
         noise = random.logistic(0, 0.25, (SEEDS, NUM_TEST))
-        values[setting] = (trained + easy + noise > 0).astype(float)
+        values[training_set] = (trained + easy + noise > 0).astype(float)
     pq.write_table(samples_table(values), folder / "samples.parquet")
-    scored = {**{setting: of.mean(axis=1) for setting, of in values.items()}, LABELS: random.normal(0.8, 0.02, SEEDS)}
-    rows = [_row(setting, seed, float(value)) for setting, of in scored.items() for seed, value in enumerate(of)]
+    scored = {
+        **{training_set: of.mean(axis=1) for training_set, of in values.items()},
+        LABELS: random.normal(0.8, 0.02, SEEDS),
+    }
+    rows = [
+        _row(training_set, seed, float(value)) for training_set, of in scored.items() for seed, value in enumerate(of)
+    ]
     rows += [
-        {**_row(setting, 0, 9.0), "task": "distance", "metric": "fd_event_x"}
-        for setting in ("held-out real", "synthetic")
+        {**_row(training_set, 0, 9.0), "task": "distance", "metric": "fd_event_x"}
+        for training_set in ("held-out real", "synthetic")
     ]
     pq.write_table(pa.Table.from_pylist(rows, schema=tables.SCORES.arrow()), folder / "scores.parquet")
     pictures = [random.integers(0, 255, (16, 16, 3), np.uint8) for _ in range(4)]
@@ -83,9 +88,10 @@ def _report(folder: Path, name: str, easy: np.ndarray, random: np.random.Generat
     return Manifest(ManifestRef(key=name, path=folder), None, (), ())
 
 
-def _row(setting: str, seed: int, value: float) -> dict:
+def _row(training_set: str, seed: int, value: float) -> dict:
     return {
-        "task": "classification", "setting": setting, "seed": seed, "group": "all", "metric": METRIC, "value": value,
+        "task": "classification", "subject": training_set, "seed": seed, "group": "all", "metric": METRIC,
+        "value": value,
         "low": value - 0.1, "high": value + 0.1, "num_samples": NUM_TEST, "num_train": 20, "model_digest": str(seed),
         "data_digest": "",
     }  # fmt: skip

@@ -17,7 +17,7 @@ def samples_table(values: dict[str, np.ndarray], per_recording: int = 1, metric:
         ids = [f"s{number:05}" for number in range(count)]
         recordings = [f"r{number // per_recording:05}" for number in range(count)]
         columns = {
-            "setting": [setting] * rows, "metric": [metric] * rows,
+            "subject": [setting] * rows, "metric": [metric] * rows,
             "training": pa.array(np.repeat(np.arange(trainings), count), pa.int32()),
             "sample_id": ids * trainings, "recording_id": recordings * trainings, "value": of_setting.ravel(),
             "weight": np.ones(rows), "samples_digest": ["d"] * rows,

@@ -18,8 +18,15 @@ from data_contracts.manifest import Manifest, ManifestRef, label_columns, read_m
 
 SIDE, COUNT, METRIC = 12, 12, "mpjpe2d_px"
 CLASSES = ["walk", "run"] * (COUNT // 2)
-SETTINGS = {"real": 0.0, "synthetic": 0.3, "gan": 0.8, "real+synthetic": -0.5, "real+gan": 0.1, "real+more_real": -1.0}
-SETTINGS |= {"real+synthetic@0.5": -0.25}
+TRAINING_SETS = {
+    "real": 0.0,
+    "synthetic": 0.3,
+    "gan": 0.8,
+    "real+synthetic": -0.5,
+    "real+gan": 0.1,
+    "real+oracle": -1.0,
+}
+TRAINING_SETS |= {"real+synthetic@0.5": -0.25}
 
 
 class Experiment:
@@ -33,21 +40,22 @@ class Experiment:
         self.conditions = self._conditions("asked", "condition_samples")
         self.checkpoints = [self._training("finetune") for _ in range(2)]
         self.generated = [self._synthetic(checkpoint) for checkpoint in self.checkpoints]
-        self.model_names = [f"{name}, seed {seed}" for name in SETTINGS for seed in seeds]
+        self.model_names = [f"{name}, seed {seed}" for name in TRAINING_SETS for seed in seeds]
         self.models = [self._training("train_downstream") for _ in self.model_names]
         self.scores = self._scores()
         beside = {DISTRIBUTIONS.name: _distributions(), TWO_SAMPLE_TESTS.name: _tests()}
         self.realism = self._put("realism", _realism(), tables.SCORES, beside)
-        self.copies = [self._copies(name) for name in ("synthetic", "gan")]
+        self.memorisation = [self._memorisation(name) for name in ("synthetic", "gan")]
 
     @property
     def arguments(self) -> dict:
         """For `tasks.report.report`."""
         inputs = ("recordings", "frames", "frame_conditions", "conditions", "checkpoints", "generated", "scores")
-        given = {name: getattr(self, name) for name in (*inputs, "models", "realism", "copies", "model_names")}
+        given = {name: getattr(self, name) for name in (*inputs, "models", "realism", "memorisation", "model_names")}
         names = ["synthetic", "gan"]
         return given | {
-            "title": "tiny", "notice": "Data: `made up`.", "settings": list(SETTINGS), "generator_names": names,
+            "title": "tiny", "notice": "Data: `made up`.", "training_sets": list(TRAINING_SETS),
+            "generator_names": names,
             "checkpoint_names": names,
         }  # fmt: skip
 
@@ -99,7 +107,7 @@ class Experiment:
             "subject": ["someone"] * COUNT, "split": ["train"] * COUNT, "class_name": CLASSES, "prompt": ["p"] * COUNT,
             "generator": ["g"] * COUNT, "checkpoint_digest": ["c"] * COUNT, "scheduler": ["ddim"] * COUNT,
             "num_inference_steps": pa.array([4] * COUNT, pa.int32()), "guidance_scale": [1.0] * COUNT,
-            "seed": [0] * COUNT, "num_tries": pa.array([1] * COUNT, pa.int32()), "refused": [""] * COUNT,
+            "seed": [0] * COUNT, "num_attempts": pa.array([1] * COUNT, pa.int32()), "rejected": [""] * COUNT,
             **label_columns(_labels()),
         }  # fmt: skip
         table = pa.table(columns).select([column.name for column in tables.SYNTHETIC.columns])
@@ -117,16 +125,19 @@ class Experiment:
         names = [self.frames.column("sample_id")[row] for row in tested]
         found = []
         for model, name in zip(self.models, self.model_names, strict=True):
-            setting, seed = name.split(", seed ")
-            values = 6 + np.arange(len(names)) / 10 + SETTINGS[setting] + 0.01 * int(seed)
-            rows = [_score(setting, int(seed), float(values.mean()), model, self.frames)]
+            training_set, seed = name.split(", seed ")
+            values = 6 + np.arange(len(names)) / 10 + TRAINING_SETS[training_set] + 0.01 * int(seed)
+            rows = [_score(training_set, int(seed), float(values.mean()), model, self.frames)]
             rows += [{**rows[0], "group": "walk"}, {**rows[0], "group": "classes with real training frames"}]
             columns = {"sample_id": names, "recording_id": names, "metric": [rows[0]["metric"]] * len(names)}
             samples = pa.table({**columns, "value": values, "weight": np.ones(len(names))})
             found.append(self._score_artefact(rows, model, {tables.SAMPLE_SCORES.name: samples}))
         model = self.models[0]
-        for setting, value in (("labels of synthetic", 5.0), ("shuffled labels of synthetic", 15.0)):
-            found.append(self._score_artefact([_score(setting, 0, value, model, self.generated[0])], model))
+        for training_set, value in (
+            ("label agreement of synthetic", 5.0),
+            ("shuffled label agreement of synthetic", 15.0),
+        ):
+            found.append(self._score_artefact([_score(training_set, 0, value, model, self.generated[0])], model))
         distance = {**_score("synthetic", 0, 9.0, model, self.generated[0]), "task": "distance", "metric": "fd_event_x"}
         return [*found, self._score_artefact([distance], model)]
 
@@ -136,15 +147,19 @@ class Experiment:
         inputs = {"arguments": arguments, "inputs": [model, self.frames]}
         return self._put("score_model", table, tables.SCORES, attached, **inputs)
 
-    def _copies(self, name: str) -> Manifest:
-        row = {**_score(name, 0, 0.0, self.models[0], self.generated[0]), "task": "copies", "metric": "close_share"}
+    def _memorisation(self, name: str) -> Manifest:
+        row = {
+            **_score(name, 0, 0.0, self.models[0], self.generated[0]),
+            "task": "memorisation",
+            "metric": "close_share",
+        }
         pair = {
-            "setting": name, "features": "small pictures", "generated_id": "made0", "training_id": "frame0",
+            "subject": name, "features": "small pictures", "generated_id": "made0", "training_id": "frame0",
             "generated_row": 0, "training_row": 0, "distance": 0.5, "threshold": 1.0,
         }  # fmt: skip
         table = pa.Table.from_pylist([{**row, "group": "small pictures"}], schema=tables.SCORES.arrow())
         pairs = pa.Table.from_pylist([pair], schema=CLOSEST_PAIRS.arrow())
-        return self._put("copy_check", table, tables.SCORES, {CLOSEST_PAIRS.name: pairs})
+        return self._put("memorisation", table, tables.SCORES, {CLOSEST_PAIRS.name: pairs})
 
 
 def _input(manifest: Manifest) -> dict[str, str]:
@@ -177,11 +192,11 @@ def _recordings() -> pa.Table:
     return pa.Table.from_pylist(rows, schema=tables.RECORDINGS.arrow())
 
 
-def _score(setting: str, seed: int, value: float, model: Manifest, data: Manifest) -> dict:
+def _score(training_set: str, seed: int, value: float, model: Manifest, data: Manifest) -> dict:
     return {
-        "task": "pose2d", "setting": setting, "seed": seed, "group": "all", "metric": METRIC, "value": value,
+        "task": "pose2d", "subject": training_set, "seed": seed, "group": "all", "metric": METRIC, "value": value,
         "low": value - 0.1, "high": value + 0.1, "num_samples": 6,
-        "num_train": {"real": 6, "real+synthetic@0.5": 12}.get(setting, 18),
+        "num_train": {"real": 6, "real+synthetic@0.5": 12}.get(training_set, 18),
         "model_digest": model.ref.digest, "data_digest": data.ref.digest,
     }  # fmt: skip
 
@@ -189,16 +204,16 @@ def _score(setting: str, seed: int, value: float, model: Manifest, data: Manifes
 def _realism() -> pa.Table:
     same = {"task": "realism", "seed": 0, "low": None, "high": None, "num_samples": 6, "num_train": 0}
     same |= {"model_digest": "", "data_digest": "", "group": "frames", "metric": "active_pixel_share"}
-    rows = [{**same, "setting": name, "value": 0.5} for name in ("real", "synthetic", "synthetic against real")]
+    rows = [{**same, "subject": name, "value": 0.5} for name in ("real", "synthetic", "synthetic against real")]
     return pa.Table.from_pylist(rows, schema=tables.SCORES.arrow())
 
 
 def _distributions() -> pa.Table:
-    row = {"group": "frames", "setting": "real", "axis": "value", "centre": 30.0, "share": 1.0}
+    row = {"group": "frames", "subject": "real", "axis": "value", "centre": 30.0, "share": 1.0}
     return pa.Table.from_pylist([row], schema=DISTRIBUTIONS.arrow())
 
 
 def _tests() -> pa.Table:
     unknown = dict.fromkeys(("value", "low", "high", "deviation"))
-    row = {"group": "frames", "setting": "synthetic against real", "num_first": 12, "num_second": 6, **unknown}
+    row = {"group": "frames", "subject": "synthetic against real", "num_first": 12, "num_second": 6, **unknown}
     return pa.Table.from_pylist([{**row, "note": "too few frames"}], schema=TWO_SAMPLE_TESTS.arrow())

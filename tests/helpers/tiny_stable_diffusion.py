@@ -12,7 +12,7 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.models.controlnets.controlnet import ControlNetModel
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from safetensors.torch import save_file
-from tiny_prior import CORPUS
+from tiny_base_model import CORPUS
 from transformers import CLIPTextConfig, CLIPTextModel
 
 from ctlev_core.diffusion.pretrained.components import read_json

@@ -65,7 +65,7 @@ def distribution_error(name, spacing, steps):
 
 @pytest.mark.parametrize("name", SPACINGS)
 def test_errors_fall_with_steps(name):
-    spacing = "lu" if "lu" in SPACINGS[name] else "even"
+    spacing = "lu" if "lu" in SPACINGS[name] else "linspace"
     few, some, many = (distribution_error(name, spacing, steps) for steps in (8, 20, 50))
     # At 50 steps the best solvers stand at what is left by the first step, which starts from noise without the little
     # signal of the schedule's end: 0.0024 for exact solutions, and 0.006 for draws.
@@ -77,26 +77,26 @@ def test_errors_fall_with_steps(name):
 def test_higher_orders_are_better_with_few_steps():
     error = {
         (name, spacing): distribution_error(name, spacing, 20)
-        for name in ("ddim", "dpm++", "dpm++_3m", "unipc", "deis")
+        for name in ("ddim", "dpmpp_2m", "dpmpp_3m", "unipc", "deis")
         for spacing in ("karras", "lu")
     }
     for spacing in ("karras", "lu"):
-        assert error["dpm++", spacing] < 0.6 * error["ddim", spacing]
-        for third in ("dpm++_3m", "unipc", "deis"):
-            assert error[third, spacing] < 0.8 * error["dpm++", spacing]
+        assert error["dpmpp_2m", spacing] < 0.6 * error["ddim", spacing]
+        for third in ("dpmpp_3m", "unipc", "deis"):
+            assert error[third, spacing] < 0.8 * error["dpmpp_2m", spacing]
     # The narrow peak is blurred by a last jump from much noise, whatever the order before.
-    assert distribution_error("dpm++_3m", "even", 20) > 3 * error["dpm++_3m", "karras"]
-    assert distribution_error("ddpm", "even", 20) > max(error.values())
+    assert distribution_error("dpmpp_3m", "linspace", 20) > 3 * error["dpmpp_3m", "karras"]
+    assert distribution_error("ddpm", "linspace", 20) > max(error.values())
 
 
 def test_twenty_steps_of_the_default_beat_hundreds_of_the_ancestral_solver():
-    assert distribution_error("unipc", "karras", 20) < distribution_error("ddpm", "even", 200)
+    assert distribution_error("unipc", "karras", 20) < distribution_error("ddpm", "linspace", 200)
 
 
 def test_few_steps_of_unipc_are_no_worse_than_those_of_a_second_order_solver():
     """At order 3 eight steps overshoot: 0.139 with Karras steps, against 0.064."""
     for spacing in ("karras", "lu"):
-        assert distribution_error("unipc", spacing, 8) < 1.1 * distribution_error("dpm++", spacing, 8)
+        assert distribution_error("unipc", spacing, 8) < 1.1 * distribution_error("dpmpp_2m", spacing, 8)
 
 
 def trajectory_error(name, steps, spread=0.5):
@@ -118,7 +118,7 @@ def trajectory_error(name, steps, spread=0.5):
 @pytest.mark.parametrize(
     # A corrector adds one order to that of unipc's predictor.
     ("name", "order"),
-    [("ddim", 1), ("dpm++", 2), ("dpm++_3m", 3), ("unipc", 4), ("deis", 3)],
+    [("ddim", 1), ("dpmpp_2m", 2), ("dpmpp_3m", 3), ("unipc", 4), ("deis", 3)],
 )
 def test_errors_fall_by_the_solvers_order(name, order):
     """Twice the steps, errors 2 ** order times smaller; measured 1.0, 2.2, 3.0, 4.1 and 2.8."""

@@ -139,13 +139,13 @@ def slow_normals(vertices, faces, intrinsics, size):
 def test_against_the_slow_reference(seed):
     """Bumpy closed meshes, several at once so that they hide one another, one of them close to the camera."""
     rng = np.random.default_rng(seed)
-    pieces = []
+    chunks = []
     for distance in (0.9, 2.0, 4.0):
         mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.35 * distance)
         bumps = 1 + 0.25 * np.sin(mesh.vertices @ rng.normal(size=(3, 1)) * 6 / distance)
         mesh.vertices = mesh.vertices * bumps + np.append(rng.uniform(-0.3, 0.3, 2) * distance, distance)
-        pieces.append(mesh)
-    mesh = trimesh.util.concatenate(pieces)
+        chunks.append(mesh)
+    mesh = trimesh.util.concatenate(chunks)
     vertices, size, intrinsics = mesh.vertices.astype(np.float32), (44, 36), np.array([40.0, 43.0, 21.7, 18.2])
     normals, depth_inverse = render_normals(vertices[None], mesh.faces, intrinsics[None], size)
     expected, expected_inverse, close = slow_normals(vertices.astype(float), mesh.faces, intrinsics, size)

@@ -130,7 +130,9 @@ def flicker(seed, num_frames=24, height=3, width=4):
     return intensity, np.cumsum(rng.integers(1, 30_000, num_frames)).astype(np.int64)
 
 
-RESTLESS = PRESETS["noisy"].model_copy(update={"leak_rate_hz": 8.0, "shot_rate_hz": 20.0, "hot_pixel_fraction": 0.2})
+RESTLESS = PRESETS["noisy"].model_copy(
+    update={"leak_rate_hz": 8.0, "shot_noise_rate_hz": 20.0, "hot_pixel_fraction": 0.2}
+)
 
 
 @settings(deadline=None, max_examples=30)
@@ -208,7 +210,7 @@ def test_the_caller_may_render_into_the_same_array_again():
 def test_zero_light_for_ever_sends_noise_alone():
     intensity, t_us = np.zeros((5, 3, 4)), 250_000 * np.arange(5)
     assert len(simulate(intensity, t_us)) == 0
-    events = simulate(intensity, t_us, SensorOptions(shot_rate_hz=30.0))
+    events = simulate(intensity, t_us, SensorOptions(shot_noise_rate_hz=30.0))
     assert 250 < len(events) < 480  # 12 pixels x 30 Hz x 1 s, six standard deviations
 
 
@@ -291,7 +293,7 @@ def test_bad_frames_leave_the_sensor_as_it_was():
 
 
 def test_shot_noise_is_poisson_and_weaker_in_the_light():
-    options = SensorOptions(shot_rate_hz=5.0, shot_rate_bright=0.25)
+    options = SensorOptions(shot_noise_rate_hz=5.0, shot_noise_rate_bright=0.25)
     t_us = 20_000 * np.arange(101)
     counts = {}
     for light in (0.0, 1.0):
@@ -307,7 +309,7 @@ def test_shot_noise_is_poisson_and_weaker_in_the_light():
 
 
 def test_shot_noise_does_not_depend_on_the_frame_rate():
-    options = SensorOptions(shot_rate_hz=5.0)
+    options = SensorOptions(shot_noise_rate_hz=5.0)
     coarse = simulate(np.full((2, 8, 8), 0.4), [0, 1_000_000], options)
     fine = simulate(np.full((501, 8, 8), 0.4), 2_000 * np.arange(501), options)
     assert len(coarse) > 100

@@ -25,7 +25,7 @@ from ctlev_core.body.motion.procedural import (
 )
 from ctlev_core.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle, matrix_from_euler, slerp
 from ctlev_core.body.text_to_motion.grammar import parse_sentence
-from ctlev_core.body.text_to_motion.plan import Piece, plan_pieces
+from ctlev_core.body.text_to_motion.plan import Segment, plan_segments
 from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from data_contracts.errors import DataError
 
@@ -96,36 +96,36 @@ def check_sentence(sentence: str) -> None:
     _plan(sentence, np.random.default_rng(0))
 
 
-def _plan(sentence: str, rng: np.random.Generator) -> list[Piece]:
+def _plan(sentence: str, rng: np.random.Generator) -> list[Segment]:
     actions = parse_sentence(sentence)
     try:
-        return plan_pieces(actions, rng)
+        return plan_segments(actions, rng)
     except DataError as error:
         raise DataError(f"sentence {sentence!r}: {error}") from None
 
 
 class _Performance:
-    """Pieces on a common time axis.
+    """Segments on a common time axis.
 
     Attributes:
-        duration_s: of all pieces.
+        duration_s: of all segments.
     """
 
-    def __init__(self, pieces: list[Piece], rng: np.random.Generator) -> None:
+    def __init__(self, segments: list[Segment], rng: np.random.Generator) -> None:
         habits = HABIT_RAD * rng.normal(size=(2, NUM_JOINTS, 3))
         # The pelvis carries the body; hips and feet that are off make it float or slide.
         habits[:, [SMPL_JOINTS.index(name) for name in ("pelvis", "left_ankle", "right_ankle")]] = 0.0
         self._style = MotionStyle(0.0, 1.0, 1.0, False, habits[0], habits[1])
-        self._pieces = pieces
-        self._starts_s = np.concatenate([[0.0], np.cumsum([piece.duration_s for piece in pieces])])
+        self._segments = segments
+        self._starts_s = np.concatenate([[0.0], np.cumsum([segment.duration_s for segment in segments])])
         self.duration_s = float(self._starts_s[-1])
         headings = [0.0]
-        for piece in pieces:
-            first, last = _channels(piece, np.array([0.0, piece.duration_s]))
-            headings.append(headings[-1] + piece.turn_deg + last[COLUMN["yaw"]] - first[COLUMN["yaw"]])
+        for segment in segments:
+            first, last = _channels(segment, np.array([0.0, segment.duration_s]))
+            headings.append(headings[-1] + segment.turn_deg + last[COLUMN["yaw"]] - first[COLUMN["yaw"]])
         # Clips whose first pose looks aside begin in the direction of the heading, all the same.
         self._headings_deg = headings
-        self._joins = [self._join(number) for number in range(1, len(pieces))]
+        self._joins = [self._join(number) for number in range(1, len(segments))]
 
     def sample(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [T, 24, 3, 3] and translations [T, 3] m."""
@@ -146,13 +146,13 @@ class _Performance:
         """Rotations [T, 24, 3, 3], height of jumps [T] m and velocity in the air [T, 3] m/s; any times, any order."""
         rotations = np.empty((len(time_s), NUM_JOINTS, 3, 3))
         jump, velocity = np.zeros(len(time_s)), np.zeros((len(time_s), 3))
-        for number in range(len(self._pieces)):
+        for number in range(len(self._segments)):
             begin, blend_begin = self._joins[number - 1][:2] if number else (-1.0, -1.0)
             end = self._joins[number][1] if number < len(self._joins) else np.inf
             rows = np.flatnonzero((time_s >= begin) & (time_s < end))
             if not len(rows):
                 continue
-            own, own_jump, own_velocity = self._piece(number, time_s[rows])
+            own, own_jump, own_velocity = self._segment(number, time_s[rows])
             weight = _ease((time_s[rows] - begin) / (blend_begin - begin)) if number else np.ones(len(rows))
             mixed = np.flatnonzero(weight < 1)
             own[mixed] = slerp(rotations[rows[mixed]], own[mixed], weight[mixed, None])
@@ -161,23 +161,23 @@ class _Performance:
             velocity[rows] = (1 - weight[:, None]) * velocity[rows] + weight[:, None] * own_velocity
         return rotations, jump, velocity
 
-    def _piece(self, number: int, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        piece, passed_s = self._pieces[number], time_s - self._starts_s[number]
-        channels = _channels(piece, passed_s)
+    def _segment(self, number: int, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        segment, passed_s = self._segments[number], time_s - self._starts_s[number]
+        channels = _channels(segment, passed_s)
         for join in (number - 1, number):
             if 0 <= join < len(self._joins):
                 self._lift_foot(channels, time_s, join)
-        turned = piece.turn_deg * _ease_ends(passed_s / piece.turn_s, 0.1)
+        turned = segment.turn_deg * _ease_ends(passed_s / segment.turn_s, 0.1)
         channels[:, COLUMN["yaw"]] += self._headings_deg[number] + turned
         rotations = rotations_from_channels(channels, time_s, self._style)
-        jump = piece.jump_scale * np.maximum(channels[:, COLUMN["jump"]], 0.0)
+        jump = segment.jump_scale * np.maximum(channels[:, COLUMN["jump"]], 0.0)
         facing = matrix_from_euler("Y", channels[:, COLUMN["yaw"], None])[:, :, 2]
         airborne = np.clip(jump / AIRBORNE_M, 0.0, 1.0)
-        return rotations, jump, piece.jump_speed_m_s * airborne[:, None] * facing
+        return rotations, jump, segment.jump_speed_m_s * airborne[:, None] * facing
 
     def _join(self, number: int) -> tuple[float, float, str]:
-        """Begin and end in s of the way from the piece before to piece `number`, and the side of a foot to lift."""
-        before, after = self._pieces[number - 1], self._pieces[number]
+        """Begin and end in s of the way from the segment before to segment `number`, and the side of a foot to lift."""
+        before, after = self._segments[number - 1], self._segments[number]
         poses = np.concatenate([_channels(before, np.array([before.duration_s])), _channels(after, np.zeros(1))])
         turn = np.abs(np.diff(poses[:, [COLUMN["pitch"], COLUMN["roll"]]] % 360, axis=0))
         turn = np.minimum(turn, 360 - turn).max()
@@ -199,20 +199,20 @@ def _at_times(time_s: np.ndarray, grid_s: np.ndarray, values: np.ndarray) -> np.
     return np.stack([np.interp(time_s, grid_s, column) for column in columns], axis=1).reshape(-1, *values.shape[1:])
 
 
-def _channels(piece: Piece, passed_s: np.ndarray) -> np.ndarray:
-    """Channels [T, C] of a piece, `passed_s` [T] after its start; before and after it as `Piece.flows` says."""
-    done = passed_s / piece.duration_s
-    if not find_motion(piece.motion).cyclic:
+def _channels(segment: Segment, passed_s: np.ndarray) -> np.ndarray:
+    """Channels [T, C] of a segment, `passed_s` [T] after its start; before and after it as `Segment.flows` says."""
+    done = passed_s / segment.duration_s
+    if not find_motion(segment.motion).cyclic:
         # Its key poses begin and end in motion, the person does not.
         done = _ease_ends(done, SOFT_ENDS)
-    elif not piece.flows:
+    elif not segment.flows:
         done = np.clip(done, 0.0, 1.0)
-    phase = piece.start + (piece.end - piece.start) * done
-    channels = channels_at_phase(piece.motion, phase, piece.amplitude, piece.mirrored)
-    return channels if piece.arms is None else _lay_over(channels, piece.arms, passed_s)
+    phase = segment.start + (segment.end - segment.start) * done
+    channels = channels_at_phase(segment.motion, phase, segment.amplitude, segment.mirrored)
+    return channels if segment.arms is None else _lay_over(channels, segment.arms, passed_s)
 
 
-def _lay_over(channels: np.ndarray, arms: Piece, passed_s: np.ndarray) -> np.ndarray:
+def _lay_over(channels: np.ndarray, arms: Segment, passed_s: np.ndarray) -> np.ndarray:
     """Channels with those of arms and head that the motion `arms` names in their place, eased in and out."""
     motion = find_motion(arms.motion)
     left_s = arms.duration_s - passed_s
@@ -234,7 +234,7 @@ def _lay_over(channels: np.ndarray, arms: Piece, passed_s: np.ndarray) -> np.nda
     return laid
 
 
-def _named_columns(arms: Piece) -> list[int]:
+def _named_columns(arms: Segment) -> list[int]:
     """Columns of arms and head that the key poses name, on the side where they are performed."""
     motion = find_motion(arms.motion)
     names = {name for _, pose in motion.keys for name in pose} | set(motion.base)

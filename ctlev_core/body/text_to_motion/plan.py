@@ -1,4 +1,4 @@
-"""From actions to pieces of procedural motion: which key poses, how often, how fast, which way round."""
+"""From actions to segments of procedural motion: which key poses, how often, how fast, which way round."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SPEED_SPREAD, _AMPLITUDE_SPREAD = 0.07, 0.06
 
 
 @dataclass(frozen=True)
-class Piece:
+class Segment:
     """A stretch of one motion.
 
     Attributes:
@@ -63,11 +63,11 @@ class Piece:
     turn_s: float = 1.0
     jump_scale: float = 1.0
     jump_speed_m_s: float = 0.0
-    arms: Piece | None = None
+    arms: Segment | None = None
 
 
-def plan_pieces(actions: tuple[Action, ...], rng: np.random.Generator) -> list[Piece]:
-    """The pieces that the actions ask for, with those between them that change the posture.
+def plan_segments(actions: tuple[Action, ...], rng: np.random.Generator) -> list[Segment]:
+    """The segments that the actions ask for, with those between them that change the posture.
 
     The first action begins in its own posture: somebody who only "stands up" sits first.
 
@@ -78,33 +78,33 @@ def plan_pieces(actions: tuple[Action, ...], rng: np.random.Generator) -> list[P
         DataError: an action that does not go with the posture before it, or more than `MAX_DURATION_S` altogether.
     """
     posture = _first_posture(actions[0])
-    pieces: list[Piece] = []
+    segments: list[Segment] = []
     for number, action in enumerate(actions):
         word = action.word
         if word.kind == "rise":
             # Nobody rises who stands: then it says that the person stands.
-            pieces += _rise(posture, action, rng) if posture != "standing" else [_hold("standing", HOLD_SECONDS, rng)]
+            segments += _rise(posture, action, rng) if posture != "standing" else [_hold("standing", HOLD_SECONDS, rng)]
             posture = "standing"
             continue
         target = posture if word.kind in ("arms", "stand") and posture not in ("prone",) else word.posture
         target = "standing" if word.kind == "stand" else target
         if target != posture:
-            pieces += _change_posture(posture, target, action, rng, entered=word.kind == "posture")
+            segments += _change_posture(posture, target, action, rng, entered=word.kind == "posture")
         posture = target
         if word.kind == "posture":
             last = number == len(actions) - 1
-            pieces += _stay(action, posture, last, rng)
+            segments += _stay(action, posture, last, rng)
         else:
-            pieces += _perform(action, posture, rng)
+            segments += _perform(action, posture, rng)
     # Steps are counted from standing to standing; a gait may be under way already, and go on.
     if actions[0].word.kind == "step":
-        pieces.insert(0, _hold("standing", STEP_HOLD_SECONDS, rng))
+        segments.insert(0, _hold("standing", STEP_HOLD_SECONDS, rng))
     if actions[-1].word.kind == "step":
-        pieces.append(_hold("standing", STEP_HOLD_SECONDS, rng))
-    total = sum(piece.duration_s for piece in pieces)
+        segments.append(_hold("standing", STEP_HOLD_SECONDS, rng))
+    total = sum(segment.duration_s for segment in segments)
     if total > MAX_DURATION_S:
         raise DataError(f"the motion takes {total:.0f} s, more than the limit of {MAX_DURATION_S:.0f} s")
-    return pieces
+    return segments
 
 
 def _first_posture(action: Action) -> str:
@@ -123,31 +123,33 @@ def _natural(name: str, action: Action | None, rng: np.random.Generator) -> tupl
     return seconds / speed, (action.amplitude if action else 1.0) * spread
 
 
-def _hold(posture: str, duration_s: float, rng: np.random.Generator) -> Piece:
+def _hold(posture: str, duration_s: float, rng: np.random.Generator) -> Segment:
     if posture == "standing":
         cycle_s, _ = _natural("stand", None, rng)
         start = rng.uniform()
-        return Piece("stand", duration_s, start, start + duration_s / cycle_s, flows=True)
-    return Piece(_POSTURES[posture], duration_s, 1.0, 1.0)
+        return Segment("stand", duration_s, start, start + duration_s / cycle_s, flows=True)
+    return Segment(_POSTURES[posture], duration_s, 1.0, 1.0)
 
 
-def _rise(posture: str, action: Action | None, rng: np.random.Generator) -> list[Piece]:
+def _rise(posture: str, action: Action | None, rng: np.random.Generator) -> list[Segment]:
     name = _POSTURES[posture]
     cycle_s, _ = _natural(name, action, rng)
     start = [_hold(posture, 0.4, rng)] if action else []
-    return [*start, Piece(name, cycle_s, 1.0, 0.0)]
+    return [*start, Segment(name, cycle_s, 1.0, 0.0)]
 
 
-def _change_posture(posture: str, target: str, action: Action, rng: np.random.Generator, entered: bool) -> list[Piece]:
-    pieces = _rise(posture, None, rng) if posture != "standing" else []
+def _change_posture(
+    posture: str, target: str, action: Action, rng: np.random.Generator, entered: bool
+) -> list[Segment]:
+    segments = _rise(posture, None, rng) if posture != "standing" else []
     if target != "standing":
         name = _POSTURES[target]
         cycle_s, _ = _natural(name, action if entered else None, rng)
-        pieces.append(Piece(name, cycle_s))
-    return pieces
+        segments.append(Segment(name, cycle_s))
+    return segments
 
 
-def _stay(action: Action, posture: str, last: bool, rng: np.random.Generator) -> list[Piece]:
+def _stay(action: Action, posture: str, last: bool, rng: np.random.Generator) -> list[Segment]:
     """The posture after it was taken."""
     seconds = action.duration_s or (HOLD_SECONDS if last else 0.3)
     if action.meanwhile is None:
@@ -156,23 +158,23 @@ def _stay(action: Action, posture: str, last: bool, rng: np.random.Generator) ->
     return [replace(_hold(posture, action.duration_s or arms.duration_s, rng), arms=arms)]
 
 
-def _perform(action: Action, posture: str, rng: np.random.Generator) -> list[Piece]:
+def _perform(action: Action, posture: str, rng: np.random.Generator) -> list[Segment]:
     kind = action.word.kind
     if kind == "arms":
         arms = _arms(action, rng)
         return [replace(_hold(posture, arms.duration_s, rng), arms=arms)]
     if kind == "stand":
-        pieces = [_hold("standing", action.duration_s or STAND_SECONDS, rng)]
+        segments = [_hold("standing", action.duration_s or STAND_SECONDS, rng)]
     elif kind == "turn":
-        pieces = [_turn(action, rng)]
+        segments = [_turn(action, rng)]
     elif kind in ("gait", "step"):
-        pieces = [_go(action, rng)]
+        segments = [_go(action, rng)]
     else:
-        pieces = _repeat(action, rng)
+        segments = _repeat(action, rng)
     if action.meanwhile is not None and action.meanwhile.word.kind == "arms":
-        arms = _arms(action.meanwhile, rng, pieces[0].duration_s)
-        pieces = [replace(pieces[0], arms=arms)]
-    return pieces
+        arms = _arms(action.meanwhile, rng, segments[0].duration_s)
+        segments = [replace(segments[0], arms=arms)]
+    return segments
 
 
 def _side(action: Action, rng: np.random.Generator) -> str:
@@ -187,7 +189,7 @@ def _mirrored(word: MotionWord, limbs: str, rng: np.random.Generator) -> bool:
     return bool(rng.random() < 0.5)
 
 
-def _turn(action: Action, rng: np.random.Generator) -> Piece:
+def _turn(action: Action, rng: np.random.Generator) -> Segment:
     whole = bool(action.directions & {"around", "backward"})
     angle = action.angle_deg or (180.0 if whole else 90.0)
     angle *= action.count or 1
@@ -199,10 +201,10 @@ def _turn(action: Action, rng: np.random.Generator) -> Piece:
     cycles = max(1, round(seconds / cycle_s))
     signed = angle if side == "left" else -angle
     # The foot on the side of the turn goes first.
-    return Piece("step_in_place", seconds, 0, cycles, mirrored=side == "right", turn_deg=signed, turn_s=seconds)
+    return Segment("step_in_place", seconds, 0, cycles, mirrored=side == "right", turn_deg=signed, turn_s=seconds)
 
 
-def _go(action: Action, rng: np.random.Generator) -> Piece:
+def _go(action: Action, rng: np.random.Generator) -> Segment:
     """Walking, running and steps: so many half cycles, along a line, a bend or a circle."""
     name, kind, directions = action.word.motion, action.word.kind, action.directions
     if (
@@ -230,7 +232,7 @@ def _go(action: Action, rng: np.random.Generator) -> Piece:
         start, end, amplitude = end, start, 0.8 * amplitude
     mirrored = bool(rng.random() < 0.5)
     turn_s = seconds if turn_s is None else min(turn_s, seconds)
-    return Piece(name_there, seconds, start, end, amplitude, mirrored, True, turn, turn_s)
+    return Segment(name_there, seconds, start, end, amplitude, mirrored, True, turn, turn_s)
 
 
 def _bend(action: Action, rng: np.random.Generator) -> tuple[float, float | None]:
@@ -247,16 +249,16 @@ def _bend(action: Action, rng: np.random.Generator) -> tuple[float, float | None
     return 0.0, 1.0
 
 
-def _go_sideways(action: Action, rng: np.random.Generator) -> Piece:
+def _go_sideways(action: Action, rng: np.random.Generator) -> Segment:
     cycle_s, amplitude = _natural("side_step", action, rng)
     cycles = action.count or (1 if action.word.kind == "step" else max(1, round(GAIT_SECONDS / cycle_s)))
     if action.duration_s:
         cycles = max(1, round(action.duration_s / cycle_s))
     seconds = action.duration_s or cycles * cycle_s
-    return Piece("side_step", seconds, 0, cycles, amplitude, mirrored=_side(action, rng) == "right")
+    return Segment("side_step", seconds, 0, cycles, amplitude, mirrored=_side(action, rng) == "right")
 
 
-def _repeat(action: Action, rng: np.random.Generator) -> list[Piece]:
+def _repeat(action: Action, rng: np.random.Generator) -> list[Segment]:
     """A whole-body motion, so many times."""
     word = action.word
     motion = MOTIONS.get(word.motion) or EVERYDAY_MOTIONS[word.motion]
@@ -275,13 +277,13 @@ def _repeat(action: Action, rng: np.random.Generator) -> list[Piece]:
     )
     scale = action.amplitude**1.5
     # Half a cartwheel is no cartwheel: what carries the body has its own measure.
-    piece = Piece(word.motion, cycle_s, 0, 1, amplitude, mirrored, jump_scale=scale, jump_speed_m_s=speed)
+    segment = Segment(word.motion, cycle_s, 0, 1, amplitude, mirrored, jump_scale=scale, jump_speed_m_s=speed)
     if motion.cyclic:
-        return [replace(piece, duration_s=count * cycle_s, end=count)]
-    return [piece] * count
+        return [replace(segment, duration_s=count * cycle_s, end=count)]
+    return [segment] * count
 
 
-def _arms(action: Action, rng: np.random.Generator, duration_s: float | None = None) -> Piece:
+def _arms(action: Action, rng: np.random.Generator, duration_s: float | None = None) -> Segment:
     """What arms and head do: cycles to fill the time, or one motion that is held in its middle."""
     word, name = action.word, action.word.motion
     if name == "look":
@@ -296,4 +298,4 @@ def _arms(action: Action, rng: np.random.Generator, duration_s: float | None = N
     seconds = action.duration_s or duration_s or count * cycle_s
     if motion.cyclic and action.count is None:
         count = max(1, round(seconds / cycle_s))
-    return Piece(name, seconds, 0, count, 1.0, mirrored)
+    return Segment(name, seconds, 0, count, 1.0, mirrored)

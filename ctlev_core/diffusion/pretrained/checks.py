@@ -1,4 +1,4 @@
-"""Do the parts of a prior make one latent-diffusion model? Told by configs and shapes, before a weight is loaded."""
+"""Do the parts of a base model fit one another? Told by configs and shapes, before a weight is loaded."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ctlev_core.diffusion.pretrained.components import PriorFiles, PriorPart, read_json
+from ctlev_core.diffusion.pretrained.components import ModelFiles, ModelPart, read_json
 from data_contracts.errors import DataError
 
 CLASSES = {
@@ -31,7 +31,7 @@ _COPIED = ("conv_in.", "time_embedding.", "down_blocks.", "mid_block.")
 logger = logging.getLogger(__name__)
 
 
-def check_parts(files: PriorFiles) -> None:
+def check_parts(files: ModelFiles) -> None:
     """Raise unless U-Net, autoencoder, text encoder, tokenizer, schedule and ControlNet fit one another.
 
     Raises:
@@ -48,7 +48,7 @@ def check_parts(files: PriorFiles) -> None:
         _check_controlnet(files.parts["controlnet"], unet, vae)
 
 
-def _check_class(part: PriorPart) -> None:
+def _check_class(part: ModelPart) -> None:
     known = CLASSES[part.name]
     named = part.config.get("_class_name") or (part.config.get("architectures") or [None])[0]
     if named is not None and named not in known:
@@ -58,7 +58,7 @@ def _check_class(part: PriorPart) -> None:
         raise DataError(f"{part.place}: expected Stable Diffusion v1, got the {part.name} of Stable Diffusion XL")
 
 
-def _shape(part: PriorPart, name: str) -> tuple[int, ...]:
+def _shape(part: ModelPart, name: str) -> tuple[int, ...]:
     """Of the weight of that name, with or without the prefix that transformers gave up."""
     for candidate in (name, f"text_model.{name}"):
         if candidate in part.tensors:
@@ -66,13 +66,13 @@ def _shape(part: PriorPart, name: str) -> tuple[int, ...]:
     raise DataError(f"{part.place}: {part.name} has no weight {name!r}; it holds {len(part.tensors)} others")
 
 
-def _entry(part: PriorPart, name: str) -> Any:
+def _entry(part: ModelPart, name: str) -> Any:
     if name not in part.config:
         raise DataError(f"{part.place}: the config of {part.name} has no entry {name!r}")
     return part.config[name]
 
 
-def _channels(part: PriorPart, name: str, entry: str, axis: int) -> int:
+def _channels(part: ModelPart, name: str, entry: str, axis: int) -> int:
     """A width as its weights have it; the config must agree."""
     shape, told = _shape(part, name), _entry(part, entry)
     told = told[0] if isinstance(told, list) else told
@@ -81,7 +81,7 @@ def _channels(part: PriorPart, name: str, entry: str, axis: int) -> int:
     return shape[axis]
 
 
-def _check_latents(unet: PriorPart, vae: PriorPart) -> None:
+def _check_latents(unet: ModelPart, vae: ModelPart) -> None:
     makes, takes = int(_entry(vae, "latent_channels")), _shape(unet, "conv_in.weight")[1]
     if takes != makes:
         what = f" ({_EXTRA_CHANNELS[takes]})" if makes == 4 and takes in _EXTRA_CHANNELS else ""
@@ -95,7 +95,7 @@ def _check_latents(unet: PriorPart, vae: PriorPart) -> None:
         raise DataError(f"{unet.place}: sample_size in its config must be the side of square latents, got {side!r}")
 
 
-def _check_prompts(unet: PriorPart, text: PriorPart) -> None:
+def _check_prompts(unet: ModelPart, text: ModelPart) -> None:
     makes = _channels(text, "embeddings.token_embedding.weight", "hidden_size", 1)
     for part_name, tensor in unet.tensors.items():
         if part_name.endswith(".attn2.to_k.weight") and tensor.shape[-1] != makes:
@@ -110,7 +110,7 @@ def _known_width(width: int) -> str:
     return f" ({_TEXT_WIDTHS[width]})" if width in _TEXT_WIDTHS else ""
 
 
-def _check_tokenizer(files: PriorFiles, text: PriorPart) -> None:
+def _check_tokenizer(files: ModelFiles, text: ModelPart) -> None:
     folder = files.tokenizer
     whole, vocabulary = folder / "tokenizer.json", folder / "vocab.json"
     if vocabulary.is_file() and (folder / "merges.txt").is_file():
@@ -129,7 +129,7 @@ def _check_tokenizer(files: PriorFiles, text: PriorPart) -> None:
         raise DataError(f"{folder}: token ids reach {highest}, the text encoder of {text.place} has {rows} embeddings")
 
 
-def check_schedule(files: PriorFiles) -> None:
+def check_schedule(files: ModelFiles) -> None:
     """Raise unless the scheduler config says how much noise there is at each step and what the U-Net predicts."""
     config = files.scheduler_config
     missing = [name for name in ("beta_start", "beta_end", "beta_schedule") if config.get(name) is None]
@@ -166,7 +166,7 @@ def _check_betas(place: Path, config: Mapping[str, Any]) -> None:
             raise DataError(f"{place}: {name} must be a number between 0 and 1, got {value!r}")
 
 
-def complete_schedule(files: PriorFiles) -> dict[str, Any]:
+def complete_schedule(files: ModelFiles) -> dict[str, Any]:
     """The scheduler config with what old ones leave unsaid, in place of the defaults of diffusers' classes.
 
     Early Stable Diffusion configs do not say what the network predicts: the noise. Several classes clip the images they
@@ -178,7 +178,7 @@ def complete_schedule(files: PriorFiles) -> dict[str, Any]:
     return config
 
 
-def _check_controlnet(controlnet: PriorPart, unet: PriorPart, vae: PriorPart) -> None:
+def _check_controlnet(controlnet: ModelPart, unet: ModelPart, vae: ModelPart) -> None:
     """A ControlNet is a copy of the U-Net's encoder: every weight they share has one shape."""
     copied = {name for name in unet.tensors if name.startswith(_COPIED)}
     theirs = {name for name in controlnet.tensors if name.startswith(_COPIED)}

@@ -16,8 +16,8 @@ _OLD_ATTENTION = {".query.": ".to_q.", ".key.": ".to_k.", ".value.": ".to_v.", "
 
 
 @dataclass(frozen=True, eq=False)
-class PriorPart:
-    """One network of a prior.
+class ModelPart:
+    """One network of a base model.
 
     Attributes:
         name: `unet`, `vae`, `text_encoder` or `controlnet`.
@@ -33,18 +33,18 @@ class PriorPart:
 
 
 @dataclass(frozen=True, eq=False)
-class PriorFiles:
-    """A whole prior on disk.
+class ModelFiles:
+    """A whole base model on disk.
 
     Attributes:
         place: the folder or file that was asked for.
         parts: `text_encoder`, `vae`, `unet`, and `controlnet` where there is one.
         tokenizer: folder of the tokenizer.
-        scheduler_config: the noise schedule the prior was trained with.
+        scheduler_config: the noise schedule the base model was trained with.
     """
 
     place: Path
-    parts: dict[str, PriorPart]
+    parts: dict[str, ModelPart]
     tokenizer: Path
     scheduler_config: dict[str, Any]
 
@@ -64,7 +64,7 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def read_part(name: str, folder: Path) -> PriorPart:
+def read_part(name: str, folder: Path) -> ModelPart:
     """The network of a subfolder.
 
     Raises:
@@ -76,7 +76,7 @@ def read_part(name: str, folder: Path) -> PriorPart:
     tensors: dict[str, StoredTensor] = {}
     for file in weights_files(folder):
         tensors |= read_tensor_table(file)
-    return PriorPart(name, folder, config, {_new_name(name, old): tensor for old, tensor in tensors.items()})
+    return ModelPart(name, folder, config, {_new_name(name, old): tensor for old, tensor in tensors.items()})
 
 
 def weights_files(folder: Path) -> list[Path]:

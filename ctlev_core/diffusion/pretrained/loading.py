@@ -1,4 +1,5 @@
-"""Load pre-trained weights: any local diffusers folder or Stable Diffusion v1 file, or the bundled small prior alike.
+"""Load pre-trained weights: any local diffusers folder or Stable Diffusion v1 file, or the bundled small base model
+alike.
 
 Nothing is downloaded, and no pickle is run: `docs/weights.md` says what is read and what is checked.
 """
@@ -17,7 +18,7 @@ import torch
 from ctlev_core.diffusion.pretrained.checks import complete_schedule
 from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.model_building import build_model
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR, read_prior_files
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, read_base_model_files
 from data_contracts.errors import DataError
 
 logger = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ PROMPT_BATCH = 128
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class PretrainedModel:
     """The parts of a latent-diffusion pipeline, in evaluation mode.
 
     Attributes:
@@ -36,7 +37,7 @@ class Prior:
         vae: images in [-1, 1] to latents and back.
         unet: predicts from noisy latents.
         controlnet: steers the U-Net by a condition image; None where the folder has none.
-        scheduler_config: the noise schedule the prior was trained with.
+        scheduler_config: the noise schedule the base model was trained with.
         image_size: (width, height) px of the images the U-Net was trained on.
         value_table: [256, 256], how values are drawn about those the networks expect; None = they are taken as they
             are.
@@ -71,34 +72,34 @@ def choose_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def load_prior(
+def load_base_model(
     path: Path | None = None,
     *,
     controlnet: Path | None = None,
     with_controlnet: bool = True,
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
-) -> Prior:
-    """Load a prior, or a checkpoint written by a generator, from local files.
+) -> PretrainedModel:
+    """Load a base model, or a checkpoint written by a generator, from local files.
 
     Args:
         path: a diffusers pipeline folder, or a Stable Diffusion v1 checkpoint in one file with the tokenizer's folder
-            beside it; the bundled small prior when None.
-        controlnet: name of a subfolder of the prior, or a separate ControlNet folder or file; otherwise the prior's
-            own where there is one.
+            beside it; the bundled small base model when None.
+        controlnet: name of a subfolder of the base model, or a separate ControlNet folder or file; otherwise the base
+            model's own where there is one.
         with_controlnet: False leaves the ControlNet on disk.
         dtype: of all weights in memory.
         device: where the weights go.
     Raises:
         DataError: a folder or file is missing or does not fit; the message names it.
     """
-    files = read_prior_files(
-        BUNDLED_PRIOR if path is None else Path(path), controlnet=controlnet, with_controlnet=with_controlnet
+    files = read_base_model_files(
+        BUNDLED_BASE_MODEL if path is None else Path(path), controlnet=controlnet, with_controlnet=with_controlnet
     )
     models = {name: build_model(part, dtype).to(device) for name, part in files.parts.items()}
     unet, vae = models["unet"], models["vae"]
     side = unet.config.sample_size * 2 ** (len(vae.config.block_out_channels) - 1)
-    return Prior(
+    return PretrainedModel(
         tokenizer=_load_tokenizer(files.tokenizer, models["text_encoder"].config.max_position_embeddings),
         text_encoder=models["text_encoder"],
         vae=vae,
@@ -121,11 +122,11 @@ def _load_tokenizer(folder: Path, max_length: int) -> Any:
     return tokenizer
 
 
-def save_prior(prior: Prior, folder: Path, dtype: torch.dtype | None = None) -> None:
+def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtype | None = None) -> None:
     """Write an ordinary diffusers pipeline folder, with safetensors weights.
 
     Args:
-        prior: what to write.
+        base_model: what to write.
         folder: is created.
         dtype: of the written weights, their own when None. The autoencoder always stays as it is: half precision would
             break the exactness of the patch code.
@@ -133,21 +134,23 @@ def save_prior(prior: Prior, folder: Path, dtype: torch.dtype | None = None) -> 
     from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
     folder.mkdir(parents=True, exist_ok=True)
-    scheduler: Any = DDPMScheduler.from_config(prior.scheduler_config)
-    prior.vae.save_pretrained(folder / "vae", safe_serialization=True)
+    scheduler: Any = DDPMScheduler.from_config(base_model.scheduler_config)
+    base_model.vae.save_pretrained(folder / "vae", safe_serialization=True)
     scheduler.save_pretrained(folder / "scheduler")
-    prior.tokenizer.save_pretrained(folder / "tokenizer")
+    base_model.tokenizer.save_pretrained(folder / "tokenizer")
     index: dict[str, Any] = {
-        "_class_name": "StableDiffusionPipeline" if prior.controlnet is None else "StableDiffusionControlNetPipeline",
+        "_class_name": "StableDiffusionPipeline"
+        if base_model.controlnet is None
+        else "StableDiffusionControlNetPipeline",
         "scheduler": ["diffusers", type(scheduler).__name__],
         "tokenizer": ["transformers", "CLIPTokenizer"],
-        "vae": [_library(prior.vae), type(prior.vae).__name__],
+        "vae": [_library(base_model.vae), type(base_model.vae).__name__],
         "safety_checker": [None, None],
         "feature_extractor": [None, None],
         "requires_safety_checker": False,
     }
     for name in ("text_encoder", "unet", "controlnet"):
-        model = getattr(prior, name)
+        model = getattr(base_model, name)
         if model is None:
             continue
         index[name] = [_library(model), type(model).__name__]
@@ -170,24 +173,24 @@ def _library(model: Any) -> str:
     return top if top in ("diffusers", "transformers") else module
 
 
-def encode_prompts(prior: Prior, prompts: list[str]) -> torch.Tensor:
+def encode_prompts(base_model: PretrainedModel, prompts: list[str]) -> torch.Tensor:
     """Prompt embeddings [N, L, D]; L is the length every prompt is padded or cut to. A cut prompt is logged."""
-    limit = prior.tokenizer.model_max_length
-    tokens = prior.tokenizer(
+    limit = base_model.tokenizer.model_max_length
+    tokens = base_model.tokenizer(
         prompts, padding="max_length", max_length=limit, truncation=True, return_tensors="pt", verbose=False
     )
     for row in tokens.attention_mask.all(dim=1).nonzero().flatten().tolist():  # no padding: perhaps it did not fit
-        length = len(prior.tokenizer(prompts[row], verbose=False).input_ids)
+        length = len(base_model.tokenizer(prompts[row], verbose=False).input_ids)
         if length > limit:
             logger.warning("prompt of %d tokens is cut to %d, its end is not heeded: %r", length, limit, prompts[row])
     with torch.no_grad():
-        device = prior.text_encoder.device
-        parts = [prior.text_encoder(ids.to(device))[0] for ids in tokens.input_ids.split(PROMPT_BATCH)]
+        device = base_model.text_encoder.device
+        parts = [base_model.text_encoder(ids.to(device))[0] for ids in tokens.input_ids.split(PROMPT_BATCH)]
     return torch.cat(parts)
 
 
 @torch.no_grad()
-def decode_latents(prior: Prior, latents: torch.Tensor) -> torch.Tensor:
+def decode_latents(base_model: PretrainedModel, latents: torch.Tensor) -> torch.Tensor:
     """Images [B, 3, H, W] float32 of scaled latents [B, C, h, w], not clipped.
 
     Autoencoders of Stable Diffusion can overflow in half precision. Images that are not finite are decoded again in
@@ -196,8 +199,8 @@ def decode_latents(prior: Prior, latents: torch.Tensor) -> torch.Tensor:
     Raises:
         DataError: they are not finite in single precision either.
     """
-    vae = prior.vae
-    latents, dtype = latents.float() / prior.scaling_factor, vae.dtype
+    vae = base_model.vae
+    latents, dtype = latents.float() / base_model.scaling_factor, vae.dtype
     images = vae.decode(latents.to(dtype)).sample.float()
     broken = [row for row, image in enumerate(images) if not bool(torch.isfinite(image).all())]
     if broken and dtype != torch.float32:

@@ -12,14 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ctlev_core.diffusion.pretrained.components import PriorPart
+from ctlev_core.diffusion.pretrained.components import ModelPart
 from ctlev_core.safe_files.tensor_files import FLOATS, StoredTensor, read_items
 from data_contracts.errors import DataError
 
 _UNUSED = (".position_ids", "position_ids")
 
 
-def build_model(part: PriorPart, dtype: torch.dtype) -> Any:
+def build_model(part: ModelPart, dtype: torch.dtype) -> Any:
     """The network of a part, in evaluation mode, on the CPU.
 
     Args:
@@ -49,7 +49,7 @@ def build_model(part: PriorPart, dtype: torch.dtype) -> Any:
     return model.eval().requires_grad_(False)
 
 
-def _make_model(part: PriorPart) -> Any:
+def _make_model(part: ModelPart) -> Any:
     from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
     from diffusers.models.controlnets.controlnet import ControlNetModel
     from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
@@ -68,7 +68,7 @@ def _make_model(part: PriorPart) -> Any:
     return classes[part.name].from_config(part.config)
 
 
-def _match_names(part: PriorPart, expected: Mapping[str, Tensor]) -> dict[str, StoredTensor]:
+def _match_names(part: ModelPart, expected: Mapping[str, Tensor]) -> dict[str, StoredTensor]:
     """The stored tensors by the names of this version of the libraries; the same set as the network's."""
     stored = {name: tensor for name, tensor in part.tensors.items() if not name.endswith(_UNUSED)}
     if part.name == "text_encoder":  # transformers gave up the prefix in 5.6

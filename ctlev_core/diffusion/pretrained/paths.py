@@ -6,26 +6,26 @@ import dataclasses
 from pathlib import Path
 
 from ctlev_core.diffusion.pretrained.checks import check_parts
-from ctlev_core.diffusion.pretrained.components import PriorFiles, PriorPart, read_json, read_part
+from ctlev_core.diffusion.pretrained.components import ModelFiles, ModelPart, read_json, read_part
 from ctlev_core.diffusion.pretrained.single_file import (
     ENDINGS,
     files_beside,
     is_single_file,
+    read_single_base_model,
     read_single_controlnet,
-    read_single_prior,
 )
 from ctlev_core.safe_files.tensor_files import check_finite
 from data_contracts.errors import DataError
 
-BUNDLED_PRIOR = Path(__file__).resolve().parents[2] / "priors" / "small"
+BUNDLED_BASE_MODEL = Path(__file__).resolve().parents[2] / "base_models" / "small"
 """Of people, and a little of things: what ControlNets steer."""
-BUNDLED_OBJECT_PRIOR = BUNDLED_PRIOR.with_name("small_objects")
+BUNDLED_OBJECT_MODEL = BUNDLED_BASE_MODEL.with_name("small_objects")
 """The same networks without ControlNet, taught the names of things: for the text route."""
 COMPONENTS = ("tokenizer", "text_encoder", "vae", "unet", "scheduler")
 
 
-def read_prior_files(path: Path, *, controlnet: Path | None = None, with_controlnet: bool = True) -> PriorFiles:
-    """Configs and tensor tables of a prior, checked: all there, of one architecture, without NaN.
+def read_base_model_files(path: Path, *, controlnet: Path | None = None, with_controlnet: bool = True) -> ModelFiles:
+    """Configs and tensor tables of a base model, checked: all there, of one architecture, without NaN.
 
     Args:
         path: a diffusers folder with the subfolders of `COMPONENTS` and perhaps `controlnet`, or a Stable Diffusion v1
@@ -37,10 +37,10 @@ def read_prior_files(path: Path, *, controlnet: Path | None = None, with_control
     """
     if not path.exists():
         raise DataError(
-            f"{path}: the prior must be a diffusers folder, or a checkpoint in one file ({', '.join(ENDINGS)}), "
+            f"{path}: the base model must be a diffusers folder, or a checkpoint in one file ({', '.join(ENDINGS)}), "
             "but there is no such folder or file"
         )
-    files = read_single_prior(path) if is_single_file(path) else _read_folder(path)
+    files = read_single_base_model(path) if is_single_file(path) else _read_folder(path)
     parts = dict(files.parts)
     control = find_controlnet(path, controlnet) if with_controlnet else None
     if control is not None:
@@ -54,35 +54,40 @@ def read_prior_files(path: Path, *, controlnet: Path | None = None, with_control
     return files
 
 
-def check_prior_folder(folder: Path, *, controlnet: Path | None = None, needs_controlnet: bool = False) -> Path:
-    """Raise unless there is a prior whose weights can be read; see `read_prior_files`.
+def check_base_model_folder(folder: Path, *, controlnet: Path | None = None, needs_controlnet: bool = False) -> Path:
+    """Raise unless there is a base model whose weights can be read; see `read_base_model_files`.
 
     Args:
         folder: or a single file.
         controlnet: as for `find_controlnet`.
-        needs_controlnet: raise where the prior has none and none is given; where neither this is asked for nor a
-            ControlNet, the prior's own is not looked at.
+        needs_controlnet: raise where the base model has none and none is given; where neither this is asked for nor a
+            ControlNet, the base model's own is not looked at.
     Returns:
         The folder or file.
     Raises:
         DataError: what is missing or does not fit, and where it was looked for.
     """
     wanted = needs_controlnet or controlnet is not None
-    files = read_prior_files(folder, controlnet=controlnet, with_controlnet=wanted)
+    files = read_base_model_files(folder, controlnet=controlnet, with_controlnet=wanted)
     if needs_controlnet and "controlnet" not in files.parts:
         raise DataError(f"{folder}: no subfolder 'controlnet', and no separate ControlNet folder or file was given")
     return folder
 
 
-def prior_places(prior: Path | None, *, controlnet: Path | None = None, needs_controlnet: bool = False) -> list[Path]:
-    """The folders and files that a prior consists of, after `check_prior_folder`: what a cache key must contain.
+def base_model_places(
+    base_model: Path | None, *, controlnet: Path | None = None, needs_controlnet: bool = False
+) -> list[Path]:
+    """The folders and files that a base model consists of, after `check_base_model_folder`: what a cache key must
+    contain.
 
     Args:
-        prior: None for the bundled one.
-        controlnet: as for `find_controlnet`; None also stands for the prior's own.
-        needs_controlnet: as for `check_prior_folder`.
+        base_model: None for the bundled one.
+        controlnet: as for `find_controlnet`; None also stands for the base model's own.
+        needs_controlnet: as for `check_base_model_folder`.
     """
-    path = check_prior_folder(prior or BUNDLED_PRIOR, controlnet=controlnet, needs_controlnet=needs_controlnet)
+    path = check_base_model_folder(
+        base_model or BUNDLED_BASE_MODEL, controlnet=controlnet, needs_controlnet=needs_controlnet
+    )
     chosen = [path] if controlnet is None else [path, find_controlnet(path, controlnet)]
     places = []
     for place in chosen:
@@ -92,12 +97,12 @@ def prior_places(prior: Path | None, *, controlnet: Path | None = None, needs_co
 
 
 def find_controlnet(folder: Path, controlnet: Path | None) -> Path | None:
-    """The ControlNet that is asked for, else the subfolder `controlnet` of the prior, else None.
+    """The ControlNet that is asked for, else the subfolder `controlnet` of the base model, else None.
 
     Args:
-        folder: the prior.
-        controlnet: name of a subfolder of the prior, such as `controlnet_normals`, or a diffusers folder or single file
-            elsewhere.
+        folder: the base model.
+        controlnet: name of a subfolder of the base model, such as `controlnet_normals`, or a diffusers folder or single
+            file elsewhere.
     Raises:
         DataError: there is no such folder or file.
     """
@@ -111,16 +116,16 @@ def find_controlnet(folder: Path, controlnet: Path | None) -> Path | None:
     inside = ", ".join(sorted(path.name for path in folder.glob("controlnet*"))) if folder.is_dir() else ""
     raise DataError(
         f"{controlnet}: the ControlNet must be a diffusers folder or a checkpoint in one file, but there is no such "
-        f"folder; those of the prior: {inside or 'none'}"
+        f"folder; those of the base model: {inside or 'none'}"
     )
 
 
-def read_controlnet(path: Path) -> PriorPart:
+def read_controlnet(path: Path) -> ModelPart:
     """Config and tensor table of a ControlNet's folder or file."""
     return read_single_controlnet(path) if path.is_file() else read_part("controlnet", path)
 
 
-def _read_folder(folder: Path) -> PriorFiles:
+def _read_folder(folder: Path) -> ModelFiles:
     missing = [name for name in COMPONENTS if not (folder / name).is_dir()]
     if missing:
         found = sorted(path.name for path in folder.iterdir() if path.is_dir())
@@ -136,4 +141,4 @@ def _read_folder(folder: Path) -> PriorFiles:
         raise DataError(f"{folder}: expected Stable Diffusion v1, got Stable Diffusion XL (it has text_encoder_2)")
     parts = {name: read_part(name, folder / name) for name in ("text_encoder", "vae", "unet")}
     schedule = read_json(folder / "scheduler" / "scheduler_config.json")
-    return PriorFiles(folder, parts, folder / "tokenizer", schedule)
+    return ModelFiles(folder, parts, folder / "tokenizer", schedule)

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from ctlev_core.diffusion.pretrained.components import PriorFiles, PriorPart, read_json
+from ctlev_core.diffusion.pretrained.components import ModelFiles, ModelPart, read_json
 from ctlev_core.safe_files.tensor_files import StoredTensor, read_tensor_table
 from data_contracts.errors import DataError
 
@@ -150,7 +150,7 @@ def files_beside(path: Path) -> list[Path]:
     return [place for place in (path.with_suffix(".json"), path.with_name("tokenizer")) if place.exists()]
 
 
-def read_single_prior(path: Path) -> PriorFiles:
+def read_single_base_model(path: Path) -> ModelFiles:
     """Stable Diffusion v1 in one file.
 
     Raises:
@@ -182,10 +182,10 @@ def read_single_prior(path: Path) -> PriorFiles:
     }
     if f"{CONTROL}input_hint_block.0.weight" in tensors:
         parts["controlnet"] = _controlnet_part(path, configs, tensors, CONTROL)
-    return PriorFiles(path, parts, tokenizer, configs["scheduler"])
+    return ModelFiles(path, parts, tokenizer, configs["scheduler"])
 
 
-def read_single_controlnet(path: Path) -> PriorPart:
+def read_single_controlnet(path: Path) -> ModelPart:
     """A ControlNet for Stable Diffusion v1 in one file, with or without Stable Diffusion beside it.
 
     Raises:
@@ -204,12 +204,12 @@ def read_single_controlnet(path: Path) -> PriorPart:
     )
 
 
-def _unet_part(path: Path, configs: dict[str, Any], tensors: dict[str, StoredTensor]) -> PriorPart:
+def _unet_part(path: Path, configs: dict[str, Any], tensors: dict[str, StoredTensor]) -> ModelPart:
     layers = configs["unet"]["layers_per_block"]
     return _part(path, "unet", configs, tensors, UNET, lambda name: translate_unet(name, layers))
 
 
-def _vae_part(path: Path, configs: dict[str, Any], tensors: dict[str, StoredTensor]) -> PriorPart:
+def _vae_part(path: Path, configs: dict[str, Any], tensors: dict[str, StoredTensor]) -> ModelPart:
     levels = len(configs["vae"]["block_out_channels"])
     part = _part(path, "vae", configs, tensors, VAE, lambda name: translate_vae(name, levels))
     # Attention was written as convolutions of one pixel; diffusers has the same weights as matrices.
@@ -221,7 +221,7 @@ def _vae_part(path: Path, configs: dict[str, Any], tensors: dict[str, StoredTens
     return dataclasses.replace(part, tensors={**part.tensors, **matrices})
 
 
-def _controlnet_part(path: Path, configs: dict[str, Any], tensors: dict[str, StoredTensor], prefix: str) -> PriorPart:
+def _controlnet_part(path: Path, configs: dict[str, Any], tensors: dict[str, StoredTensor], prefix: str) -> ModelPart:
     config = configs["controlnet"]
     layers, stages = config["layers_per_block"], len(config["conditioning_embedding_out_channels"])
     return _part(path, "controlnet", configs, tensors, prefix, lambda name: translate_controlnet(name, layers, stages))
@@ -234,7 +234,7 @@ def _part(
     tensors: dict[str, StoredTensor],
     prefix: str,
     translate: Callable[[str], str | None],
-) -> PriorPart:
+) -> ModelPart:
     """The tensors under a prefix by their diffusers names; those of unknown names keep them, and are refused later."""
     found = {}
     for name, tensor in tensors.items():
@@ -242,7 +242,7 @@ def _part(
             new = translate(name.removeprefix(prefix))
             if new is not None or part != "text_encoder":
                 found[new or name] = tensor
-    return PriorPart(part, path, configs[part], found)
+    return ModelPart(part, path, configs[part], found)
 
 
 def _read_configs(path: Path) -> dict[str, Any]:

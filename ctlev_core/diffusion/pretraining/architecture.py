@@ -1,4 +1,4 @@
-"""The architecture of the bundled small prior: Stable Diffusion's parts, three hundred times smaller.
+"""The architecture of the bundled small base model: Stable Diffusion's parts, three hundred times smaller.
 
 Sizes were chosen on a two-core machine, by the time of a training step (ms an image, one core): widths (64, 96, 128)
 with attention at the two lower resolutions 26, at the lowest alone 20; widths (64, 64, 96) 16; (48, 64, 96) 12, but 48
@@ -19,7 +19,7 @@ from typing import Any, Literal
 import torch
 
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
-from ctlev_core.diffusion.pretrained.loading import Prior
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel
 
 IMAGE_SIZE = 64
 WIDTHS = (64, 64, 96)
@@ -127,7 +127,7 @@ def train_tokenizer(corpus: Sequence[str], folder: Path) -> Any:
     return CLIPTokenizer.from_pretrained(str(folder))
 
 
-def build_prior(
+def build_base_model(
     corpus: Sequence[str],
     vae: PatchAutoencoder,
     *,
@@ -135,8 +135,8 @@ def build_prior(
     widths: tuple[int, ...] = WIDTHS,
     image_size: int = IMAGE_SIZE,
     prediction_type: PredictionType = "v_prediction",
-) -> Prior:
-    """A prior with random weights.
+) -> PretrainedModel:
+    """A base model with random weights.
 
     Args:
         corpus: captions the tokenizer is trained on.
@@ -192,7 +192,7 @@ def build_prior(
         )
         break_zeros(controlnet)
     scheduler_config = {**SCHEDULER_CONFIG, "prediction_type": prediction_type}
-    return Prior(tokenizer, text_encoder, vae, unet, controlnet, scheduler_config, (image_size, image_size))
+    return PretrainedModel(tokenizer, text_encoder, vae, unet, controlnet, scheduler_config, (image_size, image_size))
 
 
 @torch.no_grad()

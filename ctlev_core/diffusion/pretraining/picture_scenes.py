@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctlev_core.diffusion.pretraining.picture_styles import Diet, Scene, apply_style
+from ctlev_core.diffusion.pretraining.picture_styles import DataMixture, Scene, apply_style
 from ctlev_core.pictures import labelled_pictures
 from ctlev_core.pictures.labelled_pictures import LabelledPictures, PictureOptions
 
 
-def picture_diet(options: PictureOptions) -> Diet:
+def picture_mixture(options: PictureOptions) -> DataMixture:
     """The styles and captions of the user's pictures."""
-    return Diet(styles=options.styles, bare_caption_share=options.bare_caption_share)
+    return DataMixture(styles=options.styles, bare_caption_share=options.bare_caption_share)
 
 
 def scene_of(
@@ -39,14 +39,14 @@ class Rehearsal:
         """
         self._options, self._size = options, size
         self._pictures = labelled_pictures.open_pictures(options)
-        self._diet = picture_diet(options)
+        self._mixture = picture_mixture(options)
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, list[str]]:
         """Random pictures [count, S, S, 3] uint8 and their captions."""
         images, captions = [], []
         for row in rng.integers(len(self._pictures), size=count).tolist():
             scene = scene_of(self._pictures, row, self._options, self._size, rng)
-            image, caption = apply_style(scene, rng, self._diet)
+            image, caption = apply_style(scene, rng, self._mixture)
             images.append(image)
             captions.append(caption)
         return np.stack(images), captions

@@ -36,7 +36,7 @@ STYLE_CAPTIONS = {
 }
 
 
-class Diet(Frozen):
+class DataMixture(Frozen):
     """What the pictures are of, in shares."""
 
     people_share: float = Field(default=0.5, ge=0, le=1, description="people among scenes; the others are things")
@@ -57,7 +57,7 @@ class Diet(Frozen):
     )
 
 
-DEFAULT_DIET = Diet()
+DEFAULT_MIXTURE = DataMixture()
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +77,15 @@ class Scene:
     coloured: str = ""
 
 
-def apply_style(scene: Scene, rng: np.random.Generator, diet: Diet = DEFAULT_DIET) -> tuple[np.ndarray, str]:
+def apply_style(
+    scene: Scene, rng: np.random.Generator, data_mixture: DataMixture = DEFAULT_MIXTURE
+) -> tuple[np.ndarray, str]:
     """A random style for a scene.
 
     Returns:
         The picture [S, S, 3] uint8 and its caption.
     """
-    style = str(rng.choice(list(diet.styles), p=list(diet.styles.values())))
+    style = str(rng.choice(list(data_mixture.styles), p=list(data_mixture.styles.values())))
     image = scene.image.astype(np.float32)
     if style == "grey" or style == "lines":
         image = np.repeat(image @ np.array([[0.299], [0.587], [0.114]], np.float32), 3, axis=2)
@@ -94,7 +96,7 @@ def apply_style(scene: Scene, rng: np.random.Generator, diet: Diet = DEFAULT_DIE
     if rng.random() < GRAIN_SHARE:  # of film
         image = image + rng.normal(0, rng.uniform(3, 14), image.shape[:2])[..., None]
     picture = np.clip(image, 0, 255).round().astype(np.uint8)
-    return picture, _caption(scene, style, rng, diet)
+    return picture, _caption(scene, style, rng, data_mixture)
 
 
 def _outlines(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -137,7 +139,7 @@ def _shifted(grey: np.ndarray, place: np.ndarray, border: float) -> np.ndarray:
     )
 
 
-def _caption(scene: Scene, style: str, rng: np.random.Generator, diet: Diet) -> str:
+def _caption(scene: Scene, style: str, rng: np.random.Generator, data_mixture: DataMixture) -> str:
     if scene.condition is not None:
         caption = str(rng.choice(PERSON_CAPTIONS))
     else:
@@ -148,11 +150,17 @@ def _caption(scene: Scene, style: str, rng: np.random.Generator, diet: Diet) -> 
         subject = caption.removeprefix("a photo of ").removeprefix("a picture of ")
         caption = STYLE_CAPTIONS[style].format(subject)
     if style == "motion":  # never called a photo: event images come nearest to it, and are called something else again
-        return _renamed(STYLE_CAPTIONS[style].format(scene.plain), scene.plain.split(), diet.other_names_share, rng)
+        return _renamed(
+            STYLE_CAPTIONS[style].format(scene.plain), scene.plain.split(), data_mixture.other_names_share, rng
+        )
     # Asked only where it matters, so that other diets draw the same random numbers.
-    if scene.condition is None and diet.bare_caption_share > 0 and rng.random() < diet.bare_caption_share:
+    if (
+        scene.condition is None
+        and data_mixture.bare_caption_share > 0
+        and rng.random() < data_mixture.bare_caption_share
+    ):
         caption = OBJECT_CAPTIONS[0].format(plain=scene.plain)
-    return _renamed(caption, scene.plain.split(), diet.other_names_share, rng)
+    return _renamed(caption, scene.plain.split(), data_mixture.other_names_share, rng)
 
 
 def _renamed(caption: str, nouns: Sequence[str], share: float, rng: np.random.Generator) -> str:

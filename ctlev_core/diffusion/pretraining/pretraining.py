@@ -1,4 +1,4 @@
-"""Pre-train the small prior on procedural or on a user's own pictures, and write it as a diffusers folder."""
+"""Pre-train the small base model on procedural or on a user's own pictures, and write it as a diffusers folder."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from pydantic import Field, model_validator
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, validation_losses
 from ctlev_core.diffusion.patch_autoencoder import PATCH_PX, PatchAutoencoder, fit_patch_autoencoder
 from ctlev_core.diffusion.pretrained.loading import (
-    Prior,
+    PretrainedModel,
     conditions_to_tensor,
     encode_prompts,
     images_to_tensor,
-    load_prior,
-    save_prior,
+    load_base_model,
+    save_base_model,
 )
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
 from ctlev_core.diffusion.pretraining import procedural_images
-from ctlev_core.diffusion.pretraining.architecture import IMAGE_SIZE, WIDTHS, PredictionType, build_prior
-from ctlev_core.diffusion.pretraining.picture_scenes import picture_diet, scene_of
-from ctlev_core.diffusion.pretraining.picture_styles import DEFAULT_DIET, Diet, Scene, apply_style
-from ctlev_core.diffusion.training.distributed import ALONE, Ranks
+from ctlev_core.diffusion.pretraining.architecture import IMAGE_SIZE, WIDTHS, PredictionType, build_base_model
+from ctlev_core.diffusion.pretraining.picture_scenes import picture_mixture, scene_of
+from ctlev_core.diffusion.pretraining.picture_styles import DEFAULT_MIXTURE, DataMixture, Scene, apply_style
+from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
 from ctlev_core.diffusion.training.loop import run_training, sample_rows
 from ctlev_core.diffusion.training.options import TrainingOptions
@@ -55,7 +55,7 @@ logger = logging.getLogger(__name__)
 
 
 class PretrainingOptions(Frozen):
-    """How the small prior is made."""
+    """How the small base model is made."""
 
     training: TrainingOptions = Field(
         default=TrainingOptions(
@@ -72,8 +72,8 @@ class PretrainingOptions(Frozen):
     max_seconds: float | None = Field(
         default=None, gt=0, description="wall-clock budget; null = all steps, and only then is a run repeatable"
     )
-    block_scenes: int = Field(default=768, gt=0, description="scenes drawn at a time by the worker process")
-    block_passes: int = Field(
+    chunk_scenes: int = Field(default=768, gt=0, description="scenes drawn at a time by the worker process")
+    chunk_passes: int = Field(
         default=3, gt=0, description="how often each scene is shown, every time in a random style"
     )
     text_dropout: float = Field(default=0.1, ge=0, le=1, description="share of empty prompts, for guidance")
@@ -85,8 +85,8 @@ class PretrainingOptions(Frozen):
         description="U-Net and ControlNet together, a ControlNet for the U-Net of `start` alone, or a U-Net without "
         "ControlNet",
     )
-    diet: Diet = Field(
-        default=DEFAULT_DIET,
+    data_mixture: DataMixture = Field(
+        default=DEFAULT_MIXTURE,
         description="what procedural pictures are of",
     )
     pictures: PictureOptions = Field(
@@ -107,8 +107,8 @@ class PretrainingOptions(Frozen):
     start: Path | None = Field(
         default=None,
         json_schema_extra=RUN_SETTING,
-        description="diffusers folder of a small prior to go on from; when null random weights, or the bundled prior "
-        "where the ControlNet alone is tuned",
+        description="diffusers folder of a small base model to go on from; when null random weights, or the bundled "
+        "base model where the ControlNet alone is tuned",
     )
     seed: int = Field(default=0, ge=0, description="of weights, pictures, order and noise")
     workers: int = Field(
@@ -127,7 +127,7 @@ class PretrainingOptions(Frozen):
             raise ValueError("max_seconds must be null with several processes, which would not end together")
         if self.pictures.root is not None and self.tune != "unet":
             raise ValueError(f"pictures of one's own have no condition images; set tune=unet, got {self.tune!r}")
-        Ranks(0, self.num_processes).batches(self.training.gradient_accumulation)
+        DistributedContext(0, self.num_processes).batches(self.training.gradient_accumulation)
         return self
 
 
@@ -141,17 +141,17 @@ class Row:
 
 
 class ImageStream:
-    """Micro-batches of the procedural stream; the blocks ahead are drawn in worker processes meanwhile."""
+    """Micro-batches of the procedural stream; the chunks ahead are drawn in worker processes meanwhile."""
 
-    def __init__(self, prior: Prior, options: PretrainingOptions) -> None:
-        self._prior, self._options = prior, options
-        self._batches_per_block = options.block_scenes * options.block_passes // options.training.batch_size
+    def __init__(self, base_model: PretrainedModel, options: PretrainingOptions) -> None:
+        self._base_model, self._options = base_model, options
+        self._batches_per_chunk = options.chunk_scenes * options.chunk_passes // options.training.batch_size
         # Spawned, not forked: forking a process that runs torch threads can hang.
         self._pool = (
             ProcessPoolExecutor(options.workers, get_context("spawn"), die_with_parent) if options.workers else None
         )
         self._ahead: dict[int, Future] = {}
-        self._block: tuple[int, list[Scene]] = (-1, [])
+        self._chunk: tuple[int, list[Scene]] = (-1, [])
 
     def close(self) -> None:
         """Stop drawing."""
@@ -161,51 +161,51 @@ class ImageStream:
     def fetch(self, number: int) -> Batch:
         """Batch `number`: people with a condition first, then everything that goes through the U-Net alone."""
         options = self._options
-        block, position = divmod(number, self._batches_per_block)
-        scenes = self._scenes(block)
+        chunk, position = divmod(number, self._batches_per_chunk)
+        scenes = self._scenes(chunk)
         size = options.training.batch_size
-        rows = sample_rows(options.seed + 1000 * (block + 1), position, size, len(scenes))
+        rows = sample_rows(options.seed + 1000 * (chunk + 1), position, size, len(scenes))
         rng = np.random.default_rng([options.seed, STYLE_STREAM, number])
         batch = []
         for row in rows:
-            image, caption = apply_style(scenes[row], rng, diet_of(options))
+            image, caption = apply_style(scenes[row], rng, mixture_of(options))
             condition = scenes[row].condition
             steered = condition is not None and rng.random() >= options.condition_dropout
             caption = "" if rng.random() < options.text_dropout else caption
             batch.append(Row(image, caption, condition if steered else None))
-        return make_batch(self._prior, batch)
+        return make_batch(self._base_model, batch)
 
-    def _scenes(self, block: int) -> list[Scene]:
-        if self._block[0] != block:
+    def _scenes(self, chunk: int) -> list[Scene]:
+        if self._chunk[0] != chunk:
             options = self._options
             if self._pool is None:
-                self._block = (block, draw_block(options, block))
+                self._chunk = (chunk, draw_chunk(options, chunk))
             else:
-                for ahead in range(block, block + 1 + options.workers):
+                for ahead in range(chunk, chunk + 1 + options.workers):
                     if ahead not in self._ahead:
-                        self._ahead[ahead] = self._pool.submit(draw_block, options, ahead)
-                self._block = (block, self._ahead.pop(block).result())
-        return self._block[1]
+                        self._ahead[ahead] = self._pool.submit(draw_chunk, options, ahead)
+                self._chunk = (chunk, self._ahead.pop(chunk).result())
+        return self._chunk[1]
 
 
-def draw_block(options: PretrainingOptions, block: int) -> list[Scene]:
-    """The scenes of a block: procedural ones, or pictures of the user's, each moved about anew."""
+def draw_chunk(options: PretrainingOptions, chunk: int) -> list[Scene]:
+    """The scenes of a chunk: procedural ones, or pictures of the user's, each moved about anew."""
     if options.pictures.root is None:
-        return procedural_images.draw_block(
-            options.seed, block, options.block_scenes, options.image_size, options.condition, options.diet
+        return procedural_images.draw_chunk(
+            options.seed, chunk, options.chunk_scenes, options.image_size, options.condition, options.data_mixture
         )
     pictures = labelled_pictures.open_pictures(options.pictures)
     learnt, _ = split_pictures(len(pictures), options.seed)
-    rows = learnt[sample_rows(options.seed, block, options.block_scenes, len(learnt))]
-    first = block * options.block_scenes
+    rows = learnt[sample_rows(options.seed, chunk, options.chunk_scenes, len(learnt))]
+    first = chunk * options.chunk_scenes
     streams = [np.random.default_rng([options.seed, PICTURE_STREAM, first + number]) for number in range(len(rows))]
     wanted = options.pictures, options.image_size
     return [scene_of(pictures, int(row), *wanted, rng) for row, rng in zip(rows, streams, strict=True)]
 
 
-def diet_of(options: PretrainingOptions) -> Diet:
+def mixture_of(options: PretrainingOptions) -> DataMixture:
     """Styles and captions: those of the user's pictures where there are any."""
-    return options.diet if options.pictures.root is None else picture_diet(options.pictures)
+    return options.data_mixture if options.pictures.root is None else picture_mixture(options.pictures)
 
 
 def split_pictures(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -215,13 +215,13 @@ def split_pictures(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return order[held_back:], order[:held_back]
 
 
-def make_batch(prior: Prior, rows: list[Row]) -> Batch:
+def make_batch(base_model: PretrainedModel, rows: list[Row]) -> Batch:
     """Latents, prompt embeddings and conditions, rows with a condition first."""
     rows = sorted(rows, key=lambda row: row.condition is None)
     images = images_to_tensor(np.stack([row.image for row in rows]))
     with torch.no_grad():
-        latents = prior.vae.encode(images)[0].mode() * prior.scaling_factor
-    embeddings = encode_prompts(prior, [row.caption for row in rows])
+        latents = base_model.vae.encode(images)[0].mode() * base_model.scaling_factor
+    embeddings = encode_prompts(base_model, [row.caption for row in rows])
     conditions = [row.condition for row in rows if row.condition is not None]
     return Batch(latents, embeddings, conditions_to_tensor(np.stack(conditions)) if conditions else None)
 
@@ -233,7 +233,7 @@ def draw_picture_rows(options: PretrainingOptions) -> list[Row]:
     for number, row in enumerate(split_pictures(len(pictures), options.seed)[1]):
         rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + number])
         scene = scene_of(pictures, int(row), options.pictures, options.image_size, rng)
-        image, caption = apply_style(scene, rng, diet_of(options))
+        image, caption = apply_style(scene, rng, mixture_of(options))
         rows.append(Row(image, caption, None))
     return rows
 
@@ -244,34 +244,34 @@ def draw_validation_rows(options: PretrainingOptions, draw: DrawScene) -> list[R
     for index in range(VALIDATION_IMAGES):
         rng = np.random.default_rng([options.seed, VALIDATION_STREAM, VALIDATION_OFFSET + index])
         scene = draw(rng, options.image_size)
-        image, caption = apply_style(scene, rng, options.diet)
+        image, caption = apply_style(scene, rng, options.data_mixture)
         rows.append(Row(image, caption, scene.condition))
     return rows
 
 
 def start_folder(options: PretrainingOptions) -> Path | None:
-    """The prior that training goes on from; None = random weights."""
-    return options.start or (BUNDLED_PRIOR if options.tune == "controlnet" else None)
+    """The base model that training goes on from; None = random weights."""
+    return options.start or (BUNDLED_BASE_MODEL if options.tune == "controlnet" else None)
 
 
-def new_prior(options: PretrainingOptions) -> Prior:
-    """The prior before training: fitted patch code, trained tokenizer and random networks, or those of `start`."""
+def new_base_model(options: PretrainingOptions) -> PretrainedModel:
+    """The base model before training: fitted patch code, trained tokenizer and random networks, or those of `start`."""
     start = start_folder(options)
     if start is not None:
-        return load_prior(start, with_controlnet=options.tune != "unet")
+        return load_base_model(start, with_controlnet=options.tune != "unet")
     rng = np.random.default_rng([options.seed, STYLE_STREAM])
     corpus = procedural_images.caption_corpus()
     if options.pictures.root is None:
-        scenes = procedural_images.draw_block(options.seed, 0, FIT_IMAGES, options.image_size)
+        scenes = procedural_images.draw_chunk(options.seed, 0, FIT_IMAGES, options.image_size)
         images = np.stack([apply_style(scene, rng)[0] for scene in scenes])
     else:
-        scenes = draw_block(options.model_copy(update={"block_scenes": FIT_IMAGES}), 0)
-        images = np.stack([apply_style(scene, rng, diet_of(options))[0] for scene in scenes])
+        scenes = draw_chunk(options.model_copy(update={"chunk_scenes": FIT_IMAGES}), 0)
+        images = np.stack([apply_style(scene, rng, mixture_of(options))[0] for scene in scenes])
         classes = labelled_pictures.open_pictures(options.pictures).classes
         # Often enough that every name becomes a word of its own.
         corpus = corpus + 40 * [name.replace("_", " ") for name in classes] + 40 * _synonyms(options)
     vae: PatchAutoencoder = fit_patch_autoencoder(images_to_tensor(images), options.patch_px)
-    prior = build_prior(
+    base_model = build_base_model(
         corpus,
         vae,
         seed=options.seed,
@@ -279,23 +279,27 @@ def new_prior(options: PretrainingOptions) -> Prior:
         image_size=options.image_size,
         prediction_type=options.prediction_type,
     )
-    return dataclasses.replace(prior, controlnet=None) if options.tune == "unet" else prior
+    return dataclasses.replace(base_model, controlnet=None) if options.tune == "unet" else base_model
 
 
 def _synonyms(options: PretrainingOptions) -> list[str]:
     return [name for names in options.pictures.synonyms.values() for name in names]
 
 
-def prepare(options: PretrainingOptions) -> tuple[Prior, Trainer]:
-    """The untrained prior and the trainer of what learns; patch code and text encoder stay as they are."""
-    prior = new_prior(options)
-    learning = {"both": (prior.unet, prior.controlnet), "controlnet": (prior.controlnet,), "unet": (prior.unet,)}
+def prepare(options: PretrainingOptions) -> tuple[PretrainedModel, Trainer]:
+    """The untrained base model and the trainer of what learns; patch code and text encoder stay as they are."""
+    base_model = new_base_model(options)
+    learning = {
+        "both": (base_model.unet, base_model.controlnet),
+        "controlnet": (base_model.controlnet,),
+        "unet": (base_model.unet,),
+    }
     parameters = []
     for model in learning[options.tune]:
         if model is not None:
             parameters += list(model.train().requires_grad_(True).parameters())
     identity = hashlib.sha256(json.dumps(cache_material(options), sort_keys=True).encode()).hexdigest()
-    return prior, Trainer(parameters, options.training, identity, options.optimizer)
+    return base_model, Trainer(parameters, options.training, identity, options.optimizer)
 
 
 def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
@@ -308,31 +312,31 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
     Returns:
         Loss curves; the validation losses are of people with their own and with somebody else's condition, or, where
         no ControlNet learns, of objects with their own and with another's caption. Both pairs are logged: both gaps
-        must grow, or the prior does not heed what it is asked for.
+        must grow, or the base model does not heed what it is asked for.
     Raises:
         TrainingError: the loss stayed not finite, or one of several processes failed.
     """
     if options.num_processes == 1:
-        return _pretrain(options, out, work, ALONE)
+        return _pretrain(options, out, work, SINGLE_PROCESS)
     job = {"device": "cpu", "options": options.model_dump(mode="json"), "out": str(out), "work": str(work)}
     return train_in_processes(options.num_processes, __name__, work / "job", job)
 
 
-def _pretrain(options: PretrainingOptions, out: Path, work: Path, ranks: Ranks) -> TrainingHistory:
-    prior, trainer = prepare(options)
-    denoiser = Denoiser(prior.unet, prior.controlnet)
-    schedule = NoiseSchedule(prior.scheduler_config)
+def _pretrain(options: PretrainingOptions, out: Path, work: Path, distributed: DistributedContext) -> TrainingHistory:
+    base_model, trainer = prepare(options)
+    denoiser = Denoiser(base_model.unet, base_model.controlnet)
+    schedule = NoiseSchedule(base_model.scheduler_config)
     if options.pictures.root is None:
-        draw_thing = partial(procedural_images.draw_thing, diet=options.diet)
+        draw_thing = partial(procedural_images.draw_thing, data_mixture=options.data_mixture)
         captioned = draw_validation_rows(options, draw_thing)
     else:
         captioned = draw_picture_rows(options)
-    validation = {"own caption": make_batch(prior, captioned)}
-    if prior.controlnet is not None:
+    validation = {"own caption": make_batch(base_model, captioned)}
+    if base_model.controlnet is not None:
         draw_person = partial(procedural_images.draw_person, condition=options.condition)
-        people = make_batch(prior, draw_validation_rows(options, draw_person))
+        people = make_batch(base_model, draw_validation_rows(options, draw_person))
         validation = {"own condition": people, **validation}
-    stream = ImageStream(prior, options)
+    stream = ImageStream(base_model, options)
 
     def validate() -> tuple[float, float]:
         losses = {
@@ -359,17 +363,19 @@ def _pretrain(options: PretrainingOptions, out: Path, work: Path, ranks: Ranks) 
             validate=validate,
             max_seconds=options.max_seconds or math.inf,
             description="pre-training",
-            ranks=ranks,
+            distributed=distributed,
         )
     finally:
         stream.close()
-    if ranks.rank == 0:
-        save_prior(prior, out, torch.float16)
+    if distributed.rank == 0:
+        save_base_model(base_model, out, torch.float16)
     return history
 
 
-def _pretrain_rank(job: dict[str, Any], folder: Path, ranks: Ranks, device: torch.device) -> TrainingHistory:
-    return _pretrain(PretrainingOptions(**job["options"]), Path(job["out"]), Path(job["work"]), ranks)
+def _pretrain_rank(
+    job: dict[str, Any], folder: Path, distributed: DistributedContext, device: torch.device
+) -> TrainingHistory:
+    return _pretrain(PretrainingOptions(**job["options"]), Path(job["out"]), Path(job["work"]), distributed)
 
 
 if __name__ == "__main__":

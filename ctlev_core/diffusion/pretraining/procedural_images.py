@@ -1,4 +1,4 @@
-"""The endless stream of captioned pictures the small prior is pre-trained on. Never events, never a data set.
+"""The endless stream of captioned pictures the small base model is pre-trained on. Never events, never a data set.
 
 Half of the pictures are people: colour renderings of the procedural body in random poses and in poses of the procedural
 motions that are not held out for tests, with what a ControlNet is steered by: the skeleton in the manner of OpenPose,
@@ -21,11 +21,11 @@ from ctlev_core.body.motion.procedural import SEEN, UNSEEN, pose_at, sample_styl
 from ctlev_core.body.rotations import matrix_from_euler
 from ctlev_core.conditions import normals
 from ctlev_core.diffusion.pretraining.picture_styles import (
-    DEFAULT_DIET,
+    DEFAULT_MIXTURE,
     OBJECT_CAPTIONS,
     PERSON_CAPTIONS,
     STYLE_CAPTIONS,
-    Diet,
+    DataMixture,
     Scene,
 )
 from ctlev_core.geometry.camera import is_inside, project
@@ -126,14 +126,14 @@ def draw_person(rng: np.random.Generator, size: int, condition: ConditionKind = 
     return Scene(image, draw_skeleton(joints2d, visible, "dhp19", (size, size)), "person")
 
 
-def draw_thing(rng: np.random.Generator, size: int, diet: Diet = DEFAULT_DIET) -> Scene:
+def draw_thing(rng: np.random.Generator, size: int, data_mixture: DataMixture = DEFAULT_MIXTURE) -> Scene:
     """An object, or two together, on a plain or stained background, without a condition."""
     background = sample_background(rng, (size, size), colour=True) ** (1 / 2.2) * 255
-    if rng.random() < diet.plain_share:
+    if rng.random() < data_mixture.plain_share:
         background[:] = rng.choice((8, 60, 200, 250)) if rng.random() < 0.5 else background.mean(axis=(0, 1))
     canvas = background.astype(np.uint8)
     first, second = (str(colour) for colour in rng.choice(list(COLOURS), 2))
-    if rng.random() < diet.composition_share:
+    if rng.random() < data_mixture.composition_share:
         composition = COMPOSITIONS[rng.integers(len(COMPOSITIONS))]
         image = draw_composition(composition, (first, second), canvas, rng)
         coloured = f"{first} {composition.first} {composition.relation} {second} {composition.second}"
@@ -143,11 +143,15 @@ def draw_thing(rng: np.random.Generator, size: int, diet: Diet = DEFAULT_DIET) -
 
 
 def draw_scene(
-    seed: int, index: int, size: int, condition: ConditionKind = "skeleton", diet: Diet = DEFAULT_DIET
+    seed: int, index: int, size: int, condition: ConditionKind = "skeleton", data_mixture: DataMixture = DEFAULT_MIXTURE
 ) -> Scene:
     """Scene `index` of the stream, a function of its arguments alone."""
     rng = np.random.default_rng([seed, index])
-    return draw_person(rng, size, condition) if rng.random() < diet.people_share else draw_thing(rng, size, diet)
+    return (
+        draw_person(rng, size, condition)
+        if rng.random() < data_mixture.people_share
+        else draw_thing(rng, size, data_mixture)
+    )
 
 
 def caption_corpus() -> list[str]:
@@ -162,14 +166,14 @@ def caption_corpus() -> list[str]:
     return 4 * (plain + styled) + 40 * [*RELATIONS, *EXTRA_WORDS.split()]
 
 
-def draw_block(
+def draw_chunk(
     seed: int,
-    block: int,
-    block_size: int,
+    chunk: int,
+    chunk_size: int,
     size: int,
     condition: ConditionKind = "skeleton",
-    diet: Diet = DEFAULT_DIET,
+    data_mixture: DataMixture = DEFAULT_MIXTURE,
 ) -> list[Scene]:
-    """Scenes block * block_size .. (block + 1) * block_size - 1; what a worker process makes at a time."""
-    indices = range(block * block_size, (block + 1) * block_size)
-    return [draw_scene(seed, index, size, condition, diet) for index in indices]
+    """Scenes chunk * chunk_size .. (chunk + 1) * chunk_size - 1; what a worker process makes at a time."""
+    indices = range(chunk * chunk_size, (chunk + 1) * chunk_size)
+    return [draw_scene(seed, index, size, condition, data_mixture) for index in indices]

@@ -10,23 +10,23 @@ from pydantic import Field, field_validator, model_validator
 
 from data_contracts.config import RUN_SETTING, Frozen
 
-Scheduler = Literal["unipc", "dpm++", "dpm++_3m", "dpm++_sde", "deis", "sa_solver", "ddim", "ddpm"]
-Spacing = Literal["karras", "lu", "even", "trailing"]
+Scheduler = Literal["unipc", "dpmpp_2m", "dpmpp_3m", "dpmpp_sde", "deis", "sa_solver", "ddim", "ddpm"]
+Spacing = Literal["karras", "lu", "linspace", "trailing"]
 
-_ANY: tuple[Spacing, ...] = ("karras", "lu", "even", "trailing")
+_ANY: tuple[Spacing, ...] = ("karras", "lu", "linspace", "trailing")
 SPACINGS: dict[str, tuple[Spacing, ...]] = {
     "unipc": _ANY,
-    "dpm++": _ANY,
-    "dpm++_3m": _ANY,
-    "dpm++_sde": _ANY,
+    "dpmpp_2m": _ANY,
+    "dpmpp_3m": _ANY,
+    "dpmpp_sde": _ANY,
     "deis": _ANY,
     "sa_solver": _ANY,
     "ddim": _ANY,
-    "ddpm": ("even", "trailing"),
+    "ddpm": ("linspace", "trailing"),
 }
 """The spacings each solver supports; the first is what it gets where none is asked for."""
 
-STOCHASTIC = ("ddpm", "dpm++_sde", "sa_solver")
+STOCHASTIC = ("ddpm", "dpmpp_sde", "sa_solver")
 """Solvers that draw noise at every step, from each image's own stream."""
 
 _DEVICE = re.compile(r"auto|all|(cpu|mps|cuda(:\d+)?)(,(cpu|mps|cuda(:\d+)?))*")
@@ -41,10 +41,10 @@ class SamplingOptions(Frozen):
     num_inference_steps: int = Field(
         default=20, gt=0, le=1000, description="evaluations of the network an image; paper: 1000"
     )
-    spacing: Spacing = Field(
+    timestep_spacing: Spacing = Field(
         default="karras",
         description="where the steps lie: karras = dense at little noise, lu = even in log signal-to-noise ratio, "
-        "even and trailing = even in time; ddpm has no karras and takes even where nothing is said",
+        "linspace and trailing = even in time; ddpm has no karras and takes linspace where nothing is said",
     )
     guidance_scale: float = Field(default=1.0, ge=1, description="classifier-free guidance; 1 = none, twice as fast")
     guidance_interval: tuple[float, float] = Field(
@@ -64,7 +64,7 @@ class SamplingOptions(Frozen):
         default="rgb",
         description="colours event images have: red_blue = no green, grey = channels averaged (no polarity)",
     )
-    dark_level: int = Field(
+    black_threshold: int = Field(
         default=20,
         ge=0,
         le=255,
@@ -94,14 +94,14 @@ class SamplingOptions(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _take_the_spacing_of_the_solver(cls, values: Any) -> Any:
-        if isinstance(values, dict) and "spacing" not in values:
+        if isinstance(values, dict) and "timestep_spacing" not in values:
             supported = SPACINGS.get(values.get("scheduler", ""), ("karras",))
-            return {**values, "spacing": supported[0]}
+            return {**values, "timestep_spacing": supported[0]}
         return values
 
     @model_validator(mode="after")
     def _check_spacing(self) -> Self:
-        check_spacing(self.scheduler, self.spacing)
+        check_spacing(self.scheduler, self.timestep_spacing)
         return self
 
     @field_validator("guidance_interval")
@@ -119,7 +119,7 @@ class SamplingOptions(Frozen):
         return device
 
 
-def check_spacing(scheduler: str, spacing: str) -> None:
+def check_spacing(scheduler: str, timestep_spacing: str) -> None:
     """Raise unless the solver supports the spacing.
 
     Raises:
@@ -127,9 +127,9 @@ def check_spacing(scheduler: str, spacing: str) -> None:
     """
     if scheduler not in SPACINGS:
         raise ValueError(f"unknown scheduler {scheduler!r}; known: {', '.join(SPACINGS)}")
-    if spacing not in SPACINGS[scheduler]:
+    if timestep_spacing not in SPACINGS[scheduler]:
         raise ValueError(
-            f"scheduler {scheduler!r} does not support spacing {spacing!r}; "
+            f"scheduler {scheduler!r} does not support timestep_spacing {timestep_spacing!r}; "
             f"it supports {', '.join(SPACINGS[scheduler])}"
         )
 

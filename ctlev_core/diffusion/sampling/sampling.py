@@ -24,12 +24,12 @@ from tqdm import tqdm
 
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import (
-    Prior,
+    PretrainedModel,
     choose_device,
     conditions_to_tensor,
     decode_latents,
     encode_prompts,
-    load_prior,
+    load_base_model,
 )
 from ctlev_core.diffusion.sampling.controlnet_reuse import EveryKthStep
 from ctlev_core.diffusion.sampling.controlnet_reuse import cached_condition_embedding as cached_condition_embedding
@@ -53,7 +53,7 @@ SHARDS_A_PROCESS = 4
 
 @torch.no_grad()
 def sample_latents(
-    prior: Prior,
+    base_model: PretrainedModel,
     embeddings: Tensor,
     empty_embedding: Tensor,
     conditions: Tensor | None,
@@ -63,7 +63,7 @@ def sample_latents(
     """Clean latents [B, C, h, w] float32, still multiplied by the scaling factor.
 
     Args:
-        prior: networks in any precision; the solver's state is float32 whatever theirs.
+        base_model: networks in any precision; the solver's state is float32 whatever theirs.
         embeddings: [B, L, D] of the prompts.
         empty_embedding: [1, L, D], for guidance.
         conditions: [B, 3, H, W] in [0, 1], or None.
@@ -72,11 +72,13 @@ def sample_latents(
     Raises:
         FloatingPointError: latents are not finite, because the networks' precision does not reach.
     """
-    device, dtype = prior.unet.device, prior.unet.dtype
-    scheduler = make_scheduler(options.scheduler, prior.scheduler_config, options.num_inference_steps, options.spacing)
+    device, dtype = base_model.unet.device, base_model.unet.dtype
+    scheduler = make_scheduler(
+        options.scheduler, base_model.scheduler_config, options.num_inference_steps, options.timestep_spacing
+    )
     streams = [torch.Generator().manual_seed(int(seed)) for seed in seeds]
-    side = prior.unet.config.sample_size
-    shape = (prior.unet.config.in_channels, side, side)
+    side = base_model.unet.config.sample_size
+    shape = (base_model.unet.config.in_channels, side, side)
     state = torch.stack([torch.randn(shape, generator=stream) for stream in streams]).to(device)
     state = state * scheduler.init_noise_sigma
     embeddings = embeddings.to(device, dtype)
@@ -87,9 +89,11 @@ def sample_latents(
         both = torch.cat([empty_embedding.to(embeddings).expand_as(embeddings), embeddings])
         twice = None if conditions is None else torch.cat([conditions, conditions])
     further = {"generator": streams} if options.scheduler in STOCHASTIC else {}
-    controlnet = None if prior.controlnet is None else EveryKthStep(prior.controlnet, options.controlnet_every)
-    denoiser = Denoiser(prior.unet, controlnet)
-    with cached_condition_embedding(prior.controlnet, conditions):
+    controlnet = (
+        None if base_model.controlnet is None else EveryKthStep(base_model.controlnet, options.controlnet_every)
+    )
+    denoiser = Denoiser(base_model.unet, controlnet)
+    with cached_condition_embedding(base_model.controlnet, conditions):
         for timestep in scheduler.timesteps:
             noisy = scheduler.scale_model_input(state, timestep).to(dtype)
             if _is_guided(timestep, scheduler.config.num_train_timesteps, options):
@@ -115,22 +119,24 @@ def _is_guided(timestep: Tensor, num_timesteps: int, options: SamplingOptions) -
 
 
 @torch.no_grad()
-def decode_frames(prior: Prior, latents: Tensor, options: SamplingOptions, seeds: Sequence[int] = ()) -> np.ndarray:
+def decode_frames(
+    base_model: PretrainedModel, latents: Tensor, options: SamplingOptions, seeds: Sequence[int] = ()
+) -> np.ndarray:
     """Frames [B, H, W, 3] uint8 of scaled latents; dark values become exactly 0, or values are drawn from `seeds`."""
-    values = ((decode_latents(prior, latents) + 1) * 127.5).clamp(0, 255)
+    values = ((decode_latents(base_model, latents) + 1) * 127.5).clamp(0, 255)
     if options.palette == "grey":
         values = values.mean(dim=1, keepdim=True).expand_as(values)
     elif options.palette == "red_blue":
         values = values * torch.tensor([1.0, 0.0, 1.0], device=values.device)[:, None, None]
-    if prior.value_table is not None:
+    if base_model.value_table is not None:
         expected = values.permute(0, 2, 3, 1).float().cpu().numpy()
-        return draw_values(expected, prior.value_table, [(int(seed), VALUE_STREAM) for seed in seeds])
-    values = torch.where(values < options.dark_level, 0.0, values)
+        return draw_values(expected, base_model.value_table, [(int(seed), VALUE_STREAM) for seed in seeds])
+    values = torch.where(values < options.black_threshold, 0.0, values)
     return values.round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
 
 
 def sample_frames(
-    prior: Prior,
+    base_model: PretrainedModel,
     conditions: Conditions,
     options: SamplingOptions,
     *,
@@ -141,9 +147,9 @@ def sample_frames(
     """Sample one frame a condition; finished shards in `work` are reused when a killed run is started again.
 
     Args:
-        prior: a loaded checkpoint.
+        base_model: a loaded checkpoint.
         conditions: N prompts, with N condition images where the checkpoint has a ControlNet.
-        options: solver, steps, guidance, output levels; its device is that of the prior.
+        options: solver, steps, guidance, output levels; its device is that of the base model.
         seeds: N non-negative integers.
         work: folder of the finished shards.
         identity: names the checkpoint, so that shards of another one are not reused.
@@ -152,23 +158,27 @@ def sample_frames(
     Raises:
         ValueError: numbers or sizes do not match.
     """
-    _check_conditions(prior, conditions, seeds)
+    _check_conditions(base_model, conditions, seeds)
     if not len(conditions):
-        width, height = prior.image_size
+        width, height = base_model.image_size
         return np.zeros((0, height, width, 3), np.uint8)
     shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
     with _progress(shards) as (missing, report):
-        sample_shards(prior, _prompts(conditions), missing, options, report)
+        sample_shards(base_model, _prompts(conditions), missing, options, report)
     return _read(shards)
 
 
 def sample_shards(
-    prior: Prior, prompts: list[str], shards: list[Shard], options: SamplingOptions, report: Callable[[int], None]
+    base_model: PretrainedModel,
+    prompts: list[str],
+    shards: list[Shard],
+    options: SamplingOptions,
+    report: Callable[[int], None],
 ) -> None:
     """Sample shards and write them.
 
     Args:
-        prior: a loaded checkpoint.
+        base_model: a loaded checkpoint.
         prompts: all that any shard of the call has, also those of other processes: they are embedded together.
         shards: what is to be done.
         options: solver, steps, guidance, output levels.
@@ -176,33 +186,38 @@ def sample_shards(
     """
     if not shards:
         return
-    table = encode_prompts(prior, [*prompts, ""]).cpu()
+    table = encode_prompts(base_model, [*prompts, ""]).cpu()
     # Apart: the decoder takes more memory than the networks, and what they computed must not be lost for it.
     batches, decoded = ShrinkingBatches(options.batch_size), ShrinkingBatches(options.batch_size)
     for shard in shards:
         embeddings = table[[prompts.index(prompt) for prompt in shard.conditions.prompts]]
-        sample = functools.partial(_sample_rows, prior, shard, embeddings, table[-1:], options)
+        sample = functools.partial(_sample_rows, base_model, shard, embeddings, table[-1:], options)
         parts = []
         for rows, latents in batches.map(sample, len(shard)):
-            decode = functools.partial(_decode_rows, prior, latents, options, shard.seeds[rows])
+            decode = functools.partial(_decode_rows, base_model, latents, options, shard.seeds[rows])
             parts += [frames for _, frames in decoded.map(decode, len(latents))]
             report(rows.stop - rows.start)
         shard.write(np.concatenate(parts))
 
 
 def _sample_rows(
-    prior: Prior, shard: Shard, embeddings: Tensor, empty_embedding: Tensor, options: SamplingOptions, rows: slice
+    base_model: PretrainedModel,
+    shard: Shard,
+    embeddings: Tensor,
+    empty_embedding: Tensor,
+    options: SamplingOptions,
+    rows: slice,
 ) -> Tensor:
     images = None
     if shard.conditions.images is not None:
         images = conditions_to_tensor(shard.conditions.images[rows])
-    return sample_latents(prior, embeddings[rows], empty_embedding, images, shard.seeds[rows], options)
+    return sample_latents(base_model, embeddings[rows], empty_embedding, images, shard.seeds[rows], options)
 
 
 def _decode_rows(
-    prior: Prior, latents: Tensor, options: SamplingOptions, seeds: Sequence[int], rows: slice
+    base_model: PretrainedModel, latents: Tensor, options: SamplingOptions, seeds: Sequence[int], rows: slice
 ) -> np.ndarray:
-    return decode_frames(prior, latents[rows], options, seeds[rows])
+    return decode_frames(base_model, latents[rows], options, seeds[rows])
 
 
 def sample_checkpoint(
@@ -222,8 +237,8 @@ def sample_checkpoint(
     _check_scheduler(checkpoint, options)
     devices, identity = device_names(options.device), _checkpoint_digest(checkpoint)
     if not len(conditions):
-        prior = load_for_sampling(checkpoint, options, devices[0], with_controlnet)
-        return sample_frames(prior, conditions, options, seeds=seeds, work=work, identity=identity)
+        base_model = load_for_sampling(checkpoint, options, devices[0], with_controlnet)
+        return sample_frames(base_model, conditions, options, seeds=seeds, work=work, identity=identity)
     _check_seeds(conditions, seeds)
     shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
     with _progress(shards) as (missing, report):
@@ -261,25 +276,29 @@ def _sample_share(
     """What the process of one device does."""
     if not shards:
         return
-    prior = load_for_sampling(checkpoint, options, device, with_controlnet)
+    base_model = load_for_sampling(checkpoint, options, device, with_controlnet)
     for shard in shards:
-        _check_conditions(prior, shard.conditions, shard.seeds)
-    sample_shards(prior, prompts, shards, options, report)
+        _check_conditions(base_model, shard.conditions, shard.seeds)
+    sample_shards(base_model, prompts, shards, options, report)
 
 
-def load_for_sampling(checkpoint: Path, options: SamplingOptions, device: str, with_controlnet: bool) -> Prior:
+def load_for_sampling(
+    checkpoint: Path, options: SamplingOptions, device: str, with_controlnet: bool
+) -> PretrainedModel:
     """The networks in the precision asked for. The patch code stays in float32, where it is exact and takes no time."""
     from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 
     place, dtype = choose_device(device), getattr(torch, options.precision)
-    prior = load_prior(checkpoint, with_controlnet=with_controlnet, dtype=dtype, device=place)
+    base_model = load_base_model(checkpoint, with_controlnet=with_controlnet, dtype=dtype, device=place)
     if options.values != "expected":
         table = read_value_table(checkpoint)
-        prior = dataclasses.replace(prior, value_table=table if options.values == "drawn" else nearest_values(table))
-    if not isinstance(prior.vae, PatchAutoencoder) or dtype == torch.float32:
-        return prior
-    exact: Any = PatchAutoencoder.from_config(prior.vae.config)
-    return dataclasses.replace(prior, vae=exact.to(place).eval().requires_grad_(False))
+        base_model = dataclasses.replace(
+            base_model, value_table=table if options.values == "drawn" else nearest_values(table)
+        )
+    if not isinstance(base_model.vae, PatchAutoencoder) or dtype == torch.float32:
+        return base_model
+    exact: Any = PatchAutoencoder.from_config(base_model.vae.config)
+    return dataclasses.replace(base_model, vae=exact.to(place).eval().requires_grad_(False))
 
 
 def _check_scheduler(checkpoint: Path, options: SamplingOptions) -> None:
@@ -290,7 +309,7 @@ def _check_scheduler(checkpoint: Path, options: SamplingOptions) -> None:
     except (OSError, ValueError):
         return  # the checkpoint is broken, and loading it says in what way
     try:
-        make_scheduler(options.scheduler, config, options.num_inference_steps, options.spacing)
+        make_scheduler(options.scheduler, config, options.num_inference_steps, options.timestep_spacing)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
 
@@ -338,13 +357,13 @@ def _check_seeds(conditions: Conditions, seeds: Sequence[int]) -> None:
         raise ValueError(f"one seed a condition is needed, got {len(seeds)} seeds for {len(conditions)} conditions")
 
 
-def _check_conditions(prior: Prior, conditions: Conditions, seeds: Sequence[int]) -> None:
+def _check_conditions(base_model: PretrainedModel, conditions: Conditions, seeds: Sequence[int]) -> None:
     _check_seeds(conditions, seeds)
-    if (prior.controlnet is None) != (conditions.images is None):
-        needs = "no condition images" if prior.controlnet is None else "condition images"
+    if (base_model.controlnet is None) != (conditions.images is None):
+        needs = "no condition images" if base_model.controlnet is None else "condition images"
         got = "none" if conditions.images is None else f"images of shape {list(conditions.images.shape)}"
         raise ValueError(f"this checkpoint takes {needs}, got {got}")
-    width, height = prior.image_size
+    width, height = base_model.image_size
     images = conditions.images
     if images is not None and (images.shape != (len(conditions), height, width, 3) or images.dtype != np.uint8):
         raise ValueError(

@@ -32,9 +32,9 @@ MIN_ALPHA_BAR = 2.0**-24
 THIRD_ORDER_FROM = 20
 """Steps from which UniPC is of order 3; with fewer its long steps overshoot.
 
-Root mean square distance, in grey levels, of the images of an earlier bundled prior from those of 60 steps, order 3
-and 2: 48 and 11 with 6 Karras steps, 21 and 2.9 with 8, 3.0 and 1.9 with 10, 1.2 and 0.8 with 15, 0.7 and 0.7 with 20.
-With a denoiser in closed form order 3 is the better one with 20 steps.
+Root mean square distance, in grey levels, of the images of an earlier bundled base model from those of 60 steps, order
+3 and 2: 48 and 11 with 6 Karras steps, 21 and 2.9 with 8, 3.0 and 1.9 with 10, 1.2 and 0.8 with 15, 0.7 and 0.7 with
+20. With a denoiser in closed form order 3 is the better one with 20 steps.
 """
 
 _NOISE_SCHEDULE = (
@@ -49,7 +49,7 @@ _NOISE_SCHEDULE = (
 _SPACING_SETTINGS: dict[str, dict[str, Any]] = {
     "karras": {"use_karras_sigmas": True},
     "lu": {},
-    "even": {"timestep_spacing": "linspace"},
+    "linspace": {"timestep_spacing": "linspace"},
     "trailing": {"timestep_spacing": "trailing"},
 }
 
@@ -88,9 +88,9 @@ class _SASolver(_EndsClean, SASolverScheduler):
 
 _SOLVERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "unipc": (UniPCMultistepScheduler, {"solver_order": 3}),
-    "dpm++": (DPMSolverMultistepScheduler, {"solver_order": 2}),
-    "dpm++_3m": (DPMSolverMultistepScheduler, {"solver_order": 3}),
-    "dpm++_sde": (DPMSolverMultistepScheduler, {"solver_order": 2, "algorithm_type": "sde-dpmsolver++"}),
+    "dpmpp_2m": (DPMSolverMultistepScheduler, {"solver_order": 2}),
+    "dpmpp_3m": (DPMSolverMultistepScheduler, {"solver_order": 3}),
+    "dpmpp_sde": (DPMSolverMultistepScheduler, {"solver_order": 2, "algorithm_type": "sde-dpmsolver++"}),
     # Of orders 2 and 3 the one with the smaller distribution error at 8 to 20 steps, with a denoiser in closed form.
     "deis": (_DEIS, {"solver_order": 3}),
     "sa_solver": (_SASolver, {"predictor_order": 3, "corrector_order": 3}),
@@ -100,15 +100,17 @@ _SOLVERS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 
 
-def make_scheduler(name: str, config: dict[str, Any], num_inference_steps: int, spacing: str | None = None) -> Any:
+def make_scheduler(
+    name: str, config: dict[str, Any], num_inference_steps: int, timestep_spacing: str | None = None
+) -> Any:
     """A diffusers scheduler for the noise schedule of a checkpoint, its time steps set.
 
     Args:
-        name: one of `SPACINGS`. `dpm++` is the multistep solver of order 2, `dpm++_3m` of order 3, `dpm++_sde` that of
-            order 2 for the stochastic equation.
+        name: one of `SPACINGS`. `dpmpp_2m` is the multistep solver of order 2, `dpmpp_3m` of order 3, `dpmpp_sde` the
+            one of order 2 for the stochastic equation.
         config: the checkpoint's scheduler config.
         num_inference_steps: evaluations of the network.
-        spacing: where the steps lie, see `SamplingOptions`; None is the first one that the solver supports.
+        timestep_spacing: where the steps lie, see `SamplingOptions`; None is the first one that the solver supports.
     Returns:
         The scheduler; `step(predicted, timestep, state, generator=...)` of the stochastic ones draws noise.
     Raises:
@@ -117,23 +119,23 @@ def make_scheduler(name: str, config: dict[str, Any], num_inference_steps: int, 
     Source: Zhao et al., UniPC, 2023; Lu et al., DPM-Solver++, 2022; Zhang and Chen, DEIS, 2022; Xue et al., SA-Solver,
         2023; Song et al., DDIM, 2020; Ho et al., DDPM, 2020; Karras et al., 2022, eq. 5 (spacing).
     """
-    spacing = spacing or SPACINGS.get(name, ("karras",))[0]
-    check_spacing(name, spacing)
+    timestep_spacing = timestep_spacing or SPACINGS.get(name, ("karras",))[0]
+    check_spacing(name, timestep_spacing)
     schedule = _noise_schedule(config)
     steps = schedule.get("num_train_timesteps", 1000)
     if not 1 <= num_inference_steps <= steps:
         raise ValueError(f"the noise schedule has 1 to {steps} steps, got num_inference_steps {num_inference_steps}")
-    if spacing == "even" and num_inference_steps in (1, steps):
+    if timestep_spacing == "linspace" and num_inference_steps in (1, steps):
         # A single step must be the first, and all steps must be each once: rounding would get both wrong.
-        spacing = "trailing"
+        timestep_spacing = "trailing"
     solver, settings = _SOLVERS[name]
     if name == "unipc" and num_inference_steps < THIRD_ORDER_FROM:
         settings = {**settings, "solver_order": 2}
     if name in ("deis", "sa_solver") and schedule.pop("rescale_betas_zero_snr", False):
         schedule["trained_betas"] = _betas_without_signal(config)
-    scheduler = solver(**schedule, **settings, **_SPACING_SETTINGS[spacing])
+    scheduler = solver(**schedule, **settings, **_SPACING_SETTINGS[timestep_spacing])
     scheduler.set_timesteps(num_inference_steps)
-    if spacing == "lu":
+    if timestep_spacing == "lu":
         _take_lu_steps(scheduler, config)
     if len(scheduler.timesteps) > num_inference_steps:
         _drop_step_before_the_first(scheduler, num_inference_steps)

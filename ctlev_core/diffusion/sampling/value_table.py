@@ -1,10 +1,10 @@
 """How real pixel values scatter about what the network expects, and frames drawn so.
 
 Far from the data a denoiser gives the mean of what it cannot know, so that sampled event images are smooth where real
-ones have counts that scatter from pixel to pixel, and black where those have lone events. What is missing can be
+ones have counts that scatter from pixel to pixel, and black where those have isolated events. What is missing can be
 measured: training frames are noised to a time step, the network says what it expects, and a table counts which values
 real frames have where it expects a value. A sampled frame's values are then drawn from the table, each pixel and
-channel by itself: the same mean, the scatter and the lone events of real frames, and only values that they have.
+channel by itself: the same mean, the scatter and the isolated events of real frames, and only values that they have.
 
 The table is a histogram [256, 256] of (expected, real), smoothed over the expected value: neighbours have much the same
 scatter, and training frames are few.
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import NoiseSchedule, generator_for
-from ctlev_core.diffusion.pretrained.loading import Prior, decode_latents
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, decode_latents
 from data_contracts.errors import DataError
 
 TABLE_FOLDER, TABLE_NAME = "value_table", "probability.npy"
@@ -33,12 +33,12 @@ _BATCH = 32
 
 
 def fit_value_table(
-    prior: Prior, frames: np.ndarray, latents: Tensor, embeddings: Tensor, *, timestep: int, seed: int
+    base_model: PretrainedModel, frames: np.ndarray, latents: Tensor, embeddings: Tensor, *, timestep: int, seed: int
 ) -> np.ndarray:
     """Probability of each real value, given the value expected.
 
     Args:
-        prior: the trained network, and its autoencoder.
+        base_model: the trained network, and its autoencoder.
         frames: [N, H, W, 3] uint8, N > 0 training frames.
         latents: [N, C, h, w] their scaled latents.
         embeddings: [N, L, D] of their prompts.
@@ -54,11 +54,11 @@ def fit_value_table(
     kept = np.arange(len(frames))[: max(MAX_PIXELS // per_frame, 1)]
     repeats = max(-(-MIN_PIXELS // (per_frame * len(kept))), 1)
     counts = np.zeros((256, 256))
-    schedule = NoiseSchedule(prior.scheduler_config)
+    schedule = NoiseSchedule(base_model.scheduler_config)
     for repeat in range(repeats):
         for rows in _batches(kept):
             expected = _expected(
-                prior, schedule, latents[rows], embeddings[rows], timestep, (seed, repeat, int(rows[0]))
+                base_model, schedule, latents[rows], embeddings[rows], timestep, (seed, repeat, int(rows[0]))
             )
             np.add.at(counts, (expected.ravel(), frames[rows].ravel()), 1)
     return _probabilities(counts)
@@ -132,7 +132,7 @@ def _batches(rows: np.ndarray) -> Iterator[np.ndarray]:
 
 @torch.no_grad()
 def _expected(
-    prior: Prior,
+    base_model: PretrainedModel,
     schedule: NoiseSchedule,
     latents: Tensor,
     embeddings: Tensor,
@@ -140,15 +140,15 @@ def _expected(
     entropy: tuple[int, ...],
 ) -> np.ndarray:
     """What the network makes of noised latents in one step: [B, H, W, 3] int64, 0 .. 255."""
-    device = prior.unet.device
+    device = base_model.unet.device
     timesteps = torch.full((len(latents),), timestep)
     noise = torch.randn(latents.shape, generator=generator_for(*entropy))
     noisy, _ = schedule.noised(latents, noise, timesteps)
-    predicted = prior.unet(
+    predicted = base_model.unet(
         noisy.to(device), timesteps.to(device), encoder_hidden_states=embeddings.to(device)
     ).sample.float()
     clean = schedule.clean_of(predicted, noisy.to(device), timesteps.to(device))
-    values = (decode_latents(prior, clean) + 1) * 127.5
+    values = (decode_latents(base_model, clean) + 1) * 127.5
     return values.clamp(0, 255).round().long().permute(0, 2, 3, 1).cpu().numpy()
 
 

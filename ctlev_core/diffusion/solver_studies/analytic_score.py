@@ -129,7 +129,9 @@ def solve(
 ) -> Tensor:
     """What a solver makes of noise [N, D] with the exact denoiser, [N, D]; `generator` feeds solvers that draw more."""
     schedule = NoiseSchedule(scheduler_config)
-    scheduler = make_scheduler(options.scheduler, scheduler_config, options.num_inference_steps, options.spacing)
+    scheduler = make_scheduler(
+        options.scheduler, scheduler_config, options.num_inference_steps, options.timestep_spacing
+    )
     further = {"generator": generator} if options.scheduler in STOCHASTIC else {}
     # Solvers expect images.
     state = noise[:, :, None, None] * scheduler.init_noise_sigma

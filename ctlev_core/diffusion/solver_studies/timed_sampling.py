@@ -49,14 +49,14 @@ def sample_timed(
         seeds: N non-negative integers.
         work: for files that are deleted again: a time may not come from a shard of an earlier run.
     """
-    prior = load_for_sampling(checkpoint, options, device_names(options.device)[0], conditions.images is not None)
+    base_model = load_for_sampling(checkpoint, options, device_names(options.device)[0], conditions.images is not None)
     seeds = noise_seeds(seeds, options)  # before batches are cut: shared noise is that of the first row of all
     made: list[np.ndarray] = []
     costs: list[list[float]] = []
-    with tempfile.TemporaryDirectory(dir=work) as folder, _counted(prior.unet, prior.controlnet) as counts:
+    with tempfile.TemporaryDirectory(dir=work) as folder, _counted(base_model.unet, base_model.controlnet) as counts:
 
         def sample(rows: slice, name: str, chosen: SamplingOptions) -> np.ndarray:
-            return sample_frames(prior, conditions.take(rows), chosen, seeds=seeds[rows], work=Path(folder) / name)
+            return sample_frames(base_model, conditions.take(rows), chosen, seeds=seeds[rows], work=Path(folder) / name)
 
         sample(slice(0, options.batch_size), "warm_up", options.model_copy(update={"num_inference_steps": 2}))
         for start in range(0, len(conditions), options.batch_size):

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import (
-    Prior,
+    PretrainedModel,
     choose_device,
     conditions_to_tensor,
     encode_prompts,
-    load_prior,
+    load_base_model,
 )
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import cached_condition_embedding
@@ -81,15 +81,15 @@ def precision_errors(
                 f"got {chosen.scheduler!r}"
             )
     device, with_controlnet = choose_device(options[0].device), conditions.images is not None
-    exact = load_prior(checkpoint, with_controlnet=with_controlnet, dtype=REFERENCE, device=device)
+    exact = load_base_model(checkpoint, with_controlnet=with_controlnet, dtype=REFERENCE, device=device)
     references = [_trajectory(exact, conditions, chosen, seeds, REFERENCE) for chosen in options]
     pictures = [_decode(exact, latents) for latents in references]
     found: list[list[PrecisionError]] = [[] for _ in options]
     for network, of_state in PRECISIONS:
-        prior = load_prior(checkpoint, with_controlnet=with_controlnet, dtype=network, device=device)
+        base_model = load_base_model(checkpoint, with_controlnet=with_controlnet, dtype=network, device=device)
         for number, chosen in enumerate(options):
             started = time.perf_counter()
-            latents = _trajectory(prior, conditions, chosen, seeds, of_state).double()
+            latents = _trajectory(base_model, conditions, chosen, seeds, of_state).double()
             seconds = time.perf_counter() - started
             difference = (_decode(exact, latents) - pictures[number]) * GREY_LEVELS
             found[number].append(
@@ -106,21 +106,27 @@ def precision_errors(
 
 @torch.no_grad()
 def _trajectory(
-    prior: Prior, conditions: Conditions, options: SamplingOptions, seeds: Sequence[int], of_state: torch.dtype
+    base_model: PretrainedModel,
+    conditions: Conditions,
+    options: SamplingOptions,
+    seeds: Sequence[int],
+    of_state: torch.dtype,
 ) -> Tensor:
     """Latents [N, C, h, w] at the end, in the precision of the state."""
-    device, network = prior.unet.device, prior.unet.dtype
-    scheduler = make_scheduler(options.scheduler, prior.scheduler_config, options.num_inference_steps, options.spacing)
-    side = prior.unet.config.sample_size
-    shape = (prior.unet.config.in_channels, side, side)
+    device, network = base_model.unet.device, base_model.unet.dtype
+    scheduler = make_scheduler(
+        options.scheduler, base_model.scheduler_config, options.num_inference_steps, options.timestep_spacing
+    )
+    side = base_model.unet.config.sample_size
+    shape = (base_model.unet.config.in_channels, side, side)
     noise = torch.stack([torch.randn(shape, generator=torch.Generator().manual_seed(int(seed))) for seed in seeds])
     state = (noise.double() * float(scheduler.init_noise_sigma)).to(device, of_state)
-    embeddings = encode_prompts(prior, list(conditions.prompts)).to(device, network)
+    embeddings = encode_prompts(base_model, list(conditions.prompts)).to(device, network)
     images = None
     if conditions.images is not None:
         images = conditions_to_tensor(conditions.images).to(device, network)
-    denoiser = Denoiser(prior.unet, prior.controlnet)
-    with cached_condition_embedding(prior.controlnet, images):
+    denoiser = Denoiser(base_model.unet, base_model.controlnet)
+    with cached_condition_embedding(base_model.controlnet, images):
         for timestep in scheduler.timesteps:
             noisy = scheduler.scale_model_input(state, timestep).to(network)
             predicted = denoiser.predict(noisy, timestep.expand(len(noisy)).to(device), embeddings, images)
@@ -129,9 +135,9 @@ def _trajectory(
 
 
 @torch.no_grad()
-def _decode(prior: Prior, latents: Tensor) -> Tensor:
+def _decode(base_model: PretrainedModel, latents: Tensor) -> Tensor:
     """Images [N, 3, H, W] in [-1, 1], not clipped."""
-    return prior.vae.decode((latents / prior.scaling_factor).to(prior.vae.dtype)).sample.double()
+    return base_model.vae.decode((latents / base_model.scaling_factor).to(base_model.vae.dtype)).sample.double()
 
 
 def _rms(values: Tensor) -> float:

@@ -19,7 +19,7 @@ two cores; a single one would copy all gradients of a network of Stable Diffusio
 
 
 @dataclass(frozen=True)
-class Ranks:
+class DistributedContext:
     """One of `count` processes that train together; number 0 alone writes files and shows progress.
 
     Attributes:
@@ -83,10 +83,10 @@ def _messages(gradients: Sequence[torch.Tensor]) -> Iterator[list[torch.Tensor]]
         yield together
 
 
-ALONE = Ranks()
+SINGLE_PROCESS = DistributedContext()
 
 
-def start_ranks(device: str) -> tuple[Ranks, torch.device]:
+def start_distributed(device: str) -> tuple[DistributedContext, torch.device]:
     """Join the processes that a launcher started together; each with a GPU takes the one of its number.
 
     Args:
@@ -95,10 +95,10 @@ def start_ranks(device: str) -> tuple[Ranks, torch.device]:
     from accelerate import PartialState
 
     state = PartialState(cpu=device == "cpu")
-    return Ranks(state.process_index, state.num_processes), torch.device(str(state.device))
+    return DistributedContext(state.process_index, state.num_processes), torch.device(str(state.device))
 
 
-def stop_ranks() -> None:
+def stop_distributed() -> None:
     """Wait for one another, and leave."""
     from accelerate import PartialState
 

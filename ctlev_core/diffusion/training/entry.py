@@ -1,4 +1,4 @@
-"""From a prior on disk to a fine-tuned checkpoint on disk, in this process or in several that train together.
+"""From a base model on disk to a fine-tuned checkpoint on disk, in this process or in several that train together.
 
 Several processes are started here, by torchrun, and not by wrapping a flow in a launcher: one flow, one lock in the
 store and one cache key, however many GPUs compute. Where `accelerate launch` or `torchrun` started the process all the
@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ctlev_core.diffusion.pretrained.loading import choose_device, load_prior, save_prior
+from ctlev_core.diffusion.pretrained.loading import choose_device, load_base_model, save_base_model
 from ctlev_core.diffusion.sampling.value_table import write_value_table
-from ctlev_core.diffusion.training.distributed import ALONE, Ranks
+from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.finetuning import Tune, fine_tune, forget_weights
 from ctlev_core.diffusion.training.fsdp import check_sharding, gather_networks, shard_networks
 from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
@@ -43,14 +43,14 @@ def train_checkpoint(
     work: Path,
     class_names: Sequence[str] | None = None,
 ) -> TrainingHistory:
-    """Load the prior, fine-tune it and write it to `out` as a diffusers folder: `train` of both generators.
+    """Load the base model, fine-tune it and write it to `out` as a diffusers folder: `train` of both generators.
 
     Args:
-        frames: [N, H, W, 3] uint8, of the prior's image size.
+        frames: [N, H, W, 3] uint8, of the base model's image size.
         conditions: N prompts, and N condition images for a ControlNet.
         options: see `FineTuningOptions`; `num_processes` changes nothing but the order of sums.
         tune: which networks learn.
-        controlnet: the ControlNet to start from, see `load_prior`.
+        controlnet: the ControlNet to start from, see `load_base_model`.
         with_controlnet: load one at all.
         seed: of order and noise.
         out: the checkpoint folder to write.
@@ -76,8 +76,8 @@ def train_checkpoint(
     if job["fsdp"]:
         check_sharding(options)
     if count == 1:
-        return _train(frames, conditions, options, job, ALONE, choose_device(options.device))
-    Ranks(0, count).batches(options.gradient_accumulation)  # raises before processes are started
+        return _train(frames, conditions, options, job, SINGLE_PROCESS, choose_device(options.device))
+    DistributedContext(0, count).batches(options.gradient_accumulation)  # raises before processes are started
     if options.device not in ("auto", "cuda", "cpu"):
         raise ValueError(
             f"device must be auto, cuda or cpu with {count} processes, each takes a GPU of its own, got "
@@ -91,18 +91,20 @@ def _train(
     conditions: Conditions,
     options: FineTuningOptions,
     job: Mapping[str, Any],
-    ranks: Ranks,
+    distributed: DistributedContext,
     device: torch.device,
 ) -> TrainingHistory:
     controlnet = None if job["controlnet"] is None else Path(job["controlnet"])
-    prior = load_prior(options.prior, controlnet=controlnet, with_controlnet=job["with_controlnet"], device=device)
+    base_model = load_base_model(
+        options.base_model, controlnet=controlnet, with_controlnet=job["with_controlnet"], device=device
+    )
     if options.random_init:
-        prior = forget_weights(prior, job["seed"])
+        base_model = forget_weights(base_model, job["seed"])
     if job["fsdp"]:
-        shard_networks(prior)
-        ranks = replace(ranks, sharded=True)
+        shard_networks(base_model)
+        distributed = replace(distributed, sharded=True)
     history = fine_tune(
-        prior,
+        base_model,
         frames,
         conditions,
         options,
@@ -110,11 +112,11 @@ def _train(
         seed=job["seed"],
         work=Path(job["work"]),
         class_names=job["class_names"],
-        ranks=ranks,
+        distributed=distributed,
     )
-    written = gather_networks(prior, keep=ranks.rank == 0) if ranks.sharded else prior
-    if ranks.rank == 0 and written is not None:
-        save_prior(written, Path(job["out"]))
+    written = gather_networks(base_model, keep=distributed.rank == 0) if distributed.sharded else base_model
+    if distributed.rank == 0 and written is not None:
+        save_base_model(written, Path(job["out"]))
         if history.value_table is not None:
             write_value_table(Path(job["out"]), history.value_table)
             history.value_table = None  # it is in the checkpoint; histories travel as text
@@ -140,12 +142,14 @@ def _train_in_processes(
     return train_in_processes(count, __name__, folder, written)
 
 
-def _train_rank(job: dict[str, Any], folder: Path, ranks: Ranks, device: torch.device) -> TrainingHistory:
+def _train_rank(
+    job: dict[str, Any], folder: Path, distributed: DistributedContext, device: torch.device
+) -> TrainingHistory:
     images = np.load(folder / "conditions.npy", mmap_mode="r") if job["with_images"] else None
     frames = np.load(folder / "frames.npy", mmap_mode="r")
     made_by = None if job["made_by"] is None else ConditionChoice(**job["made_by"])
     conditions = Conditions(tuple(job["prompts"]), images, made_by=made_by)
-    return _train(frames, conditions, FineTuningOptions(**job["options"]), job, ranks, device)
+    return _train(frames, conditions, FineTuningOptions(**job["options"]), job, distributed, device)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fine-tune a prior on event images: what both diffusion generators do.
+"""Fine-tune a base model on event images: what both diffusion generators do.
 
 The frozen parts run once: latents are cached, each distinct prompt is embedded once and the text encoder dropped.
 """
@@ -19,13 +19,13 @@ import torch
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
-from ctlev_core.diffusion.pretrained.loading import Prior, encode_prompts
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, encode_prompts
 from ctlev_core.diffusion.pretraining.architecture import break_zeros
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.sampling.value_table import fit_value_table
-from ctlev_core.diffusion.training.distributed import ALONE, Ranks
+from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.latent_cache import (
     LatentCache,
     cache_latents,
@@ -50,22 +50,22 @@ MOVE_STREAM, REHEARSAL_STREAM, VALUE_STREAM = 6, 7, 8
 """Entropy that keeps random streams apart."""
 
 
-def forget_weights(prior: Prior, seed: int) -> Prior:
-    """The same architecture with random U-Net and ControlNet: the ablation without a prior."""
+def forget_weights(base_model: PretrainedModel, seed: int) -> PretrainedModel:
+    """The same architecture with random U-Net and ControlNet: the ablation without a base model."""
     state = int(np.random.SeedSequence([seed, WEIGHT_STREAM]).generate_state(1)[0])
-    device = prior.unet.device
+    device = base_model.unet.device
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(state)
-        unet = type(prior.unet).from_config(prior.unet.config).to(device)
+        unet = type(base_model.unet).from_config(base_model.unet.config).to(device)
         controlnet = None
-        if prior.controlnet is not None:
-            controlnet = type(prior.controlnet).from_config(prior.controlnet.config)
+        if base_model.controlnet is not None:
+            controlnet = type(base_model.controlnet).from_config(base_model.controlnet.config)
             break_zeros(controlnet)
             controlnet = controlnet.to(device)
-    return replace(prior, unet=unet, controlnet=controlnet)
+    return replace(base_model, unet=unet, controlnet=controlnet)
 
 
-def check_channel_order(prior: Prior, conditions: Conditions) -> None:
+def check_channel_order(base_model: PretrainedModel, conditions: Conditions) -> None:
     """Raise `DataError` where the ControlNet exchanges red and blue of normal maps that are drawn so already, or not.
 
     Nothing else would notice: it learns slowly, from weights that know other colours.
@@ -73,7 +73,7 @@ def check_channel_order(prior: Prior, conditions: Conditions) -> None:
     convention = ""
     if conditions.made_by is not None and conditions.made_by.name == "normals":
         convention = plugins.load_options(conditions.made_by).options.convention
-    order = "bgr" if prior.reversed_condition else "rgb"
+    order = "bgr" if base_model.reversed_condition else "rgb"
     if (convention, order) in (("controlnet", "bgr"), ("controlnet_unreversed", "rgb")):
         fitting = "controlnet_unreversed" if order == "bgr" else "controlnet"
         raise DataError(
@@ -83,7 +83,7 @@ def check_channel_order(prior: Prior, conditions: Conditions) -> None:
 
 
 def fine_tune(
-    prior: Prior,
+    base_model: PretrainedModel,
     frames: np.ndarray,
     conditions: Conditions,
     options: FineTuningOptions,
@@ -92,34 +92,40 @@ def fine_tune(
     seed: int,
     work: Path,
     class_names: Sequence[str] | None = None,
-    ranks: Ranks = ALONE,
+    distributed: DistributedContext = SINGLE_PROCESS,
 ) -> TrainingHistory:
     """Train the networks named by `tune` in place; autoencoder and text encoder stay frozen.
 
     Args:
-        prior: on the device to train on; float32.
-        frames: [N, H, W, 3] uint8 event images of the prior's image size.
-        conditions: N prompts, with N condition images for a prior with a ControlNet.
+        base_model: on the device to train on; float32.
+        frames: [N, H, W, 3] uint8 event images of the base model's image size.
+        conditions: N prompts, with N condition images for a base model with a ControlNet.
         options: length, rates, averaging.
         tune: which networks learn. The paper: `unet` for text, `controlnet` for skeletons.
         seed: of order, noise and held-back frames.
         work: folder of the resumable state.
         class_names: N; at every step a frame is shown with a random one of the prompts that occur in its class, as the
             paper draws a class name per iteration. None = each frame keeps its own prompt.
-        ranks: which of several processes this is.
+        distributed: which of several processes this is.
     Returns:
         Loss curves; `shuffled_loss` is the validation loss with the conditions of other frames.
     Raises:
-        ValueError: frames and conditions do not fit the prior or one another, latents are not finite, or options do
-            not fit one another.
+        ValueError: frames and conditions do not fit the base model or one another, latents are not finite, or options
+            do not fit one another.
     """
-    check_training_data(frames, conditions, prior.image_size)
-    check_channel_order(prior, conditions)
-    if options.turned_share and frames.shape[1] != frames.shape[2]:
-        raise DataError(f"turned_share needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0")
+    check_training_data(frames, conditions, base_model.image_size)
+    check_channel_order(base_model, conditions)
+    if options.rot90_probability and frames.shape[1] != frames.shape[2]:
+        raise DataError(
+            f"rot90_probability needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0"
+        )
     _check_text_route(options, conditions)
-    device = prior.unet.device
-    networks = {"unet": (prior.unet,), "controlnet": (prior.controlnet,), "both": (prior.unet, prior.controlnet)}[tune]
+    device = base_model.unet.device
+    networks = {
+        "unet": (base_model.unet,),
+        "controlnet": (base_model.controlnet,),
+        "both": (base_model.unet, base_model.controlnet),
+    }[tune]
     parameters = []
     for network in networks:
         network.train().requires_grad_(True)
@@ -129,25 +135,25 @@ def fine_tune(
     trainer = Trainer(parameters, options, identity, options.optimizer, keep=options.keep, patience=options.patience)
     # Two frames at least: one frame has no other's condition to be shuffled with.
     validated = len(validation_rows) >= 2
-    check_run(trainer, ranks, validated=validated)
-    denoiser = Denoiser(prior.unet, prior.controlnet)
-    schedule = NoiseSchedule(prior.scheduler_config)
-    num_turns = 4 if options.turned_share else 1
-    cache = cache_latents(prior, frames, conditions, class_names, num_turns=num_turns)
+    check_run(trainer, distributed, validated=validated)
+    denoiser = Denoiser(base_model.unet, base_model.controlnet)
+    schedule = NoiseSchedule(base_model.scheduler_config)
+    num_turns = 4 if options.rot90_probability else 1
+    cache = cache_latents(base_model, frames, conditions, class_names, num_turns=num_turns)
     check_cache(cache, conditions)
-    prior.text_encoder.to("cpu")
+    base_model.text_encoder.to("cpu")
     num_pictures = round(options.batch_size * options.rehearsal_share)
-    rehearsal = Rehearsal(options.rehearsal, prior.image_size[0]) if num_pictures else None
+    rehearsal = Rehearsal(options.rehearsal, base_model.image_size[0]) if num_pictures else None
 
     def fetch(number: int) -> Batch:
         rows = training_rows[sample_rows(seed, number, options.batch_size - num_pictures, len(training_rows))]
-        turns = draw_turns(len(rows), options.turned_share, seed, number) if options.turned_share else None
+        turns = draw_turns(len(rows), options.rot90_probability, seed, number) if options.rot90_probability else None
         generator = generator_for(seed, LATENT_STREAM, number)
         batch = cache.batch(rows, generator, options.prompt_dropout, device, turns)
         if options.moves.moves_anything:
             moved = move_frames(frames[rows], options, seed, number)
-            batch = replace(batch, latents=encode_images(prior, moved, generator).to(device))
-        return batch if rehearsal is None else _with_pictures(batch, prior, rehearsal, options, seed, number)
+            batch = replace(batch, latents=encode_images(base_model, moved, generator).to(device))
+        return batch if rehearsal is None else _with_pictures(batch, base_model, rehearsal, options, seed, number)
 
     def validate() -> tuple[float, float]:
         batch = cache.batch(validation_rows, generator_for(seed, DROPOUT_STREAM), 0.0, device)
@@ -162,14 +168,14 @@ def fine_tune(
         seed=seed,
         work=work,
         validate=validate if validated else None,
-        draw=partial(draw_samples, prior, frames[shown], _rows_of(conditions, shown)),
+        draw=partial(draw_samples, base_model, frames[shown], _rows_of(conditions, shown)),
         description="fine-tuning",
-        ranks=ranks,
+        distributed=distributed,
     )
     for network in networks:
         network.eval().requires_grad_(False)
-    if options.values_at and ranks.rank == 0:
-        history.value_table = _value_table(prior, frames, cache, training_rows, options, seed)
+    if options.values_at and distributed.rank == 0:
+        history.value_table = _value_table(base_model, frames, cache, training_rows, options, seed)
     return history
 
 
@@ -178,9 +184,9 @@ def _check_text_route(options: FineTuningOptions, conditions: Conditions) -> Non
     asked = {"moves": options.moves.moves_anything, "rehearsal_share": options.rehearsal_share > 0}
     asked["values_at"] = options.values_at > 0
     for name, is_asked in asked.items():
-        if is_asked and (conditions.images is not None or options.turned_share):
+        if is_asked and (conditions.images is not None or options.rot90_probability):
             raise DataError(
-                f"{name} is for the text route, whose prompts hold wherever a thing is, without turned_share"
+                f"{name} is for the text route, whose prompts hold wherever a thing is, without rot90_probability"
             )
 
 
@@ -204,40 +210,45 @@ def move_frames(frames: np.ndarray, options: FineTuningOptions, seed: int, numbe
 
 
 def _with_pictures(
-    batch: Batch, prior: Prior, rehearsal: Rehearsal, options: FineTuningOptions, seed: int, number: int
+    batch: Batch, base_model: PretrainedModel, rehearsal: Rehearsal, options: FineTuningOptions, seed: int, number: int
 ) -> Batch:
     """The batch, and behind it pictures with their captions up to the whole batch size."""
     rng = np.random.default_rng([seed, REHEARSAL_STREAM, number])
     images, captions = rehearsal.draw(options.batch_size - len(batch.latents), rng)
     captions = ["" if rng.random() < options.prompt_dropout else caption for caption in captions]
-    latents = encode_images(prior, images, generator_for(seed, REHEARSAL_STREAM, number)).to(batch.latents)
-    embeddings = encode_prompts(prior, captions).to(batch.embeddings)
+    latents = encode_images(base_model, images, generator_for(seed, REHEARSAL_STREAM, number)).to(batch.latents)
+    embeddings = encode_prompts(base_model, captions).to(batch.embeddings)
     return Batch(torch.cat([batch.latents, latents]), torch.cat([batch.embeddings, embeddings]))
 
 
 def _value_table(
-    prior: Prior, frames: np.ndarray, cache: LatentCache, rows: np.ndarray, options: FineTuningOptions, seed: int
+    base_model: PretrainedModel,
+    frames: np.ndarray,
+    cache: LatentCache,
+    rows: np.ndarray,
+    options: FineTuningOptions,
+    seed: int,
 ) -> np.ndarray:
     batch = cache.batch(rows, generator_for(seed, VALUE_STREAM), 0.0, torch.device("cpu"))
-    timestep = round(options.values_at * (len(NoiseSchedule(prior.scheduler_config).alphas_cumprod) - 1))
-    return fit_value_table(prior, frames[rows], batch.latents, batch.embeddings, timestep=timestep, seed=seed)
+    timestep = round(options.values_at * (len(NoiseSchedule(base_model.scheduler_config).alphas_cumprod) - 1))
+    return fit_value_table(base_model, frames[rows], batch.latents, batch.embeddings, timestep=timestep, seed=seed)
 
 
-def draw_samples(prior: Prior, frames: np.ndarray, conditions: Conditions) -> np.ndarray:
+def draw_samples(base_model: PretrainedModel, frames: np.ndarray, conditions: Conditions) -> np.ndarray:
     """A picture of conditions, real frames and samples, from noise that is the same at every call.
 
     Args:
-        prior: with the weights to sample from.
+        base_model: with the weights to sample from.
         frames: [N, H, W, 3] uint8 real frames.
         conditions: what the N samples are asked for.
     Returns:
         [N * H, 3 * W, 3] uint8; without condition images 2 * W.
     """
     if conditions.images is None:
-        prior = replace(prior, controlnet=None)
+        base_model = replace(base_model, controlnet=None)
     options = SamplingOptions(num_inference_steps=SHOWN_STEPS, batch_size=SHOWN)
     with TemporaryDirectory() as folder:
-        samples = sample_frames(prior, conditions, options, seeds=range(len(frames)), work=Path(folder))
+        samples = sample_frames(base_model, conditions, options, seeds=range(len(frames)), work=Path(folder))
     return picture_of_samples([conditions.images, frames, samples])
 
 
@@ -259,7 +270,7 @@ def _identity(
         name: value for name, value in cache_material(options).items() if name in FineTuningOptions.model_fields
     }
     named = None if class_names is None else list(class_names)
-    made_by = conditions.made_by.model_dump(mode="json") if conditions.made_by and options.turned_share else None
+    made_by = conditions.made_by.model_dump(mode="json") if conditions.made_by and options.rot90_probability else None
     digest = hashlib.sha256(json.dumps([material, tune, seed, conditions.prompts, named, made_by]).encode())
     for array in (frames, conditions.images):
         if array is not None:

@@ -1,7 +1,7 @@
 """Attention in float32 within networks that train in bfloat16 on a CPU.
 
 There torch's backward pass of attention takes ten times as long in bfloat16 as in float32: a tenth of a step of the
-small prior. The products before and after it are too small to be faster in bfloat16, and are spared the casts.
+small base model. The products before and after it are too small to be faster in bfloat16, and are spared the casts.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.distributed.tensor import DTensor, distribute_tensor
 
-from ctlev_core.diffusion.pretrained.loading import Prior
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel
 from ctlev_core.diffusion.training.options import FineTuningOptions
 
 BLOCKS = ("down_blocks", "mid_block", "up_blocks", "controlnet_cond_embedding")
@@ -34,13 +34,13 @@ def check_sharding(options: FineTuningOptions) -> None:
         raise ValueError("fsdp needs precision float32 or bfloat16, got float16, whose scale of the loss is not shared")
 
 
-def shard_networks(prior: Prior) -> None:
+def shard_networks(base_model: PretrainedModel) -> None:
     """Leave this process its part of the weights of U-Net and ControlNet, in place; gradients are summed over all."""
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import FSDPModule, fully_shard
 
-    mesh = init_device_mesh(prior.unet.device.type, (torch.distributed.get_world_size(),))
-    for network in filter(None, (prior.unet, prior.controlnet)):
+    mesh = init_device_mesh(base_model.unet.device.type, (torch.distributed.get_world_size(),))
+    for network in filter(None, (base_model.unet, base_model.controlnet)):
         parts = [getattr(network, name, None) for name in BLOCKS]
         for part in filter(None, parts):
             for block in part if isinstance(part, torch.nn.ModuleList) else [part]:
@@ -53,11 +53,11 @@ def shard_networks(prior: Prior) -> None:
                 module.set_force_sum_reduction_for_comms(True)  # a factor in the message itself NCCL alone knows
 
 
-def gather_networks(prior: Prior, *, keep: bool) -> Prior | None:
-    """The prior with whole, plain networks in CPU memory; all processes take part, those that `keep` get it."""
+def gather_networks(base_model: PretrainedModel, *, keep: bool) -> PretrainedModel | None:
+    """The base model with whole, plain networks in CPU memory; all processes take part, those that `keep` get it."""
     plain: dict[str, Any] = {}
     for name in ("unet", "controlnet"):
-        network = getattr(prior, name)
+        network = getattr(base_model, name)
         if network is None:
             continue
         weights = whole(network.state_dict(), keep=keep)
@@ -65,7 +65,7 @@ def gather_networks(prior: Prior, *, keep: bool) -> Prior | None:
             plain[name] = type(network).from_config(network.config)
             plain[name].load_state_dict(weights)
             plain[name].eval().requires_grad_(False)
-    return replace(prior, **plain) if keep else None
+    return replace(base_model, **plain) if keep else None
 
 
 @torch.no_grad()

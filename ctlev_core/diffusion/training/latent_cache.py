@@ -14,7 +14,12 @@ from torch import Tensor
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch
-from ctlev_core.diffusion.pretrained.loading import Prior, conditions_to_tensor, encode_prompts, images_to_tensor
+from ctlev_core.diffusion.pretrained.loading import (
+    PretrainedModel,
+    conditions_to_tensor,
+    encode_prompts,
+    images_to_tensor,
+)
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
@@ -23,8 +28,8 @@ from data_contracts.labels import Conditions
 logger = logging.getLogger(__name__)
 
 USUAL_SIZE = (0.4, 4.0)
-"""Root mean square of scaled latents, about 1: .7 to 2.5 of the bundled priors' images, black to white; .9 to 1.8 of
-photographs and event images in Stable Diffusion's space, where they are 5 to 10 if not scaled, .2 to .3 if twice."""
+"""Root mean square of scaled latents, about 1: .7 to 2.5 of the bundled base models' images, black to white; .9 to 1.8
+of photographs and event images in Stable Diffusion's space, where they are 5 to 10 if not scaled, .2 to .3 if twice."""
 ENCODE_BATCH = 32
 """Images that are encoded at once, unless memory runs out: of 512 px each takes .7 GB in Stable Diffusion's."""
 
@@ -88,7 +93,7 @@ class LatentCache:
 
 
 def cache_latents(
-    prior: Prior,
+    base_model: PretrainedModel,
     frames: np.ndarray,
     conditions: Conditions,
     class_names: Sequence[str] | None = None,
@@ -98,19 +103,19 @@ def cache_latents(
     """Run the frozen autoencoder and text encoder, once per frame and turn and once per distinct prompt.
 
     Args:
-        prior: autoencoder and text encoder.
+        base_model: autoencoder and text encoder.
         frames: [N, H, W, 3] uint8.
         conditions: N prompts and perhaps condition images.
         class_names: N; frames of one class may be shown with the prompt of any of them. None = each with its own.
         num_turns: 4 also encodes square frames in their three quarter turns.
     """
-    device = prior.vae.device
+    device = base_model.vae.device
     means, deviations = [], []
 
     def encode(rows: slice, turn: int) -> Any:
         turned = np.rot90(frames[rows], turn, axes=(1, 2))
-        images = images_to_tensor(np.ascontiguousarray(turned)).to(device, prior.vae.dtype)
-        return prior.vae.encode(images).latent_dist
+        images = images_to_tensor(np.ascontiguousarray(turned)).to(device, base_model.vae.dtype)
+        return base_model.vae.encode(images).latent_dist
 
     batches = ShrinkingBatches(ENCODE_BATCH)
     with torch.no_grad():
@@ -124,8 +129,8 @@ def cache_latents(
     return LatentCache(
         mean=torch.cat(means),
         std=torch.cat(deviations) if deviations else None,
-        scaling_factor=prior.scaling_factor,
-        embeddings=encode_prompts(prior, [*prompts, ""]).float().cpu(),
+        scaling_factor=base_model.scaling_factor,
+        embeddings=encode_prompts(base_model, [*prompts, ""]).float().cpu(),
         prompt_rows=_prompt_rows([position[prompt] for prompt in conditions.prompts], class_names),
         conditions=conditions.images,
         made_by=conditions.made_by,
@@ -133,14 +138,16 @@ def cache_latents(
 
 
 @torch.no_grad()
-def encode_images(prior: Prior, images: np.ndarray, generator: torch.Generator) -> Tensor:
+def encode_images(base_model: PretrainedModel, images: np.ndarray, generator: torch.Generator) -> Tensor:
     """Scaled latents [B, C, h, w] float32 of images [B, H, W, 3] uint8, drawn from their posteriors."""
-    posterior = prior.vae.encode(images_to_tensor(images).to(prior.vae.device, prior.vae.dtype)).latent_dist
+    posterior = base_model.vae.encode(
+        images_to_tensor(images).to(base_model.vae.device, base_model.vae.dtype)
+    ).latent_dist
     latents = posterior.mean.float()
     if hasattr(posterior, "std"):
         noise = torch.randn(latents.shape, generator=generator)
         latents = latents + posterior.std.float() * noise.to(latents.device)
-    return latents * prior.scaling_factor
+    return latents * base_model.scaling_factor
 
 
 def turn_conditions(images: np.ndarray, turns: np.ndarray, made_by: ConditionChoice | None) -> np.ndarray:
@@ -165,13 +172,13 @@ def _prompt_rows(own: Sequence[int], class_names: Sequence[str] | None) -> tuple
 
 
 def check_training_data(frames: np.ndarray, conditions: Conditions, image_size: tuple[int, int]) -> None:
-    """Raise `DataError` unless frames and conditions are images of the prior's size, one condition a frame."""
+    """Raise `DataError` unless frames and conditions are images of the base model's size, one condition a frame."""
     width, height = image_size
     arrays = {"frames": frames} if conditions.images is None else {"frames": frames, "conditions": conditions.images}
     for name, array in arrays.items():
         if array.ndim != 4 or array.shape[1:] != (height, width, 3) or array.dtype != np.uint8:
             raise DataError(
-                f"{name} must be [N, {height}, {width}, 3] uint8, the size this prior was trained on, "
+                f"{name} must be [N, {height}, {width}, 3] uint8, the size this base model was trained on, "
                 f"got {list(array.shape)} {array.dtype}; set the image size of the encoding"
             )
         if len(array) != len(conditions.prompts):
@@ -183,7 +190,7 @@ def check_training_data(frames: np.ndarray, conditions: Conditions, image_size: 
 def check_cache(cache: LatentCache, conditions: Conditions) -> None:
     """Raise `DataError` naming the first frame or prompt whose latents or embedding are not finite.
 
-    Latents of an unusual size are logged: the scaling factor is a number in the prior's config that nothing else
+    Latents of an unusual size are logged: the scaling factor is a number in the base model's config that nothing else
     vouches for, and networks given latents of another size than they were trained on learn and draw badly, in silence.
     """
     for name, values in (("mean", cache.mean), ("standard deviation", cache.std)):
@@ -192,19 +199,19 @@ def check_cache(cache: LatentCache, conditions: Conditions) -> None:
             count = len(cache.prompt_rows)
             row = int(wrong.nonzero()[0]) % count
             raise DataError(
-                f"frame {row} of {count}: the {name} of its latents must be finite, which the prior's "
+                f"frame {row} of {count}: the {name} of its latents must be finite, which the base model's "
                 "autoencoder did not make it; check that frame and the autoencoder"
             )
     wrong = ~torch.isfinite(cache.embeddings).flatten(1).all(dim=1)
     if bool(wrong.any()):
         row = int(wrong.nonzero()[0])
         prompt = [*sorted(set(conditions.prompts)), ""][row]
-        raise DataError(f"prompt {prompt!r}: its embedding is not finite; check the prior's text encoder")
+        raise DataError(f"prompt {prompt!r}: its embedding is not finite; check the base model's text encoder")
     sizes = torch.linalg.vector_norm(cache.mean.flatten(1), dim=1).double() / cache.mean[0].numel() ** 0.5
     size = float(sizes.square().mean().sqrt()) * cache.scaling_factor
     if not USUAL_SIZE[0] <= size <= USUAL_SIZE[1]:
         logger.warning(
             "latents of the frames have a root mean square of %.2g after scaling by %g, expected about 1; "
-            "check scaling_factor in the config of the prior's autoencoder (Stable Diffusion v1: 0.18215)",
+            "check scaling_factor in the config of the base model's autoencoder (Stable Diffusion v1: 0.18215)",
             size, cache.scaling_factor,
         )  # fmt: skip

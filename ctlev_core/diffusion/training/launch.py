@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from ctlev_core.diffusion.training.distributed import Ranks, start_ranks, stop_ranks
+from ctlev_core.diffusion.training.distributed import DistributedContext, start_distributed, stop_distributed
 from ctlev_core.diffusion.training.trainer import TrainingHistory
 from ctlev_core.processes import die_with_parent, num_cores
 from data_contracts.errors import TrainingError
@@ -33,7 +33,7 @@ def train_in_processes(count: int, module: str, folder: Path, job: Mapping[str, 
         count: of the processes.
         module: name of the module.
         folder: of the job, made where it is not there; arrays that the processes need are the caller's to write.
-        job: JSON values that `run_rank` hands on; `device` is as for `start_ranks`.
+        job: JSON values that `run_rank` hands on; `device` is as for `start_distributed`.
     Raises:
         TrainingError: a process failed; with what each of them said.
     """
@@ -55,7 +55,7 @@ def train_in_processes(count: int, module: str, folder: Path, job: Mapping[str, 
     return TrainingHistory(**json.loads((folder / HISTORY_FILE).read_text()))
 
 
-def run_rank(train: Callable[[dict[str, Any], Path, Ranks, torch.device], TrainingHistory]) -> None:
+def run_rank(train: Callable[[dict[str, Any], Path, DistributedContext, torch.device], TrainingHistory]) -> None:
     """The main program of each of the processes: train, and leave the history, or why there is none, in the folder.
 
     Args:
@@ -66,14 +66,14 @@ def run_rank(train: Callable[[dict[str, Any], Path, Ranks, torch.device], Traini
     rank = int(os.environ["RANK"])
     try:
         job = json.loads((folder / JOB_FILE).read_text())
-        ranks, device = start_ranks(job["device"])
-        history = train(job, folder, ranks, device)
+        distributed, device = start_distributed(job["device"])
+        history = train(job, folder, distributed, device)
     except Exception as error:
         (folder / f"error_{rank}.txt").write_text(str(error))
         raise
     if rank == 0:
         (folder / HISTORY_FILE).write_text(json.dumps(dataclasses.asdict(history)))
-    stop_ranks()
+    stop_distributed()
 
 
 def child_environment(environment: Mapping[str, str], count: int) -> dict[str, str]:

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.training.acceleration import accelerated, autocast, check_precision
-from ctlev_core.diffusion.training.distributed import ALONE, Ranks
+from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.tensorboard import TrainingLog, training_log
 from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 
@@ -30,7 +30,7 @@ def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray
     return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
 
 
-def check_run(trainer: Trainer, ranks: Ranks, *, validated: bool) -> None:
+def check_run(trainer: Trainer, distributed: DistributedContext, *, validated: bool) -> None:
     """Raise ValueError where options do not go together: to be called before anything long starts.
 
     Float16 needs a CUDA device, best weights and early stopping a validation loss, and several processes batches that
@@ -41,7 +41,7 @@ def check_run(trainer: Trainer, ranks: Ranks, *, validated: bool) -> None:
         raise ValueError(
             "the best weights and early stopping need a validation loss: num_validation of 2 and more, and 20 frames"
         )
-    ranks.batches(trainer.options.gradient_accumulation)
+    distributed.batches(trainer.options.gradient_accumulation)
 
 
 def run_training(
@@ -56,14 +56,14 @@ def run_training(
     draw: Callable[[], np.ndarray] | None = None,
     max_seconds: float = math.inf,
     description: str = "training",
-    ranks: Ranks = ALONE,
+    distributed: DistributedContext = SINGLE_PROCESS,
 ) -> TrainingHistory:
     """Train until `num_steps`, or until `max_seconds` over all attempts; the kept weights end up in the models.
 
     Args:
         trainer: holds the parameters; restored from `work/state.pt` where that exists.
         denoiser: what is trained, wholly or in part.
-        schedule: the noise schedule of the prior.
+        schedule: the noise schedule of the base model.
         fetch: micro-batch number to `Batch`; must depend on that number alone.
         seed: of noise and time steps.
         work: folder of the resumable state.
@@ -72,7 +72,7 @@ def run_training(
         max_seconds: a wall-clock budget; the learning rate decays towards whichever end comes first. Only a run without
             it is repeatable, and several processes would not end together.
         description: of the progress bar.
-        ranks: which of several processes this is; they share the batches of a step.
+        distributed: which of several processes this is; they share the batches of a step.
     Returns:
         The loss curves.
     Raises:
@@ -80,19 +80,19 @@ def run_training(
         TrainingError: the loss was not finite ten times in a row, or the state in `work` is of another run.
     """
     options, state, device = trainer.options, work / "state.pt", trainer.parameters[0].device
-    check_run(trainer, ranks, validated=validate is not None)
+    check_run(trainer, distributed, validated=validate is not None)
     if state.is_file():
         trainer.restore(state)
     saved = time.monotonic()
-    folder = options.tensorboard if ranks.rank == 0 else None
+    folder = options.tensorboard if distributed.rank == 0 else None
     with (
         accelerated(denoiser, options, device),
         training_log(folder, trainer.identity[:12], pictures=work / "samples", first_step=trainer.step) as log,
-        _progress_bar(trainer, description, ranks) as bar,
+        _progress_bar(trainer, description, distributed) as bar,
     ):
         while trainer.step < options.num_steps and trainer.seconds < max_seconds and not trainer.out_of_patience:
             started = time.monotonic()
-            loss = _compute_gradients(trainer, denoiser, schedule, fetch, seed, ranks)
+            loss = _compute_gradients(trainer, denoiser, schedule, fetch, seed, distributed)
             progress = max(trainer.step / options.num_steps, trainer.seconds / max_seconds)
             if math.isfinite(loss) and trainer.update(progress):
                 trainer.non_finite = 0
@@ -105,15 +105,15 @@ def run_training(
             if trainer.step % options.log_every == 0:
                 _log(trainer, bar, log)
             if validate and trainer.step % options.validation_every == 0 and trainer.step < options.num_steps:
-                _validate(trainer, validate, log, ranks)
-            _draw(trainer, draw, log, ranks)
+                _validate(trainer, validate, log, distributed)
+            _draw(trainer, draw, log, distributed)
             due = time.monotonic() - saved > options.checkpoint_every_s
-            if ranks.agreed(due) if ranks.sharded else due:
-                _save(trainer, state, ranks)
+            if distributed.agreed(due) if distributed.sharded else due:
+                _save(trainer, state, distributed)
                 saved = time.monotonic()
         if validate and trainer.history.validation_step[-1:] != [trainer.step]:
-            _validate(trainer, validate, log, ranks)
-    _save(trainer, state, ranks)
+            _validate(trainer, validate, log, distributed)
+    _save(trainer, state, distributed)
     return trainer.finish()
 
 
@@ -123,25 +123,25 @@ def _compute_gradients(
     schedule: NoiseSchedule,
     fetch: Callable[[int], Batch],
     seed: int,
-    ranks: Ranks,
+    distributed: DistributedContext,
 ) -> float:
     """Gradients of a step, summed over its batches and over all processes, into the parameters; returns the loss."""
     options, device = trainer.options, trainer.parameters[0].device
-    emphasis = Emphasis(options.snr_gamma, options.max_sample_weight, options.timestep_power)
+    emphasis = Emphasis(options.snr_gamma, options.max_loss_weight, options.timestep_power)
     trainer.optimizer.zero_grad(set_to_none=True)
     total = 0.0
-    for part in ranks.batches(options.gradient_accumulation):
+    for part in distributed.batches(options.gradient_accumulation):
         number = trainer.step * options.gradient_accumulation + part
         noise = generator_for(seed, number)
         with autocast(options, device):
             loss = denoising_loss(denoiser, schedule, fetch(number), noise, emphasis)
         trainer.scaler.scale(loss / options.gradient_accumulation).backward()
         total += loss.item() / options.gradient_accumulation
-    return ranks.sum_gradients(trainer.parameters, total)
+    return distributed.sum_gradients(trainer.parameters, total)
 
 
-def _progress_bar(trainer: Trainer, description: str, ranks: Ranks) -> tqdm:
-    disable = None if ranks.rank == 0 else True
+def _progress_bar(trainer: Trainer, description: str, distributed: DistributedContext) -> tqdm:
+    disable = None if distributed.rank == 0 else True
     total = trainer.options.num_steps
     return tqdm(total=total, initial=trainer.step, desc=description, unit="step", leave=False, disable=disable)
 
@@ -167,23 +167,27 @@ def _log(trainer: Trainer, bar: tqdm, log: TrainingLog) -> None:
     )
 
 
-def _validate(trainer: Trainer, validate: Callable[[], tuple[float, float]], log: TrainingLog, ranks: Ranks) -> None:
+def _validate(
+    trainer: Trainer, validate: Callable[[], tuple[float, float]], log: TrainingLog, distributed: DistributedContext
+) -> None:
     with trainer.using_average():
-        true_loss, shuffled_loss = ranks.agreed(validate())
+        true_loss, shuffled_loss = distributed.agreed(validate())
     trainer.note_validation(true_loss, shuffled_loss)
     curves = {"validation": true_loss, "shuffled": shuffled_loss, "gap": shuffled_loss - true_loss}
     log.scalars(trainer.step, **{f"loss/{name}": value for name, value in curves.items()})
 
 
-def _save(trainer: Trainer, path: Path, ranks: Ranks) -> None:
+def _save(trainer: Trainer, path: Path, distributed: DistributedContext) -> None:
     """Process 0 writes; where weights are shared out, the others hand over their parts."""
-    if ranks.rank == 0 or ranks.sharded:
-        trainer.save(path, write=ranks.rank == 0)
+    if distributed.rank == 0 or distributed.sharded:
+        trainer.save(path, write=distributed.rank == 0)
 
 
-def _draw(trainer: Trainer, draw: Callable[[], np.ndarray] | None, log: TrainingLog, ranks: Ranks) -> None:
+def _draw(
+    trainer: Trainer, draw: Callable[[], np.ndarray] | None, log: TrainingLog, distributed: DistributedContext
+) -> None:
     every = trainer.options.sample_every
-    if draw is not None and every and trainer.step % every == 0 and (ranks.rank == 0 or ranks.sharded):
+    if draw is not None and every and trainer.step % every == 0 and (distributed.rank == 0 or distributed.sharded):
         # Sampling swaps a part of the ControlNet and has other shapes: to compile that anew would take minutes.
         with trainer.using_average(), torch.compiler.set_stance("force_eager"):
             log.picture(trainer.step, draw())

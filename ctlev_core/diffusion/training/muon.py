@@ -1,8 +1,8 @@
 """Muon: steps of momentum with every weight matrix replaced by a nearly orthogonal one, and Adam for all other weights.
 
 A kernel [out, in, h, w] counts as a matrix [out, in * h * w]. All directions of a weight then learn equally fast,
-however seldom the pictures ask for them. In equal time on one core the small prior got further with it than with AdamW
-(`flows/presets/pretraining/small_prior.yaml`), although a step costs as much as the gradients of seven images.
+however seldom the pictures ask for them. In equal time on one core the small base model got further with it than with
+AdamW (`flows/presets/pretraining/small.yaml`), although a step costs as much as the gradients of seven images.
 
 Source: K. Jordan et al., "Muon: an optimizer for hidden layers in neural networks", 2024: the update, the coefficients,
 Nesterov momentum of 0.95. First and last layers are treated like all others here.

@@ -23,7 +23,7 @@ class TrainingOptions(Frozen):
         default=1, gt=0, description="batches an optimiser step; paper: 32 and 64, on 4 GPUs"
     )
     learning_rate: float = Field(
-        default=1e-3, gt=0, description="peak, for the small prior; 1e-5 is usual for Stable Diffusion"
+        default=1e-3, gt=0, description="peak, for the small base model; 1e-5 is usual for Stable Diffusion"
     )
     warmup_steps: int = Field(default=30, ge=0, description="linear rise of the learning rate")
     final_learning_rate: float = Field(
@@ -40,7 +40,7 @@ class TrainingOptions(Frozen):
         description="min-SNR loss weights (Hang et al., ICCV 2023); null = plain; with "
         "v-prediction min-SNR hardly trains the noisy steps, which decide layout and prompt",
     )
-    max_sample_weight: float = Field(
+    max_loss_weight: float = Field(
         default=5.0,
         gt=0,
         description="highest weight of the error of a network that predicts the latents, whose weight snr + 1 grows "
@@ -89,26 +89,27 @@ class TrainingOptions(Frozen):
 
 
 class FineTuningOptions(TrainingOptions):
-    """Fine-tuning of a prior on labelled event images."""
+    """Fine-tuning of a base model on labelled event images."""
 
-    prior: Path | None = Field(
+    base_model: Path | None = Field(
         default=None,
         json_schema_extra=RUN_SETTING,
-        description="diffusers folder, or a file of Stable Diffusion v1; the route's bundled small prior when null",
+        description="diffusers folder, or a file of Stable Diffusion v1; when null the route's bundled small one",
     )
     random_init: bool = Field(
-        default=False, description="ablation: forget the prior's U-Net and ControlNet weights first"
+        default=False, description="ablation: forget the base model's U-Net and ControlNet weights first"
     )
-    max_sample_weight: float = Field(
+    max_loss_weight: float = Field(
         default=100.0,
         gt=0,
         description="highest weight of the error of a network that predicts the latents, whose weight snr + 1 grows "
-        "without bound at little noise: there lone events are decided; what is decided at much noise the prior knows",
+        "without bound at little noise: there isolated events are decided; what is decided at much noise the "
+        "base model knows",
     )
     prompt_dropout: float = Field(
         default=0.0, ge=0, le=1, description="share of empty prompts, needed only for guidance_scale > 1"
     )
-    turned_share: float = Field(
+    rot90_probability: float = Field(
         default=0.0,
         ge=0,
         le=1,

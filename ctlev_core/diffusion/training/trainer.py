@@ -132,7 +132,7 @@ class Trainer:
         if self.non_finite >= MAX_NON_FINITE:
             raise TrainingError(
                 f"loss or gradient was not finite {self.non_finite} times in a row, the last at step {self.step}; "
-                "lower the learning rate, or check frames and prior for values that are not finite"
+                "lower the learning rate, or check frames and base model for values that are not finite"
             )
 
     def note_validation(self, true_loss: float, shuffled_loss: float) -> None:

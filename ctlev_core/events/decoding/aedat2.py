@@ -100,7 +100,7 @@ def read_records(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_record_chunks(path: Path, num_records: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The records of `read_records` in consecutive pieces of `num_records`, the last one shorter.
+    """The records of `read_records` in consecutive chunks of `num_records`, the last one shorter.
 
     Raises:
         DataError: as `read_records`.

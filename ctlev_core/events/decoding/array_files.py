@@ -1,4 +1,4 @@
-"""NumPy's array files in pieces, without ever unpickling: the header is checked before any data is touched.
+"""NumPy's array files in chunks, without ever unpickling: the header is checked before any data is touched.
 
 Source: NumPy, "A simple file format for NumPy arrays" (NEP 1); numpy.lib.format parses headers, which is safe.
 """

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from ctlev_core.events.decoding.sensor_sizes import COMMON_SENSORS, smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize
@@ -76,7 +76,7 @@ def parse_sensor_size(text: str) -> SensorSize | None:
 
 @dataclass
 class _Converter:
-    """Pieces of columns to events; remembers what one piece says about the next."""
+    """Chunks of columns to events; remembers what one chunk says about the next."""
 
     where: str
     whole_floats_are_us: bool
@@ -97,7 +97,7 @@ class _Converter:
         self.num_events += len(x)
 
     def convert(self, columns: Columns, sensor_size: SensorSize) -> Events:
-        """The events of one piece."""
+        """The events of one chunk."""
         x, y, p = self._without_times(columns)
         t = self._times(columns["t"])
         self.num_events += len(t)
@@ -195,16 +195,16 @@ def seconds_to_us(seconds: np.ndarray) -> np.ndarray:
 
 
 def to_events(
-    pieces: Callable[[], Iterator[Columns]],
+    chunks: Callable[[], Iterator[Columns]],
     where: str,
     sensor_size: SensorSize | None = None,
     whole_floats_are_us: bool = False,
     sensors: Sequence[SensorSize] = COMMON_SENSORS,
 ) -> Iterator[Events]:
-    """Pieces of columns as checked events.
+    """Chunks of columns as checked events.
 
     Args:
-        pieces: makes an iterator from the first piece on; called twice where only the whole file tells the sensor size
+        chunks: makes an iterator from the first chunk on; called twice where only the whole file tells the sensor size
             or the unit of the times.
         where: names the file in messages.
         sensor_size: (width, height) px; the first of `sensors` that holds all events where not given.
@@ -217,7 +217,7 @@ def to_events(
     converter = _Converter(where, whole_floats_are_us)
     if sensor_size is None or whole_floats_are_us:
         scanner = _Converter(where, whole_floats_are_us)
-        for columns in pieces():
+        for columns in chunks():
             scanner.scan(columns)
         converter.all_whole = scanner.all_whole
         if sensor_size is None:
@@ -225,4 +225,4 @@ def to_events(
                 raise DataError(f"{where}: no events, and nothing else tells the sensor size")
             sensor_size = smallest_sensor(scanner.largest_x, scanner.largest_y, where, sensors)
     size = sensor_size
-    yield from event_pieces.check_pieces((converter.convert(columns, size) for columns in pieces()), where)
+    yield from event_chunks.check_chunks((converter.convert(columns, size) for columns in chunks()), where)

@@ -93,12 +93,12 @@ def read(path: Path, encoding: str) -> Events:
 
 
 def read_chunks(path: Path, num_events: int, encoding: str) -> Iterator[Events]:
-    """The events of `read` in pieces of `num_events`; where the header tells no sensor size, the file is read twice.
+    """The events of `read` in chunks of `num_events`; where the header tells no sensor size, the file is read twice.
 
     Raises:
         DataError: as `read`.
     """
-    return record_files.read_pieces(_open(path, encoding), num_events)
+    return record_files.read_chunks(_open(path, encoding), num_events)
 
 
 def _open(path: Path, encoding: str) -> record_files.RecordFile:

@@ -1,4 +1,4 @@
-"""Binary event files of fixed-size records: read whole or in pieces through one compiled decoder.
+"""Binary event files of fixed-size records: read whole or in chunks through one compiled decoder.
 
 A decoder takes a run of records and a state, and leaves the state as the next run needs it. The state also gathers what
 `check_events` would have to visit every event for once more: whether times ever went back, and the largest coordinates.
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize
 
@@ -96,8 +96,8 @@ def read(file: RecordFile) -> Events:
     return _checked(file, Events(t, x, y, p, find_sensor_size(file, state, len(t))), state, 0, 0)
 
 
-def read_pieces(file: RecordFile, num_events: int) -> Iterator[Events]:
-    """The events of `read` in pieces of `num_events`, in memory that does not grow with the file.
+def read_chunks(file: RecordFile, num_events: int) -> Iterator[Events]:
+    """The events of `read` in chunks of `num_events`, in memory that does not grow with the file.
 
     The file is read twice where only its events tell the sensor size.
 
@@ -108,7 +108,7 @@ def read_pieces(file: RecordFile, num_events: int) -> Iterator[Events]:
     if callable(sensor_size):
         state, total = scan(file)
         sensor_size = find_sensor_size(file, state, total)
-    yield from event_pieces.regroup(_read_blocks(file, sensor_size, num_events), num_events)
+    yield from event_chunks.regroup(_read_blocks(file, sensor_size, num_events), num_events)
 
 
 def _read_blocks(file: RecordFile, sensor_size: SensorSize, num_events: int) -> Iterator[Events]:
@@ -157,5 +157,5 @@ def _decode(file: RecordFile, items: np.ndarray, state: np.ndarray) -> list[np.n
 def _checked(file: RecordFile, events: Events, state: np.ndarray, num_before: int, last_t: int) -> Events:
     width, height = events.sensor_size
     if state[TIME_WENT_BACK] or state[LARGEST_X] >= width or state[LARGEST_Y] >= height or min(width, height) < 1:
-        event_pieces.check_piece(events, str(file.path), num_before, last_t)
+        event_chunks.check_chunk(events, str(file.path), num_before, last_t)
     return file.finish(events) if file.finish else events

@@ -29,6 +29,6 @@ def floor_tables(scores: Sequence[Manifest]) -> list[Table]:
                 floor = score_text(row["floor"], row["floor_low"], row["floor_high"])
             halved = None if row["halved"] is None else score_text(row["halved"])
             counts = [row[name] for name in ("num_predicted", "num_target", "num_features")]
-            body.append([row["setting"], row["metric"], score_text(row["value"]), halved, floor, *counts])
+            body.append([row["subject"], row["metric"], score_text(row["value"]), halved, floor, *counts])
     columns = ["frames", "score", "all", "halves", "halves of real frames", "number", "real frames", "features"]
     return [Table("How to read the distances", columns, body, caption=_CAPTION)] if body else []

@@ -23,7 +23,7 @@ _TITLES = {
     "frames": (
         "How real do the synthetic frames look?",
         "Event images have no time stamps: what compares them is where and how bright their pixels are. Active: value "
-        "of 25 of 255 and more. Speckle: active pixels in pieces of one or two; isolated: without an active one "
+        "of 25 of 255 and more. Speckle: active pixels in chunks of one or two; isolated: without an active one "
         "around; hot: 128 and more, and four times those around. Contrast: standard deviation over full scale. c2st: "
         "how well a network tells the two sets apart, 0.5 = not at all.",
     ),
@@ -81,10 +81,10 @@ def _series(distributions: Sequence[dict[str, Any]], axis: str) -> Series:
     rows = [row for row in distributions if row["axis"] == axis]
     series: Series = {}
     # Real frames are in the comparison with each generator, and the same in all.
-    groups = {row["setting"]: row["group"] for row in reversed(rows)}
-    for setting in dict.fromkeys(row["setting"] for row in rows):
-        of_set = [row for row in rows if row["setting"] == setting and row["group"] == groups[setting]]
-        series[setting] = ([row["centre"] for row in of_set], [row["share"] for row in of_set])
+    groups = {row["subject"]: row["group"] for row in reversed(rows)}
+    for subject in dict.fromkeys(row["subject"] for row in rows):
+        of_set = [row for row in rows if row["subject"] == subject and row["group"] == groups[subject]]
+        series[subject] = ([row["centre"] for row in of_set], [row["share"] for row in of_set])
     return series
 
 
@@ -111,14 +111,14 @@ def _spectra(series: Series) -> list[Section]:
 
 def _table(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
     """Numbers down; the two sets, their ratio and distance, and the floor across."""
-    found = {(row["setting"], row["metric"]): row for row in rows}
-    sets = [name for name in dict.fromkeys(row["setting"] for row in rows) if " against " not in name]
+    found = {(row["subject"], row["metric"]): row for row in rows}
+    sets = [name for name in dict.fromkeys(row["subject"] for row in rows) if " against " not in name]
     first, second = (*sets, "", "")[:2]
-    settings = (first, second, f"{second} against {first}", f"{first} against {first}")
+    subjects = (first, second, f"{second} against {first}", f"{first} against {first}")
     body: list[list[str]] = []
     bold: set[tuple[int, int]] = set()
     for metric in dict.fromkeys(row["metric"] for row in rows):
-        cells = [found.get((setting, metric)) for setting in settings]
+        cells = [found.get((subject, metric)) for subject in subjects]
         if _is_above(cells[2], cells[3]):
             bold.add((len(body), _DISTANCE_COLUMN))
         ratio = _ratio(cells[0], cells[1])
@@ -126,7 +126,7 @@ def _table(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
             bold.add((len(body), _RATIO_COLUMN))
         numbers, rest = [_cell(cell) for cell in cells[:2]], [_cell(cell) for cell in cells[2:]]
         body.append([metric, *numbers, "" if ratio is None else _digits(ratio, 2), *rest])
-    counts = [next((row["num_samples"] for row in rows if row["setting"] == name), 0) for name in (first, second)]
+    counts = [next((row["num_samples"] for row in rows if row["subject"] == name), 0) for name in (first, second)]
     columns = [
         "number", f"{first} ({counts[0]})", f"{second} ({counts[1]})", "ratio", "distance", f"floor: {first}, halves",
     ]  # fmt: skip

@@ -8,6 +8,7 @@ from typing import Any
 
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.score_tables import interval_over_trainings, trained_rows
+from data_contracts.training_sets import REAL, TrainingSet
 
 
 @dataclass(frozen=True)
@@ -33,23 +34,25 @@ def scaling_points(rows: Sequence[dict[str, Any]], metric: str) -> list[ScalePoi
     """The points of every generator of which several amounts were added to real data.
 
     Args:
-        rows: of the table `scores`; settings `real`, `real+NAME` (all frames) and `real+NAME@SHARE`.
+        rows: of the table `scores`; training sets `real`, `real+NAME` (all frames) and `real+NAME@SHARE`.
         metric: which score.
     """
-    of_setting: dict[str, list[dict[str, Any]]] = {}
+    of_set: dict[str, list[dict[str, Any]]] = {}
     for row in trained_rows(rows):
         if row["group"] == "all" and row["metric"] == metric:
-            of_setting.setdefault(row["setting"], []).append(row)
-    real = of_setting.get("real")
+            of_set.setdefault(row["subject"], []).append(row)
+    real = of_set.get(REAL)
     if not real or not real[0]["num_train"]:
         return []
-    names = {setting.partition("@")[0] for setting in of_setting if "@" in setting}
+    parsed = {TrainingSet.parse(name): found for name, found in of_set.items()}
+    varied = {one.whole for one in parsed if one.in_part and one.names[0] == REAL}
     points = []
-    for name in sorted(name for name in names if name.startswith("real+")):
-        for setting, found in of_setting.items():
-            if setting in ("real", name) or setting.startswith(f"{name}@"):
+    for whole in sorted(varied, key=str):
+        for training_set, found in parsed.items():
+            if training_set == TrainingSet.of(REAL) or training_set.whole == whole:
                 ratio = found[0]["num_train"] / real[0]["num_train"] - 1
-                points.append(ScalePoint(name.removeprefix("real+"), ratio, *interval_over_trainings(found)))
+                added = str(TrainingSet(whole.sources[1:]))
+                points.append(ScalePoint(added, ratio, *interval_over_trainings(found)))
     return points
 
 

@@ -1,7 +1,7 @@
 """The tables of scores: what training on synthetic data is worth, whether frames show their labels, and distances.
 
-Rows are those of the table `scores`; whatever settings, tasks and metrics occur are shown. Bold cells are only those
-whose paired interval says so.
+Rows are those of the table `scores`; whatever training sets, tasks and metrics occur are shown. Bold cells are only
+those whose paired interval says so.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference, Trainings, paired_difference, read_trainings
-from data_contracts.experiment import LABELS_OF, SHUFFLED
+from data_contracts.training_sets import LabelAgreement, TrainingSet
 
 Row = dict[str, Any]
 ORIGINS = "classes with"
@@ -26,28 +26,28 @@ SUBJECTS = ("subject ", "subjects ")
 """Groups that begin so are one subject, or subjects by whether they were learnt from."""
 _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
 _ENOUGH = 5
-"""Trainings of a setting from which their spread is known well enough to say no more about it."""
-_SETTINGS = {
-    "more_real": "real frames of the very poses that synthetic frames are sampled from: the most they can give",
-    "faithful": "the synthetic frames whose labels a model trained on real frames finds best",
+"""Trainings of a training set from which their spread is known well enough to say no more about it."""
+_SOURCES = {
+    "oracle": "real frames of the very poses that synthetic frames are sampled from: the most they can give",
+    "label_consistent": "the synthetic frames whose labels a model trained on real frames finds best",
     "synthetic": "frames of the experiment's own generator",
     "real": "the labelled real frames that every generator learnt from",
 }
 
 
 class PairedScores:
-    """The scores of single samples, by setting and score, of all trainings."""
+    """The scores of single samples, by training set and score, of all trainings."""
 
     def __init__(self, samples: pa.Table) -> None:
         """Args: a table of the schema `PAIRED_SAMPLES`."""
         self._trainings = read_trainings(samples)
 
-    def of(self, setting: str, metric: str) -> Trainings | None:
-        """The trainings of a setting, where they have scores of single samples, all of the same ones."""
-        return self._trainings.get((setting, metric))
+    def of(self, training_set: str, metric: str) -> Trainings | None:
+        """The trainings of a training set, where they have scores of single samples, all of the same ones."""
+        return self._trainings.get((training_set, metric))
 
     def difference(self, before: str, after: str, metric: str) -> Difference | None:
-        """The second setting minus the first; None where they were not both scored on the same samples."""
+        """The second training set minus the first; None where they were not both scored on the same samples."""
         first, second = self.of(before, metric), self.of(after, metric)
         if first is None or second is None or not first.scores_the_same_as(second):
             return None
@@ -56,7 +56,7 @@ class PairedScores:
 
 def is_about_labels(row: Row) -> bool:
     """Does the row score synthetic frames against labels, rather than a model on real test data?"""
-    return row["setting"].startswith((LABELS_OF, SHUFFLED))
+    return LabelAgreement.parse(row["subject"]) is not None
 
 
 def trained_rows(rows: Iterable[Row]) -> list[Row]:
@@ -64,26 +64,26 @@ def trained_rows(rows: Iterable[Row]) -> list[Row]:
     return [row for row in rows if row["task"] != "distance" and not is_about_labels(row)]
 
 
-def score_tables(rows: list[Row], settings: Sequence[str], paired: PairedScores) -> list[Table]:
+def score_tables(rows: list[Row], training_sets: Sequence[str], paired: PairedScores) -> list[Table]:
     """The headline tables first, one a task; then labels and distances.
 
     Args:
         rows: of the table `scores`, of all trainings.
-        settings: what was trained on, in the order of the tables; others follow as they come.
+        training_sets: what was trained on, in the order of the tables; others follow as they come.
         paired: for the differences.
     """
     trained = [row for row in trained_rows(rows) if row["group"] == "all"]
-    order = {setting: number for number, setting in enumerate(settings)}
-    trained.sort(key=lambda row: order.get(row["setting"], len(order)))
+    order = {training_set: number for number, training_set in enumerate(training_sets)}
+    trained.sort(key=lambda row: order.get(row["subject"], len(order)))
     tasks = list(dict.fromkeys(row["task"] for row in trained))
     found = []
     for task in tasks:
         of_task = [row for row in trained if row["task"] == task]
         found.append(_headline(of_task, "" if len(tasks) == 1 else f"{task}: ", paired))
-        found += _one_against_rest(of_task, list(dict.fromkeys(row["setting"] for row in of_task)))
+        found += _one_against_rest(of_task, list(dict.fromkeys(row["subject"] for row in of_task)))
     labels = [row for row in rows if row["task"] != "distance" and is_about_labels(row) and row["group"] == "all"]
     if labels:
-        floor = [{**row, "setting": "held-out real (floor)"} for row in trained if row["setting"] == "real"]
+        floor = [{**row, "subject": "held-out real (floor)"} for row in trained if row["subject"] == "real"]
         caption = (
             "The model trained on real frames, scored on synthetic frames against the labels they were sampled from, "
             "beside its score on held-out real frames. Shuffled: the same frames against labels of others, which is "
@@ -103,14 +103,14 @@ def score_tables(rows: list[Row], settings: Sequence[str], paired: PairedScores)
     return found
 
 
-def group_tables(rows: list[Row], settings: Sequence[str]) -> tuple[list[Table], list[Table]]:
+def group_tables(rows: list[Row], training_sets: Sequence[str]) -> tuple[list[Table], list[Table]]:
     """The first score by group: classes by where they were to be learnt from and subjects, and class by class."""
     groups = [row for row in trained_rows(rows) if row["group"] != "all"]
     if not groups:
         return [], []
     metric = groups[0]["metric"]
     groups = [row for row in groups if row["metric"] == metric]
-    names = list(dict.fromkeys([*settings, *(row["setting"] for row in groups)]))
+    names = list(dict.fromkeys([*training_sets, *(row["subject"] for row in groups)]))
     by_origin = [row for row in groups if row["group"].startswith(ORIGINS)]
     by_subject = [row for row in groups if row["group"].startswith(SUBJECTS)]
     by_class = [row for row in groups if not row["group"].startswith((ORIGINS, *SUBJECTS))]
@@ -156,22 +156,22 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
     chance = [row for row in rows if row["metric"].startswith(_CHANCE)]
     rows = [row for row in rows if not row["metric"].startswith((_CHANCE, _ONE_CLASS)) or _is_mean(row["metric"])]
     metrics = list(dict.fromkeys(row["metric"] for row in rows))
-    settings = list(dict.fromkeys(row["setting"] for row in rows))
+    training_sets = list(dict.fromkeys(row["subject"] for row in rows))
     body: list[list[Cell]] = []
     bold: set[tuple[int, int]] = set()
-    for setting in settings:
-        of_setting = [row for row in rows if row["setting"] == setting]
-        differences = [paired.difference("real", setting, metric) for metric in metrics]
+    for training_set in training_sets:
+        of_set = [row for row in rows if row["subject"] == training_set]
+        differences = [paired.difference("real", training_set, metric) for metric in metrics]
         for column, (metric, difference) in enumerate(zip(metrics, differences, strict=True), 1):
             if difference is not None and difference.is_certain:
                 better = (difference.value < 0) == lower_is_better(metric)
                 bold |= {(len(body), column)} if better else set()
-        first = differences[0] if setting != "real" else None
+        first = differences[0] if training_set != "real" else None
         if first is not None and first.is_certain:
             bold.add((len(body), len(metrics) + 1))
-        cells: list[Cell] = [cell_text([row for row in of_setting if row["metric"] == metric]) for metric in metrics]
-        counts = [len({_training(row) for row in of_setting}), of_setting[0]["num_train"]]
-        body.append([setting, *cells, "" if first is None else first.text(), *counts])
+        cells: list[Cell] = [cell_text([row for row in of_set if row["metric"] == metric]) for metric in metrics]
+        counts = [len({_training(row) for row in of_set}), of_set[0]["num_train"]]
+        body.append([training_set, *cells, "" if first is None else first.text(), *counts])
     columns = ["trained on", *map(_heading, metrics), f"{metrics[0]}: minus real"]
     columns += ["trainings", "frames trained on"]
     caption = (
@@ -180,15 +180,19 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
         "test recordings and trainings. Bold: better than `real`, or a difference from it that is not 0, as the "
         "interval of the difference says that compares sample by sample."
     )
-    notes = [f"`{name}`: {text}" for name, text in _SETTINGS.items() if any(name in s.split("+") for s in settings)]
+    parsed = [TrainingSet.parse(training_set) for training_set in training_sets]
+    notes = [f"`{name}`: {text}" for name, text in _SOURCES.items() if any(name in one.names for one in parsed)]
     explained = {find_score(name).meaning: name for name in metrics if find_score(name).meaning}
     notes += [f"`{name}`: {text}" for text, name in explained.items()]
-    if any("@" in setting for setting in settings):
+    if any(one.in_part for one in parsed):
         notes.append("`synthetic@SHARE`: the first part of the synthetic frames")
     notes += [
         f"`{name}`: {score_text(value)}" for name, value in {row["metric"]: row["value"] for row in chance}.items()
     ]
-    if min(len({_training(row) for row in rows if row["setting"] == setting}) for setting in settings) < _ENOUGH:
+    if (
+        min(len({_training(row) for row in rows if row["subject"] == training_set}) for training_set in training_sets)
+        < _ENOUGH
+    ):
         notes.append(
             "Intervals cannot cover the spread between trainings where there is one, and cover it poorly where there "
             "are two or three."
@@ -200,12 +204,12 @@ def _is_mean(metric: str) -> bool:
     return metric.endswith("_mean")
 
 
-def _one_against_rest(rows: list[Row], settings: Sequence[str]) -> list[Table]:
-    """Classes down, settings across: the layout of the paper's Table 5."""
+def _one_against_rest(rows: list[Row], training_sets: Sequence[str]) -> list[Table]:
+    """Classes down, training sets across: the layout of the paper's Table 5."""
     binary = [row for row in rows if row["metric"].startswith(_ONE_CLASS) and not _is_mean(row["metric"])]
     rows = [{**row, "group": row["metric"].removeprefix(_ONE_CLASS)} for row in binary]
     caption = "Accuracy of telling a class from the others with as many negatives as positives; 0.5 is chance."
-    return [_by_group("One class against the others", rows, settings, caption)] if rows else []
+    return [_by_group("One class against the others", rows, training_sets, caption)] if rows else []
 
 
 def _training(row: Row) -> tuple:
@@ -226,20 +230,24 @@ def _pivot(
     """Settings down, metrics across."""
     metrics = list(dict.fromkeys(row["metric"] for row in rows))
     body: list[list[Cell]] = []
-    for setting in dict.fromkeys(row["setting"] for row in rows):
-        of_setting = [row for row in rows if row["setting"] == setting]
-        cells: list[Cell] = [cell_text([row for row in of_setting if row["metric"] == metric]) for metric in metrics]
-        body.append([setting, *cells, of_setting[0]["num_train"], of_setting[0]["num_samples"]])
+    for training_set in dict.fromkeys(row["subject"] for row in rows):
+        of_set = [row for row in rows if row["subject"] == training_set]
+        cells: list[Cell] = [cell_text([row for row in of_set if row["metric"] == metric]) for metric in metrics]
+        body.append([training_set, *cells, of_set[0]["num_train"], of_set[0]["num_samples"]])
     return Table(title, [first, *map(_heading, metrics), *counts], body, caption=caption)
 
 
-def _by_group(title: str, rows: list[Row], settings: Sequence[str], caption: str = "", first: str = "classes") -> Table:
+def _by_group(
+    title: str, rows: list[Row], training_sets: Sequence[str], caption: str = "", first: str = "classes"
+) -> Table:
     body: list[list[Cell]] = []
     for group in dict.fromkeys(row["group"] for row in rows):
         of_group = [row for row in rows if row["group"] == group]
-        cells: list[Cell] = [cell_text([row for row in of_group if row["setting"] == setting]) for setting in settings]
+        cells: list[Cell] = [
+            cell_text([row for row in of_group if row["subject"] == training_set]) for training_set in training_sets
+        ]
         body.append([group, *cells, of_group[0]["num_samples"]])
-    return Table(title, [first, *settings, "frames scored"], body, caption=caption)
+    return Table(title, [first, *training_sets, "frames scored"], body, caption=caption)
 
 
 def cell_text(rows: Sequence[Row]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.score_tables import interval_over_trainings
-from data_contracts.experiment import LABELS_OF
+from data_contracts.training_sets import REAL, LabelAgreement, TrainingSet
 
 FEWEST_AMOUNTS = 2
 """Amounts of training that are worth a line."""
@@ -18,7 +18,7 @@ _CAPTION = (
 )
 
 
-def prior_figures(
+def base_model_figures(
     rows: Sequence[dict[str, Any]], options: Mapping[str, Mapping[str, Any]], metric: str
 ) -> list[Curves]:
     """Label error, distance to real frames, and the error of a model trained on them too, over steps of fine-tuning;
@@ -26,7 +26,7 @@ def prior_figures(
 
     Args:
         rows: of the table `scores`.
-        options: of each generator that learnt, by its name: `num_steps`, and `random_init` where it has a prior.
+        options: of each generator that learnt, by its name: `num_steps`, and `random_init` where it has a base model.
         metric: of the labels.
     """
     found: dict[str, dict[int, str]] = {PRE_TRAINED: {}, RANDOM: {}}
@@ -39,22 +39,23 @@ def prior_figures(
         (r["metric"] for r in rows if r["task"] == "distance" and r["metric"].startswith(("fd", "fid"))), ""
     )
     figures = []
-    for title, prefix, wanted in (
-        ("Are labels found in the frames?", f"{LABELS_OF} ", metric),
-        ("How far are the frames from real ones?", "", distance),
-        ("What does a model learn from real frames and these?", "real+", metric),
+    for title, subject_of, wanted in (
+        ("Are labels found in the frames?", LabelAgreement, metric),
+        ("How far are the frames from real ones?", str, distance),
+        ("What does a model learn from real frames and these?", lambda name: TrainingSet.of(REAL, name), metric),
     ):
         series: dict[str, tuple[list[float], list[float]]] = {}
         spans: dict[str, tuple[list[float], list[float]]] = {}
         for start, names in found.items():
             for num_steps, name in sorted(names.items()):
-                scored = [r for r in rows if (r["setting"], r["metric"], r["group"]) == (prefix + name, wanted, "all")]
+                subject = str(subject_of(name))
+                scored = [r for r in rows if (r["subject"], r["metric"], r["group"]) == (subject, wanted, "all")]
                 if scored:
                     value, low, high = interval_over_trainings(scored)
                     _append(series.setdefault(start, ([], [])), float(num_steps), value)
                     _append(spans.setdefault(start, ([], [])), low, high)
         if series:
-            steps, far = "optimiser steps of fine-tuning", not prefix
+            steps, far = "optimiser steps of fine-tuning", wanted == distance
             figures.append(Curves(title, series, steps, wanted, log_x=True, log_y=far, caption=_CAPTION, spans=spans))
     return figures
 

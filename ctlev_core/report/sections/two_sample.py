@@ -33,20 +33,20 @@ def two_sample_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
     """
     body: list[list[Cell]] = []
     bold: set[tuple[int, int]] = set()
-    for row in sorted(rows, key=lambda row: row["setting"] not in _NAMES):
+    for row in sorted(rows, key=lambda row: row["subject"] not in _NAMES):
         area = deviation = None
         if row["value"] is not None:
             area, deviation = score_text(row["value"], row["low"], row["high"]), f"{row['deviation']:.3f}"
             if row["low"] is not None and row["low"] > 0.5:
                 bold.add((len(body), _AREA_COLUMN))
         counts = f"{row['num_first']} + {row['num_second']}"
-        body.append([_name(row["setting"]), area, deviation, counts, row["note"]])
+        body.append([_name(row["subject"]), area, deviation, counts, row["note"]])
     columns = ["frames", "area (c2st)", "sd", "number", "note"]
     title = "Can a network tell synthetic from recorded frames?"
     return [Table(title, columns, body, caption=_CAPTION, bold=bold)] if body else []
 
 
-def _name(setting: str) -> str:
-    first, _, second = setting.partition(" against ")
+def _name(subject: str) -> str:
+    first, _, second = subject.partition(" against ")
     against = {"real": "recorded training frames", "test": "recorded test frames"}.get(second, second)
-    return _NAMES.get(setting, f"{first} from {against}")
+    return _NAMES.get(subject, f"{first} from {against}")

@@ -11,7 +11,7 @@ import numpy as np
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
-from data_contracts.experiment import LABELS_OF, SHUFFLED
+from data_contracts.training_sets import SYNTHETIC, LabelAgreement
 
 
 def in_range(score: Difference, metric: str) -> Difference:
@@ -28,26 +28,26 @@ def made_better(difference: Difference, metric: str) -> bool | None:
 
 def verdict(
     rows: list[dict[str, Any]],
-    settings: Sequence[str],
+    training_sets: Sequence[str],
     difference: Difference | None = None,
     beside: Mapping[str, Difference | None] | None = None,
-    ceiling: tuple[Difference, Difference | None] | None = None,
+    oracle: tuple[Difference, Difference | None] | None = None,
     instead: Difference | None = None,
 ) -> str:
     """Compare training on real data with training on real and synthetic data, and synthetic data with baselines.
 
     Args:
         rows: rows of the table `scores`.
-        settings: the settings that were trained; the first metric found is the one compared.
+        training_sets: the training sets that were trained; the first metric found is the one compared.
         difference: real + synthetic minus real in that metric, paired by sample.
         beside: for each baseline, real + synthetic minus real + baseline, paired by sample.
-        ceiling: real + more real minus real, and the share of that gain which synthetic data reached (None where the
+        oracle: real + oracle minus real, and the share of that gain which synthetic data reached (None where the
             gain is not certain).
         instead: synthetic alone minus real, likewise; told where nothing was trained on both together.
     Returns:
         A few sentences. A change counts as shown only where the interval of the difference excludes zero.
     """
-    scored = [row for row in rows if row["group"] == "all" and row["setting"] in settings]
+    scored = [row for row in rows if row["group"] == "all" and row["subject"] in training_sets]
     if not scored:
         return "No downstream model was scored."
     metric = scored[0]["metric"]
@@ -55,18 +55,18 @@ def verdict(
     beside = beside or {}
     own = {name: values[name] for name in ("real", "synthetic", "real+synthetic") if name in values}
     if not own:
-        own = {name: values[name] for name in settings if name in values}
+        own = {name: values[name] for name in training_sets if name in values}
     sense = f"{'lower' if lower_is_better(metric) else 'higher'} is better"
     summary = f"{metric} ({'; '.join(filter(None, (find_score(metric).meaning, sense)))}) on held-out real data: "
-    summary += ", ".join(f"{setting} {score_text(value)}" for setting, value in own.items()) + "."
+    summary += ", ".join(f"{training_set} {score_text(value)}" for training_set, value in own.items()) + "."
     if "real+synthetic" not in values and instead is not None and {"real", "synthetic"} <= values.keys():
         told = _what_it_did(instead, metric, values["real"], "Training on synthetic data instead of real data")
         return f"{summary} {told} {_labels(values)}".rstrip()
     if difference is None or "real" not in values or "real+synthetic" not in values:
         return summary
     sentences = [summary, _what_it_did(difference, metric, values["real"])]
-    if ceiling is not None and "real+more_real" in values:
-        sentences.append(_ceiling(*ceiling))
+    if oracle is not None and "real+oracle" in values:
+        sentences.append(_oracle(*oracle))
     for name, compared in beside.items():
         if compared is not None and f"real+{name}" in values:
             sentences.append(_beside(name, values[f"real+{name}"], compared, metric))
@@ -75,12 +75,12 @@ def verdict(
 
 
 def _means(rows: list[dict[str, Any]], metric: str) -> dict[str, float]:
-    """Mean over trainings of each setting's score on all rows."""
+    """Mean over trainings of each training set's score on all rows."""
     found: dict[str, list[float]] = {}
     for row in rows:
         if row["group"] == "all" and row["metric"] == metric:
-            found.setdefault(row["setting"], []).append(row["value"])
-    return {setting: float(np.mean(values)) for setting, values in found.items()}
+            found.setdefault(row["subject"], []).append(row["value"])
+    return {training_set: float(np.mean(values)) for training_set, values in found.items()}
 
 
 def _what_it_did(difference: Difference, metric: str, real: float, what: str = "Adding synthetic data") -> str:
@@ -97,7 +97,7 @@ def _what_it_did(difference: Difference, metric: str, real: float, what: str = "
     return f"{what} made it {'better' if better else 'worse'}: {text}{share}."
 
 
-def _ceiling(gain: Difference, share: Difference | None) -> str:
+def _oracle(gain: Difference, share: Difference | None) -> str:
     beginning = f"Real frames of the same poses in the place of synthetic ones change it by {gain.text()}"
     if share is None:
         return f"{beginning}."
@@ -117,7 +117,7 @@ def _beside(name: str, value: float, difference: Difference, metric: str) -> str
 
 def _labels(values: Mapping[str, float]) -> str:
     """Whether synthetic frames show their labels, as the model trained on real frames sees them."""
-    own, shuffled = (values.get(f"{begin} synthetic") for begin in (LABELS_OF, SHUFFLED))
+    own, shuffled = (values.get(str(LabelAgreement(SYNTHETIC, shuffled))) for shuffled in (False, True))
     if own is None:
         return ""
     control = "" if shuffled is None else f", and {score_text(shuffled)} on them with shuffled labels"

@@ -1,7 +1,7 @@
 """The numbers of the paper's Tables 1 to 5, to be read beside an experiment's own and never against them.
 
 Source: Hu et al., ControlEvents, WACV 2026. They were measured on N-ImageNet, DHP19, CDEHP, Event-HPE and N-Caltech101
-with Stable Diffusion as the prior. Bold is the paper's; it gives no intervals.
+with Stable Diffusion as the base model. Bold is the paper's; it gives no intervals.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ TABLES = (CLASSIFICATION, POSE_2D, BODY_3D, DISTANCES, ZERO_SHOT)
 def paper_section() -> Folded:
     """All five tables, closed."""
     caption = (
-        "Other data, other priors, other sizes: these numbers of the paper (Hu et al., ControlEvents, WACV 2026) say "
-        "what its authors found on real datasets, and none of them is comparable with a number of this report. The "
+        "Other data, other base models, other sizes: these numbers of the paper (Hu et al., ControlEvents, WACV 2026) "
+        "say what its authors found on real datasets, and none of them is comparable with a number of this report. The "
         "paper gives no intervals; bold is the paper's."
     )
     return Folded("The paper's own numbers, on other data", TABLES, caption)

@@ -1,6 +1,6 @@
 """Groups of experiments that differ in their draw of training recordings alone, told as one column each.
 
-The page of a study with groups begins with them: whether synthetic frames helped, every setting's score, the
+The page of a study with groups begins with them: whether synthetic frames helped, every training set's score, the
 differences that matter, and accuracy over the number of real recordings.
 """
 
@@ -23,31 +23,31 @@ from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
 from ctlev_core.statistics.pooled_scores import PooledScores, pool_values
-from data_contracts.experiment import LABELS_OF
+from data_contracts.training_sets import LABEL_CONSISTENT, ORACLE, REAL, SYNTHETIC, LabelAgreement, TrainingSet
 
-REAL, OWN, BOTH = "real", "synthetic", "real+synthetic"
-LABELS = f"{LABELS_OF} {OWN}"
+BOTH = str(TrainingSet.of(REAL, SYNTHETIC))
+LABELS = str(LabelAgreement(SYNTHETIC))
 _FRAMES = {
     REAL: "real frames",
-    OWN: "synthetic frames",
+    SYNTHETIC: "synthetic frames",
     "augmentation": "augmented copies of real frames",
     "random_weights": "synthetic frames of a generator from random weights",
     "simulator": "simulated frames",
-    "more_real": "more real frames",
-    "faithful": "the synthetic frames with the clearest labels",
+    ORACLE: "more real frames",
+    LABEL_CONSISTENT: "the synthetic frames with the clearest labels",
 }
-"""What the parts of a setting's name stand for, in reading order."""
+"""What the parts of a training set's name stand for, in reading order."""
 _COMPARED = (
     (REAL, BOTH, "real and synthetic frames, against real frames alone"),
     ("real+augmentation", BOTH, "real and synthetic frames, against real frames and augmented copies"),
     ("real+augmentation", "real+synthetic+augmentation", "synthetic frames on top of augmented copies"),
-    (REAL, OWN, "synthetic frames alone, against real frames alone"),
-    ("random_weights", OWN, "synthetic frames: pre-trained weights against random weights"),
+    (REAL, SYNTHETIC, "synthetic frames alone, against real frames alone"),
+    ("random_weights", SYNTHETIC, "synthetic frames: pre-trained weights against random weights"),
     ("real+simulator", BOTH, "real and synthetic frames, against real and simulated frames"),
 )
 """Before, after, and what the row is called."""
-_CEILING = "real+more_real"
-_LINES = (REAL, "real+augmentation", BOTH, OWN, "real+simulator")
+_WITH_ORACLE = str(TrainingSet.of(REAL, ORACLE))
+_LINES = (REAL, "real+augmentation", BOTH, SYNTHETIC, "real+simulator")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Group:
             [
                 row["value"]
                 for row in part.rows
-                if (row["setting"], row["metric"], row["group"]) == (LABELS, self.metric, "all")
+                if (row["subject"], row["metric"], row["group"]) == (LABELS, self.metric, "all")
             ]
             for part in self.parts
         ]
@@ -85,13 +85,13 @@ class Group:
             return None
         return in_range(pool_values(np.array(draws), self.scores.num_generators), self.metric)
 
-    def score(self, setting: str) -> Difference:
-        """Of a setting that every experiment has."""
-        return in_range(self.scores.score(setting), self.metric)
+    def score(self, training_set: str) -> Difference:
+        """Of a training set that every experiment has."""
+        return in_range(self.scores.score(training_set), self.metric)
 
     def difference(self, before: str, after: str) -> Difference | None:
-        """The second setting minus the first; None where it has not both."""
-        return self.scores.difference(before, after) if {before, after} <= set(self.scores.settings) else None
+        """The second training set minus the first; None where it has not both."""
+        return self.scores.difference(before, after) if {before, after} <= set(self.scores.training_sets) else None
 
 
 def pool_parts(name: str, parts: Sequence[Part], samples: Sequence[pa.Table], num_generators: int) -> Group:
@@ -115,7 +115,7 @@ def pooled_verdict(groups: Sequence[Group]) -> str:
 
 
 def pooled_tables(groups: Sequence[Group]) -> list[Table]:
-    """Scores of all settings; differences; how probable it is that one setting beats another."""
+    """Scores of all training sets; differences; how probable it is that one training set beats another."""
     return [_score_table(groups), *_difference_tables(groups)]
 
 
@@ -129,15 +129,15 @@ def pooled_chart(groups: Sequence[Group]) -> list[Curves]:
     series: dict[str, tuple[list[float], list[float]]] = {}
     spans: dict[str, tuple[list[float], list[float]]] = {}
     apart = 0.02 if min(places) > 0 else 0.0
-    for number, setting in enumerate(_LINES):
+    for number, training_set in enumerate(_LINES):
         # A little beside one another, so that no bar hides another.
         points = [
-            (place * (1 + apart) ** (number - len(_LINES) // 2), group.score(setting))
+            (place * (1 + apart) ** (number - len(_LINES) // 2), group.score(training_set))
             for place, group in sorted(zip(places, groups, strict=True), key=lambda pair: pair[0])
-            if setting in group.scores.settings
+            if training_set in group.scores.training_sets
         ]
         if points:
-            name = _in_words(setting)
+            name = _in_words(training_set)
             series[name] = [place for place, _ in points], [score.value for _, score in points]
             spans[name] = [score.low for _, score in points], [score.high for _, score in points]
     metric = groups[0].metric
@@ -168,7 +168,7 @@ def _sentence(group: Group) -> str:
     added = group.difference(REAL, BOTH)
     if added is None:
         return f"{group.name}: nothing was trained on real and synthetic frames together."
-    before, after = (score_text(group.score(setting).value) for setting in (REAL, BOTH))
+    before, after = (score_text(group.score(training_set).value) for training_set in (REAL, BOTH))
     what = "adding synthetic frames to the real ones"
     numbers = f"{group.metric} went from {before} to {after}, a difference of {added.text()}"
     told = f"{group.name}: {_told(added, group.metric, what)}; {numbers}"
@@ -191,40 +191,40 @@ def _told(difference: Difference, metric: str, what: str) -> str:
     return {True: f"{what} helped", False: f"{what} did harm", None: f"whether {what} helped is undecided"}[better]
 
 
-def _in_words(setting: str) -> str:
-    """A setting in plain words: `real and synthetic frames`."""
-    if setting == BOTH:
+def _in_words(training_set: str) -> str:
+    """A training set in plain words: `real and synthetic frames`."""
+    if training_set == BOTH:
         return "real and synthetic frames"
-    parts = [_FRAMES.get(part, f"frames of {part.replace('_', ' ')}") for part in setting.split("+")]
+    parts = [_FRAMES.get(part, f"frames of {part.replace('_', ' ')}") for part in TrainingSet.parse(training_set).names]
     if len(parts) == 1:
         return f"{parts[0]} alone"
     return f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
-def _reading_order(settings: Sequence[str]) -> list[str]:
+def _reading_order(training_sets: Sequence[str]) -> list[str]:
     """Real frames alone, real frames with others, then others alone; within these as `_FRAMES` names them."""
     known = list(_FRAMES)
 
-    def place(setting: str) -> tuple:
-        parts = setting.split("+")
-        kind = 0 if parts == [REAL] else 1 if REAL in parts else 2
+    def place(training_set: str) -> tuple:
+        parts = TrainingSet.parse(training_set).names
+        kind = 0 if parts == (REAL,) else 1 if REAL in parts else 2
         others = [known.index(part) if part in known else len(known) for part in parts]
         return kind, len(parts), others
 
-    return sorted(settings, key=place)
+    return sorted(training_sets, key=place)
 
 
 def _score_table(groups: Sequence[Group]) -> Table:
     metric = groups[0].metric
-    settings = _reading_order(list(dict.fromkeys(name for group in groups for name in group.scores.settings)))
+    training_sets = _reading_order(list(dict.fromkeys(name for group in groups for name in group.scores.training_sets)))
     body: list[list[Cell]] = []
     bold: set[tuple[int, int]] = set()
-    for setting in settings:
-        row: list[Cell] = [f"{_in_words(setting)} (`{setting}`)"]
+    for training_set in training_sets:
+        row: list[Cell] = [f"{_in_words(training_set)} (`{training_set}`)"]
         for column, group in enumerate(groups, 1):
-            known = setting in group.scores.settings
-            row.append(_score(group.score(setting)) if known else "")
-            difference = group.difference(REAL, setting)
+            known = training_set in group.scores.training_sets
+            row.append(_score(group.score(training_set)) if known else "")
+            difference = group.difference(REAL, training_set)
             if difference is not None and made_better(difference, metric):
                 bold.add((len(body), column))
         body.append(row)
@@ -297,9 +297,9 @@ def _probability(group: Group, before: str, after: str) -> str:
 
 
 def _share(group: Group) -> str:
-    if not {REAL, BOTH, _CEILING} <= set(group.scores.settings):
+    if not {REAL, BOTH, _WITH_ORACLE} <= set(group.scores.training_sets):
         return ""
-    share = group.scores.share_of_gain(REAL, BOTH, _CEILING)
+    share = group.scores.share_of_gain(REAL, BOTH, _WITH_ORACLE)
     return "" if share is None else f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]".replace("%", " %")
 
 

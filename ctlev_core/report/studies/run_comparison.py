@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.provenance.records import Record, options_of, read_provenance, versions_of
-from ctlev_core.provenance.scores import PAIRED_SAMPLES, TRACED_SCORES
+from ctlev_core.provenance.scores import PAIRED_SAMPLES, SCORE_LINEAGE
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import cell_text, interval_over_trainings
 from ctlev_core.scoring.score_info import lower_is_better
@@ -45,8 +45,8 @@ class Run:
     Attributes:
         name: as asked for.
         records: of all its stages.
-        scores: rows of the table `traced_scores`.
-        trainings: scores of single samples by setting and score.
+        scores: rows of the table `score_lineage`.
+        trainings: scores of single samples by subject and score.
     """
 
     name: str
@@ -99,7 +99,7 @@ def read_run(name: str, folder: Path) -> Run:
     if not (folder / "provenance.json").is_file():
         raise DataError(f"{folder}: holds no provenance.json; a report of an earlier version must be made again")
     records = read_provenance(folder / "provenance.json")
-    scores = _read(folder / "scores.parquet", TRACED_SCORES)
+    scores = _read(folder / "scores.parquet", SCORE_LINEAGE)
     samples = _read(folder / "samples.parquet", PAIRED_SAMPLES)
     return Run(name, records, scores.to_pylist(), read_trainings(samples))
 
@@ -127,9 +127,9 @@ def _scores_table(first: Run, second: Run) -> Table:
     bold: set[tuple[int, int]] = set()
     for key in dict.fromkeys([*found[0], *found[1]]):
         rows = [of_run.get(key, []) for of_run in found]
-        setting, metric = key
+        subject, metric = key
         row: list[Cell] = [
-            setting,
+            subject,
             f"{metric} {'↓' if lower_is_better(metric) else '↑'}",
             *map(cell_text, rows),
             "",
@@ -146,7 +146,7 @@ def _scores_table(first: Run, second: Run) -> Table:
         "the same test samples, which sees small differences; separate: other test samples, or other frames; "
         "intervals: joined from those of both. Bold: the interval excludes 0."
     )
-    columns = ["setting", "score", first.name, second.name, "difference", "compared"]
+    columns = ["subject", "score", first.name, second.name, "difference", "compared"]
     return Table("Scores", columns, body, caption=caption, bold=bold)
 
 
@@ -154,7 +154,7 @@ def _by_score(rows: Iterable[dict[str, Any]]) -> dict[tuple[str, str], list[dict
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         if row["group"] == "all":
-            found.setdefault((row["setting"], row["metric"]), []).append(row)
+            found.setdefault((row["subject"], row["metric"]), []).append(row)
     return found
 
 
@@ -225,7 +225,7 @@ def _cause(first: Record, second: Record) -> str:
         causes.append("versions")
     if sorted(first.upstream.values()) != sorted(second.upstream.values()):
         causes.append("inputs")
-    return ", ".join(causes) or "raw files (recordings, or the prior's)"
+    return ", ".join(causes) or "raw files (recordings, or the base model's)"
 
 
 def _versions_table(first: Run, second: Run) -> Table:

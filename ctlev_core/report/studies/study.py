@@ -36,7 +36,7 @@ class Part:
     Attributes:
         name: its name in the study.
         rows: of the table `scores`.
-        settings: what was trained on, in the order of the tables.
+        training_sets: what was trained on, in the order of the tables.
         generators: whose frames were compared, its own first.
         paired: its scores sample by sample.
         summary: of its report.
@@ -44,7 +44,7 @@ class Part:
 
     name: str
     rows: list[Row]
-    settings: Sequence[str]
+    training_sets: Sequence[str]
     generators: Sequence[str]
     paired: PairedScores
     summary: Summary
@@ -52,7 +52,7 @@ class Part:
     @property
     def compares(self) -> bool:
         """Was anything trained on synthetic frames? If not, it is here for its samples and figures."""
-        return any(setting != "real" for setting in self.settings)
+        return any(training_set != "real" for training_set in self.training_sets)
 
     @property
     def heading(self) -> str:
@@ -102,7 +102,7 @@ def study_overview(parts: Sequence[Part]) -> Table:
         if not part.compares:
             continue
         rows = [row for row in trained_rows(part.rows) if row["group"] == "all" and row["metric"] == part.metric]
-        by_setting = {name: [row for row in rows if row["setting"] == name] for name in _COMPARED}
+        by_set = {name: [row for row in rows if row["subject"] == name] for name in _COMPARED}
         difference = part.difference
         if difference is not None and difference.is_certain:
             bold.add((len(body), 5))
@@ -110,7 +110,7 @@ def study_overview(parts: Sequence[Part]) -> Table:
                 bold.add((len(body), 4))
         told = "" if difference is None else difference.text()
         direction = "↓" if lower_is_better(part.metric) else "↑"
-        body.append([part.heading, f"{part.metric} {direction}", *map(cell_text, by_setting.values()), told])
+        body.append([part.heading, f"{part.metric} {direction}", *map(cell_text, by_set.values()), told])
         if find_score(part.metric).meaning:
             explained[part.metric] = find_score(part.metric).meaning
     caption = (
@@ -141,7 +141,7 @@ def study_tables(parts: Sequence[Part]) -> list[list[Table]]:
     """The tables of scores of each experiment that the page shows; in the last list those of all together."""
     found = []
     for part in parts:
-        tables = score_tables(part.rows, part.settings, part.paired) if part.compares else []
+        tables = score_tables(part.rows, part.training_sets, part.paired) if part.compares else []
         found.append([replace(table, title=f"{part.heading}: {table.title}") for table in tables if _answers(table)])
     return [*found, [distances_table(parts)]]
 
@@ -188,7 +188,9 @@ def _heading(parts: Sequence[Part], speed: SpeedSummary) -> str:
 
 
 def _published(table: Table | None) -> list[Folded]:
-    caption = "Other data, another prior, other sizes: not comparable with the numbers above. It gives no intervals."
+    caption = (
+        "Other data, another base model, other sizes: not comparable with the numbers above. It gives no intervals."
+    )
     return [] if table is None else [Folded(table.title, [table], caption)]
 
 
@@ -201,10 +203,10 @@ def _first_distance(rows: Sequence[Row]) -> list[Row]:
 def distances_table(parts: Sequence[Part]) -> Table:
     """Generators down, experiments across: the layout of the paper's Table 4."""
     distances = [_first_distance(part.rows) for part in parts]
-    settings = list(dict.fromkeys(row["setting"] for rows in distances for row in rows))
+    training_sets = list(dict.fromkeys(row["subject"] for rows in distances for row in rows))
     body: list[list[Cell]] = [
-        [setting, *(cell_text([row for row in rows if row["setting"] == setting]) for rows in distances)]
-        for setting in settings
+        [training_set, *(cell_text([row for row in rows if row["subject"] == training_set]) for rows in distances)]
+        for training_set in training_sets
     ]
     caption = (
         "Frechet distance to the real training frames, in features of a classifier trained on real events: another one "

@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from tiny_prior import make_data, make_prior
+from tiny_base_model import make_base_model, make_data
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule
 from ctlev_core.diffusion.pretrained.loading import (
     conditions_to_tensor,
     encode_prompts,
     images_to_tensor,
-    load_prior,
-    save_prior,
+    load_base_model,
+    save_base_model,
 )
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_latents
@@ -41,32 +41,34 @@ def benchmarks():
 
 
 @pytest.fixture(scope="module")
-def prior_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("prior")
-    save_prior(make_prior(), folder)
+def base_model_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("base_model")
+    save_base_model(make_base_model(), folder)
     return folder
 
 
-def make_example(benchmarks, prior, **further):
+def make_example(benchmarks, base_model, **further):
     """A loop over two equal frames, one at a time, so that their order does not matter."""
-    frames, conditions = make_data(1, with_images=prior.controlnet is not None)
+    frames, conditions = make_data(1, with_images=base_model.controlnet is not None)
     images = conditions.images
     twice = Conditions(2 * conditions.prompts, None if images is None else np.repeat(images, 2, axis=0))
-    loop = benchmarks.diffusers_loop.ExampleLoop(prior, np.repeat(frames, 2, axis=0), twice, batch_size=1, **further)
+    loop = benchmarks.diffusers_loop.ExampleLoop(
+        base_model, np.repeat(frames, 2, axis=0), twice, batch_size=1, **further
+    )
     return loop, frames, conditions
 
 
 @pytest.mark.parametrize("with_controlnet", [True, False])
-def test_the_examples_loss_is_ours_on_the_same_noise(benchmarks, prior_folder, with_controlnet):
+def test_the_examples_loss_is_ours_on_the_same_noise(benchmarks, base_model_folder, with_controlnet):
     """Written down twice, by diffusers' functions there and by ours here; a step that changes nothing goes before,
     because the loader draws from the same stream of random numbers when it starts."""
-    prior = load_prior(prior_folder, with_controlnet=with_controlnet)
-    loop, frames, conditions = make_example(benchmarks, prior, learning_rate=0.0)
+    base_model = load_base_model(base_model_folder, with_controlnet=with_controlnet)
+    loop, frames, conditions = make_example(benchmarks, base_model, learning_rate=0.0)
     loop.run(1)
     torch.manual_seed(SEED)
     (loss,) = loop.run(1)
 
-    plain = load_prior(prior_folder, with_controlnet=with_controlnet)
+    plain = load_base_model(base_model_folder, with_controlnet=with_controlnet)
     with torch.no_grad():
         latents = plain.vae.encode(images_to_tensor(frames)).latent_dist.mean * plain.scaling_factor
         torch.manual_seed(SEED)
@@ -81,31 +83,31 @@ def test_the_examples_loss_is_ours_on_the_same_noise(benchmarks, prior_folder, w
 
 
 @pytest.mark.parametrize(("with_controlnet", "learns"), [(True, "controlnet"), (False, "unet")])
-def test_the_example_trains_what_ours_does(benchmarks, prior_folder, with_controlnet, learns):
-    prior, before = (load_prior(prior_folder, with_controlnet=with_controlnet) for _ in range(2))
-    loop, *_ = make_example(benchmarks, prior, learning_rate=1e-3, use_ema=not with_controlnet)
+def test_the_example_trains_what_ours_does(benchmarks, base_model_folder, with_controlnet, learns):
+    base_model, before = (load_base_model(base_model_folder, with_controlnet=with_controlnet) for _ in range(2))
+    loop, *_ = make_example(benchmarks, base_model, learning_rate=1e-3, use_ema=not with_controlnet)
     losses = loop.run(2)
     assert len(losses) == 2 and np.isfinite(losses).all()
     for name in ("unet", "controlnet", "text_encoder"):
-        if getattr(prior, name) is not None:
-            old, new = (getattr(each, name).state_dict() for each in (before, prior))
+        if getattr(base_model, name) is not None:
+            old, new = (getattr(each, name).state_dict() for each in (before, base_model))
             assert any(not torch.equal(old[key], new[key]) for key in old) == (name == learns), name
 
 
-def test_the_stages_of_a_step_add_up(benchmarks, prior_folder):
-    loop, *_ = make_example(benchmarks, load_prior(prior_folder, with_controlnet=False), use_ema=True)
+def test_the_stages_of_a_step_add_up(benchmarks, base_model_folder):
+    loop, *_ = make_example(benchmarks, load_base_model(base_model_folder, with_controlnet=False), use_ema=True)
     ticks = iter(range(1000))
     loop.clock = lambda: next(ticks)
     loop.run(2)
     assert loop.seconds == dict.fromkeys(benchmarks.diffusers_loop.STAGES, 2)
 
 
-def test_our_loop_is_stopped_between_steps(benchmarks, prior_folder, tmp_path):
+def test_our_loop_is_stopped_between_steps(benchmarks, base_model_folder, tmp_path):
     """Three rounds of two steps, after the warm-up, of the loop that `fine_tune` would have run."""
-    prior, before = load_prior(prior_folder), load_prior(prior_folder)
+    base_model, before = load_base_model(base_model_folder), load_base_model(base_model_folder)
     options = benchmarks.training.make_options(4, "float32", ["learning_rate=0.001"])
     frames, conditions = make_data()
-    loop = benchmarks.training.FineTuningLoop(prior, frames, conditions, options, tune="controlnet", work=tmp_path)
+    loop = benchmarks.training.FineTuningLoop(base_model, frames, conditions, options, tune="controlnet", work=tmp_path)
     fetched, at = [], []
     fetch = loop.fetch
     loop.fetch = lambda number: fetched.append(number) or fetch(number)
@@ -114,7 +116,7 @@ def test_our_loop_is_stopped_between_steps(benchmarks, prior_folder, tmp_path):
     assert fetched == list(range(2 + 6))
     assert at == [2, 4, 6]
     assert not list(tmp_path.rglob("state.pt")), "nothing is saved while the clock runs"
-    old, new = (each.controlnet.state_dict() for each in (before, prior))
+    old, new = (each.controlnet.state_dict() for each in (before, base_model))
     assert any(not torch.equal(old[key], new[key]) for key in old)
 
 
@@ -127,23 +129,23 @@ def test_ratio_is_the_median_over_the_rounds(benchmarks):
 
 
 @pytest.mark.parametrize(("scheduler", "steps"), [("unipc", 5), ("ddpm", 10)])
-def test_trajectory_is_that_of_our_sampler(benchmarks, prior_folder, scheduler, steps):
-    prior = load_prior(prior_folder)
-    got = benchmarks.sampling.run_trajectory(prior, scheduler, steps, 2, torch.float32)
-    _, conditions = benchmarks.training.make_rows(prior, 2, with_images=True)
+def test_trajectory_is_that_of_our_sampler(benchmarks, base_model_folder, scheduler, steps):
+    base_model = load_base_model(base_model_folder)
+    got = benchmarks.sampling.run_trajectory(base_model, scheduler, steps, 2, torch.float32)
+    _, conditions = benchmarks.training.make_rows(base_model, 2, with_images=True)
     options = SamplingOptions(scheduler=scheduler, num_inference_steps=steps)
-    embeddings = encode_prompts(prior, list(conditions.prompts))
+    embeddings = encode_prompts(base_model, list(conditions.prompts))
     expected = sample_latents(
-        prior, embeddings, embeddings[:1], conditions_to_tensor(conditions.images), [0, 1], options
+        base_model, embeddings, embeddings[:1], conditions_to_tensor(conditions.images), [0, 1], options
     )
     # The ancestral update is written out there and diffusers' here: rounding in float32.
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("scheduler", ["unipc", "ddpm"])
-def test_errors_grow_as_digits_are_lost(benchmarks, prior_folder, scheduler):
+def test_errors_grow_as_digits_are_lost(benchmarks, base_model_folder, scheduler):
     def load(**where):
-        return load_prior(prior_folder, **where)
+        return load_base_model(base_model_folder, **where)
 
     found = benchmarks.sampling.compute_precision_errors(load, scheduler, 5, 1, torch.device("cpu"))
     rms = {key: error.latents[1] for key, error in found.items()}
@@ -153,8 +155,10 @@ def test_errors_grow_as_digits_are_lost(benchmarks, prior_folder, scheduler):
     assert all(error.latents[0] >= error.latents[1] for error in found.values())
 
 
-def test_training_benchmark(benchmarks, prior_folder, capsys):
-    benchmarks.training.main(["--prior", str(prior_folder), "--batch-size", "2", "--rounds", "2", "--steps", "1"])
+def test_training_benchmark(benchmarks, base_model_folder, capsys):
+    benchmarks.training.main(
+        ["--base_model", str(base_model_folder), "--batch-size", "2", "--rounds", "2", "--steps", "1"]
+    )
     printed = capsys.readouterr().out
     assert re.findall(r"^(\w+), bfloat16 beside float32 ", printed, re.M) == ["controlnet", "text"]
     for route in ("controlnet, float32", "text, float32"):
@@ -165,10 +169,10 @@ def test_training_benchmark(benchmarks, prior_folder, capsys):
     assert "Targets missed: " in printed
 
 
-def test_sampling_benchmark(benchmarks, prior_folder, capsys, monkeypatch):
+def test_sampling_benchmark(benchmarks, base_model_folder, capsys, monkeypatch):
     monkeypatch.setattr(benchmarks.sampling, "EXTRAPOLATED_FROM", (1, 2))
     benchmarks.sampling.main(
-        ["--prior", str(prior_folder), "--images", "2", "--rounds", "1", "--steps", "3", "--ddpm-steps", "4"]
+        ["--base_model", str(base_model_folder), "--images", "2", "--rounds", "1", "--steps", "3", "--ddpm-steps", "4"]
     )
     printed = capsys.readouterr().out
     for differences in re.findall(r"differ by (\d+) grey levels at most", printed):
@@ -215,19 +219,19 @@ def test_gpu_benchmark_goes_on_after_a_part_that_failed(benchmarks, capsys, monk
 
 def test_networks_have_the_size_of_stable_diffusion(benchmarks):
     """Published sizes of v1.4: 859.5 M, ControlNet 361.3 M, autoencoder 83.7 M, text encoder 123.1 M."""
-    prior = benchmarks.gpu.build_prior(
+    base_model = benchmarks.gpu.build_base_model(
         "sd", 512, with_controlnet=True, dtype=torch.float32, device=torch.device("meta")
     )
-    counts = benchmarks.gpu.count_parameters(prior)
+    counts = benchmarks.gpu.count_parameters(base_model)
     assert counts == "unet 859.5 M, controlnet 361.3 M, vae 83.7 M, text_encoder 123.1 M"
 
 
-def test_networks_alone_cost_what_their_layers_do(benchmarks, prior_folder, tmp_path):
+def test_networks_alone_cost_what_their_layers_do(benchmarks, base_model_folder, tmp_path):
     """The counter sees forward and backward passes, and twice the images cost twice the operations."""
     options = benchmarks.training.make_options(4, "float32")
     frames, conditions = make_data()
     loop = benchmarks.training.FineTuningLoop(
-        load_prior(prior_folder), frames, conditions, options, tune="controlnet", work=tmp_path
+        load_base_model(base_model_folder), frames, conditions, options, tune="controlnet", work=tmp_path
     )
     networks = benchmarks.training.Networks(loop, options)
     one, two = networks.batch(1), networks.batch(2)

@@ -1,4 +1,4 @@
-"""Normal maps as conditions: bodies where their labels are, whoever's body it is, and clear refusals."""
+"""Normal maps as conditions: bodies where their labels are, whoever's body it is, and clear rejections."""
 
 from dataclasses import replace
 

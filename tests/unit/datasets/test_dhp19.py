@@ -115,9 +115,9 @@ def test_events_outside_the_sensor_and_picture_samples_are_dropped(root):
 
 
 def test_filters_see_the_four_cameras_as_one_picture(root):
-    """A lone event is noise; one beside it is not. A seam between two channels is a neighbourhood."""
-    lone, beside = (address(3, 0, 100), START + 100), (address(2, 345, 101), START + 50)
-    records = [(SPECIAL, START), beside, lone, (SPECIAL, START + 999), (SPECIAL, START + 1000)]
+    """An isolated event is noise; one beside it is not. A seam between two channels is a neighbourhood."""
+    isolated, beside = (address(3, 0, 100), START + 100), (address(2, 345, 101), START + 50)
+    records = [(SPECIAL, START), beside, isolated, (SPECIAL, START + 999), (SPECIAL, START + 1000)]
     write_aedat(root / "DVS_movies/S1/session1/mov2.aedat", records)
     assert len(dhp19.read_events(*first(root))) == 1
     assert dhp19.read_events(*first(root, filters=True)).t.tolist() == [100]

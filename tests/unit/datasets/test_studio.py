@@ -48,16 +48,16 @@ def test_splits_share_no_subject_and_held_out_motions_are_in_tests_alone():
 
 
 def test_condition_people_can_be_filmed_as_training_recordings():
-    filmed = changed(film_conditions=True, num_train_recordings=0, num_test_recordings=1, num_cameras=2)
-    recordings = [r for r in studio.list_recordings(filmed) if r.recording_id.startswith("condition/")]
+    recorded = changed(record_conditions=True, num_train_recordings=0, num_test_recordings=1, num_cameras=2)
+    recordings = [r for r in studio.list_recordings(recorded) if r.recording_id.startswith("condition/")]
     assert [r.recording_id for r in recordings] == [r.recording_id for r in of_split("condition")]
     assert all(r.has_events and r.parts[0].split == "train" for r in recordings)
     for recording, label_only in zip(recordings[:3], of_split("condition")[:3], strict=True):
-        labels, asked = studio.read_labels(recording, filmed), studio.read_labels(label_only, OPTIONS)
+        labels, asked = studio.read_labels(recording, recorded), studio.read_labels(label_only, OPTIONS)
         shared = np.isin(labels.t_us, asked.t_us)
         assert shared.sum() >= 3  # 5 ms against 20.8 ms: 0, 125 and 250 ms at least
         np.testing.assert_array_equal(labels.joints2d[shared], asked.joints2d[np.isin(asked.t_us, labels.t_us)])
-        assert len(check_events(studio.read_events(recording, filmed), recording.recording_id)) > 100
+        assert len(check_events(studio.read_events(recording, recorded), recording.recording_id)) > 100
 
 
 def test_recording_ids_say_what_they_are():
@@ -175,8 +175,8 @@ def test_cameras_stand_around_the_same_performance():
     assert [view.recording_id for view in views] == [f"train/subject0_run_00001_cam{i}" for i in range(4)]
     assert len(studio.list_recordings(options)) == 4 * (24 + 40) + 26
     labels = [studio.read_labels(view, options) for view in views]
-    films = [studio._film(view, options) for view in views]
-    for track, film in zip(labels[1:], films[1:], strict=True):
+    records = [studio._record(view, options) for view in views]
+    for track, record in zip(labels[1:], records[1:], strict=True):
         assert np.array_equal(track.t_us, labels[0].t_us)
         np.testing.assert_allclose(track.smpl_pose[:, 3:], labels[0].smpl_pose[:, 3:], atol=1e-5)
         # One rigid motion carries what one camera sees to what the other sees: all distances, over time too, agree.
@@ -188,11 +188,13 @@ def test_cameras_stand_around_the_same_performance():
         )
         assert np.abs(track.joints2d[0] - labels[0].joints2d[0]).max() > 3
         # The lamp stands where it is.
-        lamps = [each._painter.camera.R.T @ each._painter.light.direction for each in (film, films[0])]
+        lamps = [each._painter.camera.R.T @ each._painter.light.direction for each in (record, records[0])]
         np.testing.assert_allclose(*lamps, atol=1e-12)
-        assert np.array_equal(film._painter.subject.albedo, films[0]._painter.subject.albedo)
+        assert np.array_equal(record._painter.subject.albedo, records[0]._painter.subject.albedo)
     # From the front, the right, the back and the left: a quarter of the range each.
-    yaw_deg = [np.rad2deg(np.arctan2(-film._painter.camera.R[2, 0], -film._painter.camera.R[2, 2])) for film in films]
+    yaw_deg = [
+        np.rad2deg(np.arctan2(-record._painter.camera.R[2, 0], -record._painter.camera.R[2, 2])) for record in records
+    ]
     assert sorted(np.floor(np.mod(yaw_deg, 360) / 90)) == [0, 1, 2, 3]
 
 
@@ -254,9 +256,9 @@ def test_pictures_show_what_the_labels_say(motion):
     """Between key poses too, where pictures go straight and labels follow the curve: within a millimetre."""
     options = changed(label_rate_hz=800.0)
     recording = next(r for r in of_split("test") if r.class_name == motion)
-    labels, film = studio.read_labels(recording, options), studio._film(recording, options)
-    painter = film._painter
-    rotations, transl = film.poses_at(1e-6 * labels.t_us)
+    labels, record = studio.read_labels(recording, options), studio._record(recording, options)
+    painter = record._painter
+    rotations, transl = record.poses_at(1e-6 * labels.t_us)
     _, joints = joint_transforms(painter.body, rotations, painter.subject.betas, transl)
     seen = 1000 * (joints @ painter.camera.R.T + painter.camera.translation)[:, list(SMPL_TO_DHP19)]
     assert np.linalg.norm(seen - labels.joints3d, axis=-1).max() < 1.0
@@ -275,8 +277,8 @@ def test_events_are_nearly_those_of_many_more_pictures():
     options = changed(sensor_preset="ideal", sensor_size=(96, 96))
     recording = studio.list_recordings(options)[1]
     events = studio.read_events(recording, options)
-    film, t_us = studio._film(recording, options), np.arange(0, 250_001, 250)
-    dense = simulate_events(film.render_frames(1e-6 * t_us), t_us, PRESETS["ideal"], sensor_seed=0, seed=0)
+    record, t_us = studio._record(recording, options), np.arange(0, 250_001, 250)
+    dense = simulate_events(record.render_frames(1e-6 * t_us), t_us, PRESETS["ideal"], sensor_seed=0, seed=0)
     assert len(events) == pytest.approx(len(dense), rel=0.1)
     counts = [np.bincount(e.y.astype(int) * 96 + e.x, minlength=96 * 96) for e in (events, dense)]
     assert np.abs(counts[0] - counts[1]).sum() < 0.15 * len(dense)

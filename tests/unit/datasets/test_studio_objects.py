@@ -15,7 +15,7 @@ from tokenizers import Tokenizer
 from ctlev_core.conditions import text
 from ctlev_core.datasets import studio_objects
 from ctlev_core.datasets.studio_objects import CLASSES, COMPOSITIONS, HELD_OUT, UNSEEN, Options
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
 from ctlev_core.sensor.choice import read_sensor
 from ctlev_core.sensor.options import PRESETS
 from ctlev_core.studio.compositions import NOUNS, Composition, all_compositions, parse_composition
@@ -50,12 +50,12 @@ def test_there_are_classes_enough_with_two_to_five_names_that_no_other_has():
     assert all(2 <= len(names[name]) <= 5 and names[name][0] == name for name in CLASSES)
     every = [name for of_class in names.values() for name in of_class]
     assert len(set(every)) == len(every)
-    # A name must not mean what the prior draws as something else.
+    # A name must not mean what the base model draws as something else.
     assert not {name for name in every if name not in CLASSES} & set(OBJECTS)
 
 
-def test_the_prior_has_class_names_and_held_out_names_as_whole_words():
-    tokenizer = Tokenizer.from_file(str(BUNDLED_PRIOR / "tokenizer" / "tokenizer.json"))
+def test_the_base_model_has_class_names_and_held_out_names_as_whole_words():
+    tokenizer = Tokenizer.from_file(str(BUNDLED_BASE_MODEL / "tokenizer" / "tokenizer.json"))
     tokenizer.no_padding()
     for name in CLASSES + HELD_OUT:
         tokens = tokenizer.encode(name, add_special_tokens=False).tokens
@@ -204,7 +204,7 @@ def test_noise_and_size_are_difficulty():
     ]
     assert noisy[0] < noisy[1] < noisy[2]
     still = read_sensor("noisy", 0.0)
-    assert still.threshold_sigma == still.leak_rate_hz == still.shot_rate_hz == still.hot_pixel_fraction == 0
+    assert still.threshold_sigma == still.leak_rate_hz == still.shot_noise_rate_hz == still.hot_pixel_fraction == 0
     assert still.threshold == PRESETS["noisy"].threshold and read_sensor("noisy", 1e6).hot_pixel_fraction == 1
     small, large = (Options(object_size=size, sensor_preset="ideal") for size in ((0.2, 0.2), (0.8, 0.8)))
     extents = []

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm, wasserstein_distance
 
 from ctlev_core.diffusion.denoising import NoiseSchedule
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.solver_studies.analytic_score import (
     LatentMixture,
@@ -22,7 +22,7 @@ from ctlev_core.diffusion.solver_studies.analytic_score import (
     wasserstein_1,
 )
 
-CONFIG = json.loads((BUNDLED_PRIOR / "scheduler" / "scheduler_config.json").read_text())
+CONFIG = json.loads((BUNDLED_BASE_MODEL / "scheduler" / "scheduler_config.json").read_text())
 WEIGHTS, MEANS, SPREADS = (0.85, 0.15), (-0.6, 1.2), (0.05, 0.4)
 
 
@@ -34,10 +34,10 @@ def events_like():
 def test_denoiser_is_the_mean_of_the_clean_values_given_the_noisy_one(alpha_bar):
     """Bayes' rule by quadrature over the clean value."""
     clean = np.linspace(-3, 4, 200_001)
-    prior = sum(w * norm.pdf(clean, m, s) for w, m, s in zip(WEIGHTS, MEANS, SPREADS, strict=True))
+    base_model = sum(w * norm.pdf(clean, m, s) for w, m, s in zip(WEIGHTS, MEANS, SPREADS, strict=True))
     for noisy in (-1.5, -0.6, 0.1, 0.9, 2.0):
         likelihood = norm.logpdf(noisy, np.sqrt(alpha_bar) * clean, np.sqrt(1 - alpha_bar))
-        weight = prior * np.exp(likelihood - likelihood.max())
+        weight = base_model * np.exp(likelihood - likelihood.max())
         expected = (weight * clean).sum() / weight.sum()
         found = events_like().denoise(torch.tensor([[noisy]], dtype=torch.float64), alpha_bar)
         # Trapezoids of 3.5e-5 under densities at least 0.03 wide.

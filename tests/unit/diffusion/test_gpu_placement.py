@@ -10,9 +10,9 @@ from simulated_gpu import simulated_gpu
 from test_downstream_hard_cases import bodies, frames_of, points
 from test_event_gan import TINY as TINY_GAN
 from test_event_gan import moving_squares
-from tiny_prior import make_data, make_prior
+from tiny_base_model import make_base_model, make_data
 
-from ctlev_core.diffusion.pretrained.loading import save_prior
+from ctlev_core.diffusion.pretrained.loading import save_base_model
 from ctlev_core.diffusion.sampling.options import SPACINGS, SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
 from ctlev_core.diffusion.training import trainer
@@ -26,9 +26,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def prior_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("prior")
-    save_prior(make_prior(), folder)
+def base_model_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("base_model")
+    save_base_model(make_base_model(), folder)
     return folder
 
 
@@ -73,21 +73,21 @@ TRAINED = {
     "both": {},
     "controlnet": {"tune": "controlnet", "gradient_checkpointing": True},
     "unet": {"tune": "unet", "snr_gamma": 5.0},
-    "muon": {"optimizer": "muon", "gradient_accumulation": 2, "turned_share": 0.5},
+    "muon": {"optimizer": "muon", "gradient_accumulation": 2, "rot90_probability": 0.5},
     "random": {"random_init": True},
     "bfloat16": {"precision": "bfloat16"},
     "float16": {"precision": "float16"},
 }
 
 
-def fine_tuned(folder, prior, device, changed, kill=None):
+def fine_tuned(folder, base_model, device, changed, kill=None):
     changed = dict(changed)
     tune = changed.pop("tune", "both")
     frames, conditions = make_data(24, with_images=tune != "unet")
     options = FineTuningOptions.model_validate(
         {
             "num_steps": 4, "batch_size": 2, "num_validation": 4, "validation_every": 2, "keep": "best", "log_every": 2,
-            "sample_every": 3, "ema_decay": 0.5, "checkpoint_every_s": 1e-9, "device": device, "prior": prior,
+            "sample_every": 3, "ema_decay": 0.5, "checkpoint_every_s": 1e-9, "device": device, "base_model": base_model,
             **changed,
         }
     )  # fmt: skip
@@ -100,20 +100,20 @@ def fine_tuned(folder, prior, device, changed, kill=None):
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_fine_tuning(tmp_path, prior_folder, name):
+def test_fine_tuning(tmp_path, base_model_folder, name):
     with simulated_gpu() as gpu:
-        history, weights = fine_tuned(tmp_path / "gpu", prior_folder, "cuda", TRAINED[name])
+        history, weights = fine_tuned(tmp_path / "gpu", base_model_folder, "cuda", TRAINED[name])
     assert gpu.num_operations > 5_000 and np.isfinite(history.loss).all()
     if name == "float16":  # a CPU takes none
         return
-    again, expected = fine_tuned(tmp_path / "cpu", prior_folder, "cpu", TRAINED[name])
+    again, expected = fine_tuned(tmp_path / "cpu", base_model_folder, "cpu", TRAINED[name])
     exact = name != "bfloat16"  # of which CPUs do attention in float32
     np.testing.assert_allclose(history.loss, again.loss, rtol=0 if exact else 1e-2)
     if exact:
         assert all(torch.equal(weights[key], expected[key]) for key in expected)
 
 
-def test_a_killed_fine_tuning_goes_on(tmp_path, prior_folder, monkeypatch):
+def test_a_killed_fine_tuning_goes_on(tmp_path, base_model_folder, monkeypatch):
     update, calls = trainer.Trainer.update, []
 
     def stop_once(self, progress):
@@ -125,14 +125,14 @@ def test_a_killed_fine_tuning_goes_on(tmp_path, prior_folder, monkeypatch):
     monkeypatch.setattr(trainer.Trainer, "update", stop_once)
     with simulated_gpu():
         with pytest.raises(KeyboardInterrupt):
-            fine_tuned(tmp_path, prior_folder, "cuda", {})
-        _, weights = fine_tuned(tmp_path, prior_folder, "auto", {})
+            fine_tuned(tmp_path, base_model_folder, "cuda", {})
+        _, weights = fine_tuned(tmp_path, base_model_folder, "auto", {})
     assert calls == [0, 1, 2, 2, 3]
-    _, expected = fine_tuned(tmp_path / "whole", prior_folder, "cpu", {})
+    _, expected = fine_tuned(tmp_path / "whole", base_model_folder, "cpu", {})
     assert all(torch.equal(weights[key], expected[key]) for key in expected)
 
 
-SAMPLED = [{"scheduler": solver, "spacing": spacings[-1]} for solver, spacings in SPACINGS.items()]
+SAMPLED = [{"scheduler": solver, "timestep_spacing": spacings[-1]} for solver, spacings in SPACINGS.items()]
 SAMPLED += [
     {"guidance_scale": 3.0, "guidance_interval": (0.2, 0.6)}, {"controlnet_every": 2}, {"noise": "shared"},
     {"palette": "red_blue"}, {"precision": "float16"}, {"precision": "bfloat16"},
@@ -140,13 +140,13 @@ SAMPLED += [
 
 
 @pytest.mark.parametrize("changed", SAMPLED, ids=lambda changed: "-".join(map(str, changed.values())))
-def test_sampling(tmp_path, prior_folder, changed):
+def test_sampling(tmp_path, base_model_folder, changed):
     def sample(device):
         options = SamplingOptions.model_validate(
             {"num_inference_steps": 4, "batch_size": 3, **changed, "device": device}
         )
         return sample_checkpoint(
-            prior_folder, make_data(4)[1], options, with_controlnet=True, seeds=range(4), work=tmp_path / device
+            base_model_folder, make_data(4)[1], options, with_controlnet=True, seeds=range(4), work=tmp_path / device
         )
 
     with simulated_gpu() as gpu:

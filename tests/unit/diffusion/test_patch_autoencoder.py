@@ -10,7 +10,7 @@ from scipy.fft import dctn
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder, patch_basis
 from ctlev_core.diffusion.pretrained.loading import encode_prompts
-from ctlev_core.diffusion.pretraining.architecture import build_prior
+from ctlev_core.diffusion.pretraining.architecture import build_base_model
 
 
 def random_images(count=4, side=16, seed=0):
@@ -46,10 +46,12 @@ def test_blocks_of_any_size_lose_nothing(patch_px, tmp_path):
 @pytest.mark.parametrize("patch_px", [1, 2, 4])
 def test_networks_fit_the_latents(patch_px):
     code = fit_patch_autoencoder(random_images(seed=1), patch_px)
-    prior = build_prior(["a word"], code, seed=0, widths=(32, 32), image_size=16, prediction_type="v_prediction")
+    base_model = build_base_model(
+        ["a word"], code, seed=0, widths=(32, 32), image_size=16, prediction_type="v_prediction"
+    )
     latents = code.encode(random_images())[0].mode()
-    embeddings = encode_prompts(prior, ["a word"] * 4)
-    predicted = Denoiser(prior.unet, prior.controlnet).predict(
+    embeddings = encode_prompts(base_model, ["a word"] * 4)
+    predicted = Denoiser(base_model.unet, base_model.controlnet).predict(
         latents, torch.full((4,), 500), embeddings, torch.rand(4, 3, 16, 16)
     )
     assert predicted.shape == latents.shape

@@ -1,15 +1,15 @@
-"""The pictures behind the bundled prior are a function of their index, and pre-training one of its seed."""
+"""The pictures behind the bundled base model are a function of their index, and pre-training one of its seed."""
 
 import numpy as np
 import pytest
 import torch
 
 from ctlev_core.body.motion.procedural import HELD_OUT
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_prior
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_base_model
 from ctlev_core.diffusion.pretraining import picture_styles, pretraining, procedural_images
 from ctlev_core.diffusion.pretraining.architecture import WORD_GAIN, learn_merges, train_tokenizer
-from ctlev_core.diffusion.pretraining.picture_styles import Diet
-from ctlev_core.diffusion.pretraining.pretraining import ImageStream, PretrainingOptions, new_prior, pretrain
+from ctlev_core.diffusion.pretraining.picture_styles import DataMixture
+from ctlev_core.diffusion.pretraining.pretraining import ImageStream, PretrainingOptions, new_base_model, pretrain
 from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.studio.compositions import RELATIONS, parse_composition
 from ctlev_core.studio.object_drawing import draw_object
@@ -19,7 +19,7 @@ from data_contracts.errors import TrainingError
 TINY = PretrainingOptions(
     training=TrainingOptions(num_steps=4, batch_size=4, warmup_steps=1, log_every=1, validation_every=2, ema_decay=0.5),
     max_seconds=None,
-    block_scenes=8,
+    chunk_scenes=8,
     image_size=16,
     widths=(32, 32),
     workers=0,
@@ -43,7 +43,7 @@ def same_weights(one, other):
 
 def test_scenes_do_not_depend_on_order_or_block():
     alone = procedural_images.draw_scene(3, 11, 32)
-    inside = procedural_images.draw_block(3, 1, 8, 32)[3]
+    inside = procedural_images.draw_chunk(3, 1, 8, 32)[3]
     np.testing.assert_array_equal(alone.image, inside.image)
     np.testing.assert_array_equal(alone.condition, inside.condition)
     other = procedural_images.draw_scene(4, 11, 32)
@@ -51,7 +51,7 @@ def test_scenes_do_not_depend_on_order_or_block():
 
 
 def test_mixture_of_people_and_objects():
-    scenes = procedural_images.draw_block(0, 0, 60, 32)
+    scenes = procedural_images.draw_chunk(0, 0, 60, 32)
     people = [scene.condition for scene in scenes if scene.condition is not None]
     # 60 draws at 0.5: four standard deviations either way.
     assert 15 <= len(people) <= 45
@@ -76,7 +76,7 @@ def test_held_out_motions_are_never_drawn(monkeypatch):
         return original(name, *arguments)
 
     monkeypatch.setattr(procedural_images, "sample_style", recording)
-    procedural_images.draw_block(1, 0, 150, 16)
+    procedural_images.draw_chunk(1, 0, 150, 16)
     assert len(set(drawn)) > 5
     assert not set(drawn) & set(HELD_OUT)
 
@@ -99,9 +99,9 @@ def test_every_object_is_visible_and_its_parts_fit(noun):
 
 
 def test_captions_name_what_is_seen_and_the_tokenizer_knows_their_words():
-    tokenizer = new_prior(TINY).tokenizer
+    tokenizer = new_base_model(TINY).tokenizer
     rng = np.random.default_rng(0)
-    for scene in procedural_images.draw_block(0, 0, 40, 16):
+    for scene in procedural_images.draw_chunk(0, 0, 40, 16):
         image, caption = picture_styles.apply_style(scene, rng)
         assert image.dtype == np.uint8 and image.shape == (16, 16, 3)
         if scene.condition is None:
@@ -116,10 +116,10 @@ def test_captions_name_what_is_seen_and_the_tokenizer_knows_their_words():
 
 
 def test_batches_put_steered_rows_first_and_follow_the_number_alone():
-    prior = new_prior(TINY)
-    stream = ImageStream(prior, TINY)
+    base_model = new_base_model(TINY)
+    stream = ImageStream(base_model, TINY)
     late = stream.fetch(5)
-    batch = ImageStream(prior, TINY).fetch(5)
+    batch = ImageStream(base_model, TINY).fetch(5)
     assert torch.equal(late.latents, batch.latents) and torch.equal(late.embeddings, batch.embeddings)
     steered = 0 if batch.conditions is None else len(batch.conditions)
     assert steered <= len(batch.latents) == 4
@@ -128,23 +128,23 @@ def test_batches_put_steered_rows_first_and_follow_the_number_alone():
 
 @pytest.mark.slow
 def test_a_worker_process_draws_the_same_pictures():
-    prior = new_prior(TINY)
-    stream = ImageStream(prior, TINY.model_copy(update={"workers": 1}))
+    base_model = new_base_model(TINY)
+    stream = ImageStream(base_model, TINY.model_copy(update={"workers": 1}))
     try:
         for number in range(6):  # over two blocks
-            assert torch.equal(stream.fetch(number).latents, ImageStream(prior, TINY).fetch(number).latents)
+            assert torch.equal(stream.fetch(number).latents, ImageStream(base_model, TINY).fetch(number).latents)
     finally:
         stream.close()
 
 
-def test_pretraining_resumes_and_writes_a_prior(tmp_path):
+def test_pretraining_resumes_and_writes_a_base_model(tmp_path):
     history = pretrain(TINY, tmp_path / "whole", tmp_path / "work")
     assert history.step == [1, 2, 3, 4] and history.validation_step == [2, 4]
-    whole = load_prior(tmp_path / "whole")
+    whole = load_base_model(tmp_path / "whole")
     assert whole.controlnet is not None and whole.image_size == (16, 16)
     # Started again on its own state, a finished run only writes its result again.
     pretrain(TINY, tmp_path / "again", tmp_path / "work")
-    assert same_weights(whole, load_prior(tmp_path / "again"))
+    assert same_weights(whole, load_base_model(tmp_path / "again"))
     with pytest.raises(TrainingError, match="of another run"):
         pretrain(TINY.model_copy(update={"seed": 1}), tmp_path / "other", tmp_path / "work")
 
@@ -154,10 +154,12 @@ def test_pretraining_resumes_and_writes_a_prior(tmp_path):
 def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monkeypatch):
     monkeypatch.undo()  # other processes know nothing of it
     training = TINY.training.model_copy(update={"gradient_accumulation": 2})
-    options = TINY.model_copy(update={"tune": "unet", "diet": Diet(people_share=0.0), "training": training})
+    options = TINY.model_copy(
+        update={"tune": "unet", "data_mixture": DataMixture(people_share=0.0), "training": training}
+    )
     alone = pretrain(options, tmp_path / "alone", tmp_path / "work")
     together = pretrain(options.model_copy(update={"num_processes": 2}), tmp_path / "both", tmp_path / "work of both")
-    one, both = load_prior(tmp_path / "alone"), load_prior(tmp_path / "both")
+    one, both = load_base_model(tmp_path / "alone"), load_base_model(tmp_path / "both")
     assert one.controlnet is None and both.controlnet is None
     for key, value in one.unet.state_dict().items():
         # Sums in another order, 1e-7; then rounded to half precision, where two neighbours are 2e-3 of each other.
@@ -172,7 +174,7 @@ def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monk
     [
         ({"num_processes": 2}, "multiple of the 2 processes"),
         ({"num_processes": 2, "max_seconds": 5.0}, "max_seconds must be null with several processes"),
-        ({"diet": {"styles": {"lines": 0.5}}}, "shares of styles must sum to 1, got 0.5"),
+        ({"data_mixture": {"styles": {"lines": 0.5}}}, "shares of styles must sum to 1, got 0.5"),
     ],
 )
 def test_what_does_not_go_together_is_refused(changed, message):
@@ -186,7 +188,7 @@ def test_captions_call_things_by_their_other_names_and_pictures_stay_the_same():
     def styled(share):
         return [
             picture_styles.apply_style(
-                scene, np.random.default_rng(index), Diet(styles={"lines": 1.0}, other_names_share=share)
+                scene, np.random.default_rng(index), DataMixture(styles={"lines": 1.0}, other_names_share=share)
             )
             for index, scene in enumerate(scenes)
         ]
@@ -217,24 +219,24 @@ def test_words_have_the_same_numbers_each_time(tmp_path):
 
 def test_the_text_encoder_tells_prompts_apart_and_is_not_trained(tmp_path):
     """A trained one had collapsed: its embeddings differed by 0.01, and no fine-tuning could tell classes apart."""
-    before = new_prior(TINY)
+    before = new_base_model(TINY)
     pretrain(TINY, tmp_path / "out", tmp_path / "work")
-    for prior in (before, load_prior(tmp_path / "out"), load_prior()):
+    for base_model in (before, load_base_model(tmp_path / "out"), load_base_model()):
         prompts = [f"A photo of {name}" for name in ("person", "spot", "street", "leopard")]
-        embeddings = encode_prompts(prior, prompts)
+        embeddings = encode_prompts(base_model, prompts)
         distances = (embeddings[:, None] - embeddings[None]).square().mean(dim=(2, 3)).sqrt()
         assert distances[~torch.eye(len(prompts), dtype=torch.bool)].min() > 0.2
-    kept = load_prior(tmp_path / "out").text_encoder.state_dict()
+    kept = load_base_model(tmp_path / "out").text_encoder.state_dict()
     for name, weight in before.text_encoder.state_dict().items():
         assert torch.equal(kept[name].half(), weight.half()), name
 
 
 def test_tokens_hold_their_word_and_the_mean_of_the_words_so_far():
     """Against the definition in NumPy: layer norm, mean of the projections, one turn, layer norm."""
-    prior = new_prior(TINY)
-    tokens = prior.tokenizer("a red cat on a blue box", padding="max_length", return_tensors="pt").input_ids
-    embeddings = prior.text_encoder.embeddings
-    layer = prior.text_encoder.encoder.layers[0]
+    base_model = new_base_model(TINY)
+    tokens = base_model.tokenizer("a red cat on a blue box", padding="max_length", return_tensors="pt").input_ids
+    embeddings = base_model.text_encoder.embeddings
+    layer = base_model.text_encoder.encoder.layers[0]
     project, turn = (weight.detach().double().numpy() for weight in (layer.self_attn.v_proj.weight,
         layer.self_attn.out_proj.weight))  # fmt: skip
 
@@ -246,16 +248,16 @@ def test_tokens_hold_their_word_and_the_mean_of_the_words_so_far():
     means = np.cumsum(normalised(rows) @ project.T, axis=0) / np.arange(1, len(rows) + 1)[:, None]
     expected = normalised(rows + means @ turn.T)
     with torch.no_grad():
-        actual = prior.text_encoder(tokens)[0][0].numpy()
+        actual = base_model.text_encoder(tokens)[0][0].numpy()
     # float32 against float64, and layer norm's epsilon of 1e-5.
     np.testing.assert_allclose(actual, expected, atol=1e-4)
     np.testing.assert_allclose(turn @ turn.T, WORD_GAIN**2 * np.eye(len(turn)), atol=1e-3)
 
 
 def test_padding_says_which_words_a_prompt_has_and_words_in_which_order():
-    prior = new_prior(TINY)
+    base_model = new_base_model(TINY)
     prompts = ["a photo of a cat on box", "a photo of a box on cat", "a photo of a cat with box", ""]
-    cat_on_box, box_on_cat, with_box, empty = encode_prompts(prior, prompts)
+    cat_on_box, box_on_cat, with_box, empty = encode_prompts(base_model, prompts)
 
     def distance(one, other):
         return float((one - other).square().mean().sqrt())
@@ -269,9 +271,9 @@ def test_padding_says_which_words_a_prompt_has_and_words_in_which_order():
 def test_prediction_type_is_written_and_kept(tmp_path):
     options = TINY.model_copy(update={"prediction_type": "sample"})
     pretrain(options, tmp_path / "first", tmp_path / "work")
-    assert load_prior(tmp_path / "first").scheduler_config["prediction_type"] == "sample"
+    assert load_base_model(tmp_path / "first").scheduler_config["prediction_type"] == "sample"
     again = TINY.model_copy(update={"start": tmp_path / "first"})
-    assert new_prior(again).scheduler_config["prediction_type"] == "sample", "that of the weights it goes on from"
+    assert new_base_model(again).scheduler_config["prediction_type"] == "sample", "that of the weights it goes on from"
 
 
 def test_wall_clock_budget_ends_training(tmp_path):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
-from tiny_prior import SIDE, make_data, make_prior
+from tiny_base_model import SIDE, make_base_model, make_data
 
-from ctlev_core.diffusion.pretrained.loading import load_prior
+from ctlev_core.diffusion.pretrained.loading import load_base_model
 from ctlev_core.diffusion.pretraining import picture_styles, pretraining
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
-from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions, draw_block, pretrain, split_pictures
+from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions, draw_chunk, pretrain, split_pictures
 from ctlev_core.diffusion.training import finetuning
 from ctlev_core.diffusion.training.finetuning import fine_tune, move_frames
 from ctlev_core.diffusion.training.options import FineTuningOptions, TrainingOptions
@@ -29,9 +29,9 @@ def pictures(tmp_path):
 
 def tuned(options, work, seed=0):
     frames, conditions = make_data(with_images=False)
-    prior = replace(make_prior(), controlnet=None)
-    fine_tune(prior, frames, conditions, options, tune="unet", seed=seed, work=work)
-    return prior.unet.state_dict()
+    base_model = replace(make_base_model(), controlnet=None)
+    fine_tune(base_model, frames, conditions, options, tune="unet", seed=seed, work=work)
+    return base_model.unet.state_dict()
 
 
 def test_rehearsed_training_is_repeatable_and_differs_from_plain(tmp_path, pictures):
@@ -58,9 +58,9 @@ def test_batches_keep_their_size_and_pictures_come_last(tmp_path, pictures, monk
     tuned(options, tmp_path / "w")
     (batch,) = seen
     assert batch.latents.shape[0] == batch.embeddings.shape[0] == 8
-    prior, rng = make_prior(), np.random.default_rng([0, finetuning.REHEARSAL_STREAM, 0])
+    base_model, rng = make_base_model(), np.random.default_rng([0, finetuning.REHEARSAL_STREAM, 0])
     images, _ = Rehearsal(pictures, SIDE).draw(2, rng)
-    latents = finetuning.encode_images(prior, images, torch.Generator())
+    latents = finetuning.encode_images(base_model, images, torch.Generator())
     torch.testing.assert_close(batch.latents[6:], latents)
 
 
@@ -84,7 +84,7 @@ def test_what_is_for_the_text_route_is_refused_elsewhere(tmp_path, asked):
     frames, conditions = make_data()
     options = FineTuningOptions(num_steps=1, batch_size=2, num_validation=0).model_copy(update=asked)
     with pytest.raises(DataError, match=f"{next(iter(asked))} is for the text route"):
-        fine_tune(make_prior(), frames, conditions, options, tune="both", seed=0, work=tmp_path)
+        fine_tune(make_base_model(), frames, conditions, options, tune="both", seed=0, work=tmp_path)
 
 
 def test_rehearsal_needs_pictures():
@@ -94,7 +94,7 @@ def test_rehearsal_needs_pictures():
 
 TINY = PretrainingOptions(
     training=TrainingOptions(num_steps=2, batch_size=4, warmup_steps=1, log_every=1, validation_every=2, ema_decay=0.5),
-    tune="unet", block_scenes=8, image_size=16, widths=(32, 32), workers=0,
+    tune="unet", chunk_scenes=8, image_size=16, widths=(32, 32), workers=0,
 )  # fmt: skip
 
 
@@ -103,20 +103,20 @@ def test_a_base_model_of_pictures(tmp_path, pictures, monkeypatch):
     options = TINY.model_copy(update={"pictures": pictures})
     one, again = (pretrain(options, tmp_path / name, tmp_path / f"{name}_work") for name in ("a", "b"))
     assert one.loss == again.loss
-    prior = load_prior(tmp_path / "a", with_controlnet=False)
-    assert prior.image_size == (16, 16)
+    base_model = load_base_model(tmp_path / "a", with_controlnet=False)
+    assert base_model.image_size == (16, 16)
     for word in ("cup", "ball"):
-        assert len(prior.tokenizer(word).input_ids) == 3, "start, the name as one token, end"
+        assert len(base_model.tokenizer(word).input_ids) == 3, "start, the name as one token, end"
 
 
 def test_pictures_held_back_are_never_learnt_from(pictures):
     learnt, held_back = split_pictures(40, seed=0)
     assert len(held_back) == 4 and sorted([*learnt, *held_back]) == list(range(40))
     options = TINY.model_copy(update={"pictures": pictures})
-    block = draw_block(options, 1)
+    block = draw_chunk(options, 1)
     assert len(block) == 8 and all(isinstance(scene, picture_styles.Scene) for scene in block)
-    assert np.array_equal(block[2].image, draw_block(options, 1)[2].image)
-    assert not np.array_equal(block[2].image, draw_block(options, 2)[2].image)
+    assert np.array_equal(block[2].image, draw_chunk(options, 1)[2].image)
+    assert not np.array_equal(block[2].image, draw_chunk(options, 2)[2].image)
 
 
 def test_pictures_have_no_condition_images(pictures):

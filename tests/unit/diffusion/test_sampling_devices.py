@@ -64,20 +64,20 @@ def test_the_first_failure_ends_the_other_processes(deed, error, message):
 
 
 def test_two_processes_make_the_frames_of_one(tmp_path, monkeypatch):
-    from tiny_prior import make_data, make_prior
+    from tiny_base_model import make_base_model, make_data
 
-    from ctlev_core.diffusion.pretrained.loading import save_prior
+    from ctlev_core.diffusion.pretrained.loading import save_base_model
     from ctlev_core.diffusion.sampling import sampling
     from ctlev_core.diffusion.sampling import shards as sampling_shards
 
     monkeypatch.setattr(sampling_shards, "SHARD", 2)
-    save_prior(make_prior(), tmp_path / "prior")
+    save_base_model(make_base_model(), tmp_path / "base_model")
     conditions = make_data(7, seed=4)[1]
 
     def sample(device, work):
-        options = SamplingOptions(num_inference_steps=3, batch_size=2, dark_level=0, device=device)
+        options = SamplingOptions(num_inference_steps=3, batch_size=2, black_threshold=0, device=device)
         return sampling.sample_checkpoint(
-            tmp_path / "prior", conditions, options, with_controlnet=True, seeds=range(7), work=tmp_path / work
+            tmp_path / "base_model", conditions, options, with_controlnet=True, seeds=range(7), work=tmp_path / work
         )
 
     one = sample("cpu", "one")

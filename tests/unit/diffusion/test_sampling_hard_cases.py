@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny_prior import SIDE, make_data, make_prior, shared_prior
+from tiny_base_model import SIDE, make_base_model, make_data, shared_base_model
 
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
-from ctlev_core.diffusion.pretrained.loading import images_to_tensor, save_prior
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.loading import images_to_tensor, save_base_model
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
 from ctlev_core.diffusion.sampling import sampling
 from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling.out_of_memory import is_out_of_memory
@@ -20,12 +20,12 @@ from ctlev_core.diffusion.sampling.sampling import decode_frames, sample_checkpo
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 
-FAST = SamplingOptions(num_inference_steps=3, batch_size=4, dark_level=0)
+FAST = SamplingOptions(num_inference_steps=3, batch_size=4, black_threshold=0)
 SEEDS = [7, 1, 7, 3, 5, 2]
 
 
 def options_of(**changes):
-    return SamplingOptions.model_validate(FAST.model_dump(exclude={"spacing"}) | changes)
+    return SamplingOptions.model_validate(FAST.model_dump(exclude={"timestep_spacing"}) | changes)
 
 
 class Network:
@@ -62,9 +62,9 @@ def raising(error, limit):
 )
 def test_batches_are_halved_where_memory_runs_out(tmp_path, caplog, error):
     conditions = make_data(6, seed=4)[1]
-    whole = sample_frames(shared_prior(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
-    unet = Network(shared_prior().unet, raising(error, limit=1))
-    failing = dataclasses.replace(shared_prior(), unet=unet)
+    whole = sample_frames(shared_base_model(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
+    unet = Network(shared_base_model().unet, raising(error, limit=1))
+    failing = dataclasses.replace(shared_base_model(), unet=unet)
     with caplog.at_level(logging.WARNING):
         frames = sample_frames(failing, conditions, FAST, seeds=SEEDS, work=tmp_path / "halved")
     # Convolutions may sum in another order for another batch size: one grey level.
@@ -75,27 +75,27 @@ def test_batches_are_halved_where_memory_runs_out(tmp_path, caplog, error):
 
 
 def test_what_was_sampled_is_not_sampled_again_for_a_decoder_that_takes_more_memory(tmp_path, monkeypatch):
-    conditions, unet = make_data(6, seed=4)[1], Network(shared_prior().unet)
-    whole = sample_frames(shared_prior(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
+    conditions, unet = make_data(6, seed=4)[1], Network(shared_base_model().unet)
+    whole = sample_frames(shared_base_model(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
     decode, asked = sampling.decode_latents, []
 
-    def narrow(prior, latents):
+    def narrow(base_model, latents):
         asked.append(len(latents))
         if len(latents) > 1:
             raise torch.OutOfMemoryError("CUDA out of memory.")
-        return decode(prior, latents)
+        return decode(base_model, latents)
 
     monkeypatch.setattr(sampling, "decode_latents", narrow)
-    prior = dataclasses.replace(shared_prior(), unet=unet)
-    frames = sample_frames(prior, conditions, FAST, seeds=SEEDS, work=tmp_path / "narrow")
+    base_model = dataclasses.replace(shared_base_model(), unet=unet)
+    frames = sample_frames(base_model, conditions, FAST, seeds=SEEDS, work=tmp_path / "narrow")
     assert np.abs(frames.astype(int) - whole.astype(int)).max() <= 1
     assert unet.batches == [4] * 3 + [2] * 3 and asked == [4, 2] + [1] * 6
 
 
 def test_a_single_image_too_large_is_an_error_that_says_so(tmp_path):
     conditions = make_data(2, seed=4)[1]
-    unet = Network(shared_prior().unet, raising(torch.OutOfMemoryError("CUDA out of memory."), limit=0))
-    failing = dataclasses.replace(shared_prior(), unet=unet)
+    unet = Network(shared_base_model().unet, raising(torch.OutOfMemoryError("CUDA out of memory."), limit=0))
+    failing = dataclasses.replace(shared_base_model(), unet=unet)
     with pytest.raises(torch.OutOfMemoryError) as caught:
         sample_frames(failing, conditions, FAST, seeds=[0, 1], work=tmp_path)
     assert "one image does not fit" in caught.value.__notes__[0]
@@ -104,8 +104,8 @@ def test_a_single_image_too_large_is_an_error_that_says_so(tmp_path):
 
 def test_other_errors_are_not_mistaken_for_memory(tmp_path):
     conditions = make_data(2, seed=4)[1]
-    unet = Network(shared_prior().unet, raising(RuntimeError("shapes do not match"), limit=0))
-    failing = dataclasses.replace(shared_prior(), unet=unet)
+    unet = Network(shared_base_model().unet, raising(RuntimeError("shapes do not match"), limit=0))
+    failing = dataclasses.replace(shared_base_model(), unet=unet)
     with pytest.raises(RuntimeError, match="shapes do not match"):
         sample_frames(failing, conditions, FAST, seeds=[0, 1], work=tmp_path)
     assert unet.batches == [2]
@@ -115,15 +115,15 @@ def test_other_errors_are_not_mistaken_for_memory(tmp_path):
 @pytest.mark.parametrize(("every", "calls"), [(1, 5), (2, 3), (3, 2), (9, 1)])
 def test_controlnet_every_k_steps(tmp_path, every, calls):
     conditions = make_data(2, seed=4)[1]
-    controlnet: Any = Network(shared_prior().controlnet)
+    controlnet: Any = Network(shared_base_model().controlnet)
     # The embedding is exchanged on the network itself, not on its stand-in.
-    controlnet.controlnet_cond_embedding = shared_prior().controlnet.controlnet_cond_embedding
-    prior = dataclasses.replace(shared_prior(), controlnet=controlnet)
+    controlnet.controlnet_cond_embedding = shared_base_model().controlnet.controlnet_cond_embedding
+    base_model = dataclasses.replace(shared_base_model(), controlnet=controlnet)
     options = options_of(num_inference_steps=5, controlnet_every=every)
-    frames = sample_frames(prior, conditions, options, seeds=[0, 1], work=tmp_path / "a")
+    frames = sample_frames(base_model, conditions, options, seeds=[0, 1], work=tmp_path / "a")
     assert len(controlnet.batches) == calls
     plain = sample_frames(
-        shared_prior(), conditions, options_of(num_inference_steps=5), seeds=[0, 1], work=tmp_path / "b"
+        shared_base_model(), conditions, options_of(num_inference_steps=5), seeds=[0, 1], work=tmp_path / "b"
     )
     assert np.array_equal(frames, plain) == (every == 1)
 
@@ -133,25 +133,27 @@ def test_shared_noise_is_the_first_rows(tmp_path, scheduler):
     motion = make_data(4, seed=4)[1]
     still = Conditions((motion.prompts[0],) * 4, np.repeat(motion.images[:1], 4, axis=0))
     options = options_of(scheduler=scheduler, noise="shared")
-    frames = sample_frames(shared_prior(), still, options, seeds=[3, 1, 4, 1], work=tmp_path / "still")
+    frames = sample_frames(shared_base_model(), still, options, seeds=[3, 1, 4, 1], work=tmp_path / "still")
     assert all(np.array_equal(frame, frames[0]) for frame in frames), "equal conditions, equal frames"
-    frames = sample_frames(shared_prior(), motion, options, seeds=[3, 1, 4, 1], work=tmp_path / "motion")
+    frames = sample_frames(shared_base_model(), motion, options, seeds=[3, 1, 4, 1], work=tmp_path / "motion")
     # A row by itself: its condition and the seed it was drawn with are enough, and say nothing of the others.
     alone = Conditions(motion.prompts[2:3], motion.images[2:3])
     seed = noise_seeds([3, 1, 4, 1], options)[2]
-    own = sample_frames(shared_prior(), alone, options_of(scheduler=scheduler), seeds=[seed], work=tmp_path / "alone")
+    own = sample_frames(
+        shared_base_model(), alone, options_of(scheduler=scheduler), seeds=[seed], work=tmp_path / "alone"
+    )
     assert np.abs(own[0].astype(int) - frames[2].astype(int)).max() <= 1  # another batch size: one grey level
     independent = options_of(scheduler=scheduler)
-    drawn = sample_frames(shared_prior(), still, independent, seeds=[3, 1, 4, 1], work=tmp_path / "still")
+    drawn = sample_frames(shared_base_model(), still, independent, seeds=[3, 1, 4, 1], work=tmp_path / "still")
     assert np.array_equal(drawn[1], drawn[3]) and not np.array_equal(drawn[0], drawn[1])
 
 
 def test_shards_of_shared_noise_are_named_by_the_seed_that_counts(tmp_path):
     conditions, options = make_data(4, seed=4)[1], options_of(noise="shared")
-    first = sample_frames(shared_prior(), conditions, options, seeds=[3, 1, 4, 1], work=tmp_path)
-    again = sample_frames(shared_prior(), conditions, options, seeds=[3, 5, 9, 2], work=tmp_path)
+    first = sample_frames(shared_base_model(), conditions, options, seeds=[3, 1, 4, 1], work=tmp_path)
+    again = sample_frames(shared_base_model(), conditions, options, seeds=[3, 5, 9, 2], work=tmp_path)
     assert np.array_equal(first, again) and len(list(tmp_path.glob("shard_*.npy"))) == 1
-    other = sample_frames(shared_prior(), conditions, options, seeds=[5, 1, 4, 1], work=tmp_path)
+    other = sample_frames(shared_base_model(), conditions, options, seeds=[5, 1, 4, 1], work=tmp_path)
     assert not np.array_equal(first, other) and len(list(tmp_path.glob("shard_*.npy"))) == 2
 
 
@@ -168,7 +170,7 @@ def event_images(side=64):
 
 @pytest.fixture(scope="module")
 def bundled_config() -> Any:
-    return PatchAutoencoder.from_pretrained(BUNDLED_PRIOR / "vae").config
+    return PatchAutoencoder.from_pretrained(BUNDLED_BASE_MODEL / "vae").config
 
 
 @pytest.mark.parametrize(
@@ -195,13 +197,15 @@ def test_extreme_images_through_the_bundled_code_and_back(bundled_config, dtype,
 
 @pytest.mark.parametrize("precision", ["float16", "bfloat16"])
 def test_low_precision_is_that_of_the_networks_alone(tmp_path, precision):
-    save_prior(make_prior(), tmp_path / "prior")
+    save_base_model(make_base_model(), tmp_path / "base_model")
     conditions = make_data(2, seed=4)[1]
 
     def sample(precision):
         options = options_of(precision=precision, device="cpu")
         work = tmp_path / precision
-        return sample_checkpoint(tmp_path / "prior", conditions, options, with_controlnet=True, seeds=[0, 1], work=work)
+        return sample_checkpoint(
+            tmp_path / "base_model", conditions, options, with_controlnet=True, seeds=[0, 1], work=work
+        )
 
     # A random network after three steps; 8 bits of mantissa in every layer. Another image would differ by 60 levels.
     difference = np.abs(sample(precision).astype(int) - sample("float32").astype(int))
@@ -210,11 +214,11 @@ def test_low_precision_is_that_of_the_networks_alone(tmp_path, precision):
 
 def test_black_stays_black_in_half_precision():
     """The latents of an empty image, decoded as samples are, with networks in half precision: no event anywhere."""
-    code: Any = PatchAutoencoder.from_pretrained(BUNDLED_PRIOR / "vae")
-    prior = dataclasses.replace(shared_prior(), vae=code)
+    code: Any = PatchAutoencoder.from_pretrained(BUNDLED_BASE_MODEL / "vae")
+    base_model = dataclasses.replace(shared_base_model(), vae=code)
     images = event_images()
-    latents = code.encode(images_to_tensor(images))[0].mode() * prior.scaling_factor
-    assert np.array_equal(decode_frames(prior, latents, SamplingOptions(dark_level=0)), images)
+    latents = code.encode(images_to_tensor(images))[0].mode() * base_model.scaling_factor
+    assert np.array_equal(decode_frames(base_model, latents, SamplingOptions(black_threshold=0)), images)
 
 
 def test_an_autoencoder_that_overflows_is_run_in_float32(caplog):
@@ -231,24 +235,24 @@ def test_an_autoencoder_that_overflows_is_run_in_float32(caplog):
 
         @property
         def config(self):
-            return shared_prior().vae.config
+            return shared_base_model().vae.config
 
         def decode(self, latents):
             images = (latents * self.weight * 4) / (4 * self.weight)
             return type("Decoded", (), {"sample": images[:, :3]})
 
-    prior = dataclasses.replace(shared_prior(), vae=Decoder())
+    base_model = dataclasses.replace(shared_base_model(), vae=Decoder())
     with caplog.at_level(logging.WARNING), torch.no_grad():
-        frames = decode_frames(prior, torch.ones(1, 48, 4, 4) * prior.scaling_factor, SamplingOptions())
+        frames = decode_frames(base_model, torch.ones(1, 48, 4, 4) * base_model.scaling_factor, SamplingOptions())
     assert (frames == 255).all() and "decodes them again in float32" in caplog.text
 
 
 def test_latents_that_are_not_finite_are_an_error():
-    prior = dataclasses.replace(shared_prior(), unet=Network(shared_prior().unet, poison))
+    base_model = dataclasses.replace(shared_base_model(), unet=Network(shared_base_model().unet, poison))
     embeddings = torch.zeros(1, 24, 64)
     images = torch.zeros(1, 3, SIDE, SIDE)
     with pytest.raises(FloatingPointError, match=r"unipc and networks in torch\.float32 are not finite"):
-        sample_latents(prior, embeddings, embeddings, images, [0], FAST)
+        sample_latents(base_model, embeddings, embeddings, images, [0], FAST)
 
 
 def poison(noisy):
@@ -257,12 +261,12 @@ def poison(noisy):
 
 def test_a_schedule_that_cannot_be_sampled_is_refused_before_anything_is_loaded(tmp_path):
     """The folder holds nothing but the scheduler's config: any loading would complain about that first."""
-    config = shared_prior().scheduler_config | {"prediction_type": "epsilon", "rescale_betas_zero_snr": True}
+    config = shared_base_model().scheduler_config | {"prediction_type": "epsilon", "rescale_betas_zero_snr": True}
     place = tmp_path / "scheduler" / "scheduler_config.json"
     place.parent.mkdir()
     place.write_text(json.dumps(config))
     with pytest.raises(DataError, match=r"scheduler_config.json: .* expected v_prediction or sample"):
         sample_checkpoint(tmp_path, Conditions(("a",)), FAST, with_controlnet=False, seeds=[0], work=tmp_path / "work")
-    place.write_text(json.dumps(shared_prior().scheduler_config))
+    place.write_text(json.dumps(shared_base_model().scheduler_config))
     with pytest.raises(DataError, match="missing: tokenizer"):
         sample_checkpoint(tmp_path, Conditions(("a",)), FAST, with_controlnet=False, seeds=[0], work=tmp_path / "work")

@@ -75,10 +75,10 @@ def test_every_solver_ends_on_the_only_image_there_is(name, spacing, prediction_
     ("scheduler", "steps", "tolerance"),
     [
         ("unipc", 20, 0.05),
-        ("dpm++", 20, 0.05),
-        ("dpm++_3m", 20, 0.05),
+        ("dpmpp_2m", 20, 0.05),
+        ("dpmpp_3m", 20, 0.05),
         ("deis", 20, 0.05),
-        ("dpm++_sde", 50, 0.05),
+        ("dpmpp_sde", 50, 0.05),
         ("sa_solver", 50, 0.05),
         ("ddim", 100, 0.1),
         ("ddim", 1000, 0.02),
@@ -97,16 +97,16 @@ def test_solvers_reach_the_right_spread(scheduler, steps, tolerance):
 def test_zero_terminal_snr(name, prediction_type):
     """Without signal in the first noisy latents the mean has to come from the network alone, all of it."""
     config = CONFIG | {"prediction_type": prediction_type, "rescale_betas_zero_snr": True}
-    spacing = "lu" if "lu" in SPACINGS[name] else "even"
+    spacing = "lu" if "lu" in SPACINGS[name] else "linspace"
     for steps in (20, 100):
         made = solve(make_scheduler(name, config, steps, spacing), config, gaussian(3.0, 0.3))
         assert bool(torch.isfinite(made).all())
     # Spread: first-order and ancestral solvers are still off at 100 steps, as without rescaling.
     assert abs(float(made.mean()) - 3) < 0.02
-    assert abs(float(made.std()) / 0.3 - 1) < (0.3 if name in ("ddim", "ddpm", "sa_solver", "dpm++_sde") else 0.1)
+    assert abs(float(made.std()) / 0.3 - 1) < (0.3 if name in ("ddim", "ddpm", "sa_solver", "dpmpp_sde") else 0.1)
 
 
-@pytest.mark.parametrize("spacing", ["karras", "even", "trailing"])
+@pytest.mark.parametrize("spacing", ["karras", "linspace", "trailing"])
 @pytest.mark.parametrize("name", ["unipc", "deis", "sa_solver"])
 def test_zero_terminal_snr_is_finite_with_every_spacing(name, spacing):
     config = CONFIG | {"rescale_betas_zero_snr": True}
@@ -151,7 +151,7 @@ def test_the_default_is_diffusers_unipc_of_order_three():
     )
     reference.set_timesteps(20)
     options = SamplingOptions()
-    ours = make_scheduler(options.scheduler, CONFIG, options.num_inference_steps, options.spacing)
+    ours = make_scheduler(options.scheduler, CONFIG, options.num_inference_steps, options.timestep_spacing)
     assert torch.equal(solve(ours, CONFIG, gaussian(1.0, 0.3)), solve(reference, CONFIG, gaussian(1.0, 0.3)))
 
 
@@ -175,11 +175,11 @@ def test_a_thousand_steps_of_the_paper_are_all_time_steps():
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(1, 1000), st.sampled_from(["even", "trailing"]))
+@given(st.integers(1, 1000), st.sampled_from(["linspace", "trailing"]))
 # Rounding made 62 of diffusers' thousand trailing schedules one step too long, and two even steps of 1000 the same.
 @example(61, "trailing")
 @example(982, "trailing")
-@example(1000, "even")
+@example(1000, "linspace")
 def test_steps_even_in_time(steps, spacing):
     for name in ("unipc", "ddpm", "sa_solver"):
         timesteps = make_scheduler(name, CONFIG, steps, spacing).timesteps.tolist()
@@ -210,18 +210,20 @@ def test_clean_latents_inverts_each_prediction():
 def test_wrong_calls_are_named():
     with pytest.raises(ValueError, match="unknown scheduler 'euler'; known: unipc"):
         make_scheduler("euler", CONFIG, 20)
-    with pytest.raises(ValueError, match="'ddpm' does not support spacing 'karras'; it supports even, trailing"):
+    with pytest.raises(
+        ValueError, match="'ddpm' does not support timestep_spacing 'karras'; it supports linspace, trailing"
+    ):
         make_scheduler("ddpm", CONFIG, 20, "karras")
     with pytest.raises(ValueError, match="has 1 to 100 steps, got num_inference_steps 101"):
         make_scheduler("unipc", CONFIG | {"num_train_timesteps": 100}, 101)
 
 
 def test_options_refuse_spacings_before_anything_is_loaded():
-    assert SamplingOptions(scheduler="ddpm").spacing == "even"
-    assert SamplingOptions(scheduler="dpm++").spacing == SamplingOptions().spacing == "karras"
+    assert SamplingOptions(scheduler="ddpm").timestep_spacing == "linspace"
+    assert SamplingOptions(scheduler="dpmpp_2m").timestep_spacing == SamplingOptions().timestep_spacing == "karras"
     for spacing in ("karras", "lu"):
-        with pytest.raises(ValueError, match=f"'ddpm' does not support spacing '{spacing}'"):
-            SamplingOptions(scheduler="ddpm", spacing=spacing)
+        with pytest.raises(ValueError, match=f"'ddpm' does not support timestep_spacing '{spacing}'"):
+            SamplingOptions(scheduler="ddpm", timestep_spacing=spacing)
     with pytest.raises(ValueError, match="Input should be 'unipc'"):
         SamplingOptions.model_validate({"scheduler": "euler"})
     assert set(STOCHASTIC) < set(SPACINGS)

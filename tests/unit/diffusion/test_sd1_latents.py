@@ -17,7 +17,7 @@ from sd1_latent_tiny import REAL_DATA, SCALING_FACTOR, tiny_autoencoder
 from tiny_stable_diffusion import make_models, tiny_changes, write_folder
 
 from ctlev_core import plugins
-from ctlev_core.diffusion.pretrained.loading import decode_latents, images_to_tensor, load_prior
+from ctlev_core.diffusion.pretrained.loading import decode_latents, images_to_tensor, load_base_model
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.training.finetuning import fine_tune
@@ -61,7 +61,7 @@ def drawn(folder: str, num_events: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def frames() -> dict[str, np.ndarray]:
-    """[512, 512, 3] uint8 by name: a grey picture, two bodies of DHP19, a digit, three recordings of lone events."""
+    """[512, 512, 3] uint8 by name: a grey picture, two bodies of DHP19, a digit, three recordings of sparse events."""
     for place in (*PICTURES.values(), *(folder for folder, _ in RECORDINGS.values())):
         if not (REAL_DATA / place).exists():
             pytest.skip(f"{place} of the real data is not beside this checkout")
@@ -74,17 +74,17 @@ def frames() -> dict[str, np.ndarray]:
 def folder(tmp_path_factory):
     changes = tiny_changes()
     changes = {**changes, "unet": {**changes["unet"], "sample_size": SIDE // 8}}
-    return write_folder(make_models(changes), tmp_path_factory.mktemp("prior") / "sd")
+    return write_folder(make_models(changes), tmp_path_factory.mktemp("base_model") / "sd")
 
 
 @pytest.fixture
-def prior_of(folder):
-    """A prior of the given scaling factor."""
+def base_model_of(folder):
+    """A base model of the given scaling factor."""
 
     def make(scaling_factor=SCALING_FACTOR):
-        prior = dataclasses.replace(load_prior(folder), vae=tiny_autoencoder(scaling_factor))
-        assert prior.image_size == (SIDE, SIDE)
-        return prior
+        base_model = dataclasses.replace(load_base_model(folder), vae=tiny_autoencoder(scaling_factor))
+        assert base_model.image_size == (SIDE, SIDE)
+        return base_model
 
     return make
 
@@ -102,22 +102,22 @@ def psnr(image: torch.Tensor, frame: np.ndarray) -> float:
     return float(10 * torch.log10(4 / (image - images_to_tensor(frame[None])[0]).square().mean()))
 
 
-def test_scaled_latents_have_a_deviation_near_one_and_others_have_not(latents, prior_of):
+def test_scaled_latents_have_a_deviation_near_one_and_others_have_not(latents, base_model_of):
     for name, values in latents.items():
         assert values.shape == (4, SIDE // 8, SIDE // 8)
         # 7.3 of the picture; 7.7 to 9.2 of event images, most of which is how far black lies from the middle.
         assert 5 < values.std() < 10, name
-        assert 0.5 < values.std() * prior_of().scaling_factor < 2, name
+        assert 0.5 < values.std() * base_model_of().scaling_factor < 2, name
 
 
-def test_round_trip_keeps_frames_as_far_as_the_tiny_autoencoder_can(frames, latents, prior_of):
+def test_round_trip_keeps_frames_as_far_as_the_tiny_autoencoder_can(frames, latents, base_model_of):
     for name, frame in frames.items():
-        (image,) = decode_latents(prior_of(), latents[name][None] * SCALING_FACTOR)
+        (image,) = decode_latents(base_model_of(), latents[name][None] * SCALING_FACTOR)
         # 22.7 (street) to 25.6 dB (spot) of event images. It draws black as a grey of .045: black alone has 25.7 dB.
         assert psnr(image, frame) > 21.5, name
         alike = np.corrcoef(image.numpy().ravel(), images_to_tensor(frame[None]).numpy().ravel())[0, 1]
-        # Bodies .90 and .91, digit .96, picture .99. Of lone events, each spread over four pixels at half its height,
-        # only the mean of their neighbourhood is left: spot .65, person .44, street .29.
+        # Bodies .90 and .91, digit .96, picture .99. Of isolated events, each spread over four pixels at half its
+        # height, only the mean of their neighbourhood is left: spot .65, person .44, street .29.
         assert alike > (0.15 if name in SPARSE else 0.85), name
         if name not in SPARSE:
             assert psnr(image, frame) > psnr(-torch.ones(3, SIDE, SIDE), frame) + 1, f"{name}: no nearer than black"
@@ -128,31 +128,33 @@ def test_round_trip_keeps_frames_as_far_as_the_tiny_autoencoder_can(frames, late
     # Not scaled back; not scaled at first; twice of what it should be.
     [(SCALING_FACTOR, 1.0, 10), (1.0, SCALING_FACTOR, 10), (SCALING_FACTOR, 2 * SCALING_FACTOR, 5)],
 )
-def test_another_factor_on_the_way_back_draws_worse(frames, latents, prior_of, encoded, decoded, loss_db):
+def test_another_factor_on_the_way_back_draws_worse(frames, latents, base_model_of, encoded, decoded, loss_db):
     """14, 19 and 9 dB worse. A factor a little too small even gains, as black then is darker than it draws it."""
     for name in FEW:
-        (right,) = decode_latents(prior_of(), latents[name][None] * SCALING_FACTOR)
-        (wrong,) = decode_latents(prior_of(decoded), latents[name][None] * encoded)
+        (right,) = decode_latents(base_model_of(), latents[name][None] * SCALING_FACTOR)
+        (wrong,) = decode_latents(base_model_of(decoded), latents[name][None] * encoded)
         assert psnr(wrong, frames[name]) < psnr(right, frames[name]) - loss_db, name
 
 
-def test_cached_latents_are_those_of_a_direct_call(frames, latents, prior_of):
-    prior = prior_of()
-    cache = cache_latents(prior, np.stack(list(frames.values())), Conditions(tuple(f"a {name}" for name in frames)))
+def test_cached_latents_are_those_of_a_direct_call(frames, latents, base_model_of):
+    base_model = base_model_of()
+    cache = cache_latents(
+        base_model, np.stack(list(frames.values())), Conditions(tuple(f"a {name}" for name in frames))
+    )
     direct = torch.stack(list(latents.values()))
     assert cache.std is None
     torch.testing.assert_close(cache.mean, direct, rtol=0, atol=0)
     rows = np.array([5, 0, 3])
     batch = cache.batch(rows, torch.Generator().manual_seed(0), 0.0, torch.device("cpu"))
     torch.testing.assert_close(batch.latents, direct[rows] * SCALING_FACTOR)
-    decoded = prior.vae.decode(direct[rows[:1]]).sample
-    torch.testing.assert_close(decode_latents(prior, batch.latents[:1]), decoded, rtol=1e-4, atol=1e-4)
+    decoded = base_model.vae.decode(direct[rows[:1]]).sample
+    torch.testing.assert_close(decode_latents(base_model, batch.latents[:1]), decoded, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("scaling_factor", [SCALING_FACTOR, 1.0, SCALING_FACTOR**2])
-def test_a_wrong_factor_in_a_folder_is_noticed_before_training(frames, prior_of, caplog, scaling_factor):
+def test_a_wrong_factor_in_a_folder_is_noticed_before_training(frames, base_model_of, caplog, scaling_factor):
     conditions = Conditions(("an event image",) * len(frames))
-    cache = cache_latents(prior_of(scaling_factor), np.stack(list(frames.values())), conditions)
+    cache = cache_latents(base_model_of(scaling_factor), np.stack(list(frames.values())), conditions)
     with caplog.at_level(logging.WARNING):
         check_cache(cache, conditions)
     messages = [record.getMessage() for record in caplog.records]
@@ -163,13 +165,13 @@ def test_a_wrong_factor_in_a_folder_is_noticed_before_training(frames, prior_of,
         assert f"after scaling by {scaling_factor:g}" in message and "Stable Diffusion v1: 0.18215" in message
 
 
-def test_the_whole_route_learns_from_and_draws_frames_of_512_px(frames, prior_of, tmp_path):
-    prior = prior_of()
+def test_the_whole_route_learns_from_and_draws_frames_of_512_px(frames, base_model_of, tmp_path):
+    base_model = base_model_of()
     conditions = Conditions(("an event image",) * 2)
     options = FineTuningOptions(num_steps=2, batch_size=2, warmup_steps=1, log_every=1, num_validation=0)
     images = np.stack([frames[name] for name in FEW])
-    history = fine_tune(prior, images, conditions, options, tune="unet", seed=0, work=tmp_path / "training")
+    history = fine_tune(base_model, images, conditions, options, tune="unet", seed=0, work=tmp_path / "training")
     assert np.isfinite(history.loss).all()
     sampling = SamplingOptions(num_inference_steps=2, batch_size=2)
-    drawn_frames = sample_frames(prior, conditions, sampling, seeds=[0, 1], work=tmp_path / "sampling")
+    drawn_frames = sample_frames(base_model, conditions, sampling, seeds=[0, 1], work=tmp_path / "sampling")
     assert drawn_frames.shape == (2, SIDE, SIDE, 3) and drawn_frames.dtype == np.uint8

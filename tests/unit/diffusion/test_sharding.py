@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny_prior import make_prior
+from tiny_base_model import make_base_model
 
 from ctlev_core.diffusion.training.fsdp import gather_networks, part_of, part_of_optimizer, shard_networks, whole
 
@@ -12,18 +12,18 @@ PROCESSES = 2
 
 
 def share_out(rank, folder):
-    """The main program of each process: share out a prior, put it together again, and tell what was held."""
+    """The main program of each process: share out a base model, put it together again, and tell what was held."""
     torch.set_num_threads(1)
     torch.distributed.init_process_group(
         "gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=PROCESSES
     )
-    prior = make_prior()
-    before = {name: dict(getattr(prior, name).state_dict()) for name in ("unet", "controlnet")}
+    base_model = make_base_model()
+    before = {name: dict(getattr(base_model, name).state_dict()) for name in ("unet", "controlnet")}
     before = {name: {key: value.clone() for key, value in state.items()} for name, state in before.items()}
-    shard_networks(prior)
-    held = {name: sum(p.to_local().numel() for p in getattr(prior, name).parameters()) for name in before}
+    shard_networks(base_model)
+    held = {name: sum(p.to_local().numel() for p in getattr(base_model, name).parameters()) for name in before}
     of = {name: sum(value.numel() for value in state.values()) for name, state in before.items()}
-    gathered = gather_networks(prior, keep=rank == 0)
+    gathered = gather_networks(base_model, keep=rank == 0)
     assert (gathered is None) == (rank != 0)
     same = gathered is None or all(
         torch.equal(value, before[name][key])

@@ -30,8 +30,8 @@ from tiny_stable_diffusion import (
 from transformers import CLIPTextModel
 
 from ctlev_core.diffusion.pretrained import single_file
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_prior, save_prior
-from ctlev_core.diffusion.pretrained.paths import check_prior_folder, prior_places
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_base_model, save_base_model
+from ctlev_core.diffusion.pretrained.paths import base_model_places, check_base_model_folder
 from data_contracts.errors import DataError
 
 STABLE_DIFFUSION_V1 = {"unet": 859_520_964, "controlnet": 361_279_120, "vae": 83_653_863, "text_encoder": 123_060_480}
@@ -89,7 +89,7 @@ def outputs(unet, controlnet, vae, text_encoder):
     return {"text": text, "middle": middle, "predicted": predicted, "mean": posterior.mean, "decoded": decoded}
 
 
-def check_same(prior, folder):
+def check_same(base_model, folder):
     """Bit for bit what the libraries themselves load from the folder."""
     control_folder = folder.with_name(f"{folder.name}-controlnet")
     expected = outputs(
@@ -98,22 +98,26 @@ def check_same(prior, folder):
         AutoencoderKL.from_pretrained(folder / "vae"),
         CLIPTextModel.from_pretrained(folder / "text_encoder"),
     )
-    got = outputs(prior.unet, prior.controlnet, prior.vae, prior.text_encoder)
+    got = outputs(base_model.unet, base_model.controlnet, base_model.vae, base_model.text_encoder)
     for name, value in expected.items():
         assert torch.isfinite(value).all() and value.std() > 0, name
         assert torch.equal(got[name], value), name
 
 
 def test_single_files_give_what_the_folders_give(single, control, folder):
-    check_same(load_prior(folder, controlnet=folder.with_name("sd-controlnet")), folder)
-    prior = load_prior(single, controlnet=control)
-    check_same(prior, folder)
-    assert prior.image_size == (SIDE, SIDE) and prior.scaling_factor == 0.25 and not prior.reversed_condition
-    assert prior.scheduler_config["prediction_type"] == "epsilon"
-    assert prior.scheduler_config["beta_end"] == 0.012 and prior.scheduler_config["clip_sample"] is False
+    check_same(load_base_model(folder, controlnet=folder.with_name("sd-controlnet")), folder)
+    base_model = load_base_model(single, controlnet=control)
+    check_same(base_model, folder)
+    assert (
+        base_model.image_size == (SIDE, SIDE)
+        and base_model.scaling_factor == 0.25
+        and not base_model.reversed_condition
+    )
+    assert base_model.scheduler_config["prediction_type"] == "epsilon"
+    assert base_model.scheduler_config["beta_end"] == 0.012 and base_model.scheduler_config["clip_sample"] is False
     prompts = ["a photo of a cup", ""]
-    assert torch.equal(encode_prompts(prior, prompts), encode_prompts(load_prior(folder), prompts))
-    assert load_prior(single).controlnet is None
+    assert torch.equal(encode_prompts(base_model, prompts), encode_prompts(load_base_model(folder), prompts))
+    assert load_base_model(single).controlnet is None
 
 
 def write_lightning_checkpoint(tensors, path, monkeypatch):
@@ -136,12 +140,12 @@ def test_original_training_state_is_read_without_lightning(models, single, folde
     path.with_suffix(".json").write_text(json.dumps(tiny_changes()))
     with pytest.raises(Exception, match="pytorch_lightning"):  # what torch does with such a file
         torch.load(path, weights_only=True)
-    # Both in one file, as control_sd15_openpose.pth: it is a prior of its own, and a ControlNet for another.
-    assert check_prior_folder(single, controlnet=path, needs_controlnet=True) == single
-    check_same(load_prior(single, controlnet=path), folder)
+    # Both in one file, as control_sd15_openpose.pth: it is a base model of its own, and a ControlNet for another.
+    assert check_base_model_folder(single, controlnet=path, needs_controlnet=True) == single
+    check_same(load_base_model(single, controlnet=path), folder)
     shutil.copytree(folder / "tokenizer", tmp_path / "tokenizer")
-    check_same(load_prior(path), folder)
-    assert load_prior(path, with_controlnet=False).controlnet is None
+    check_same(load_base_model(path), folder)
+    assert load_base_model(path, with_controlnet=False).controlnet is None
 
 
 def test_tensors_that_share_storage_or_are_transposed_are_read_from_archives(models, single, folder, tmp_path):
@@ -154,7 +158,7 @@ def test_tensors_that_share_storage_or_are_transposed_are_read_from_archives(mod
     tensors["time_embed.0.weight"] = torch.nn.Parameter(tensors["time_embed.0.weight"])
     torch.save(tensors, tmp_path / "control.pth")
     (tmp_path / "control.json").write_text(json.dumps(tiny_changes()))
-    check_same(load_prior(single, controlnet=tmp_path / "control.pth"), folder)
+    check_same(load_base_model(single, controlnet=tmp_path / "control.pth"), folder)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -164,7 +168,7 @@ def test_half_precision_files_load_as_the_rounded_weights(models, single, tmp_pa
     path = write_single(halves, tmp_path / "half.safetensors")
     if ending == ".pth":
         torch.save(halves, path.with_suffix(ending))
-    loaded = load_prior(single, controlnet=path.with_suffix(ending)).controlnet.state_dict()
+    loaded = load_base_model(single, controlnet=path.with_suffix(ending)).controlnet.state_dict()
     for name, value in models["controlnet"].state_dict().items():
         assert torch.equal(loaded[name], value.to(dtype).float()), name
 
@@ -213,10 +217,10 @@ def test_file_beside_the_checkpoint_changes_its_config(single, control, tmp_path
     }
     for path in (single, control):
         (tmp_path / path.name).with_suffix(".json").write_text(json.dumps(changes))
-    prior = load_prior(tmp_path / single.name, controlnet=tmp_path / control.name)
-    assert prior.scheduler_config["prediction_type"] == "v_prediction"
-    assert prior.scheduler_config["clip_sample"] is False  # latents are never clipped
-    assert prior.scaling_factor == 0.5 and prior.reversed_condition
+    base_model = load_base_model(tmp_path / single.name, controlnet=tmp_path / control.name)
+    assert base_model.scheduler_config["prediction_type"] == "v_prediction"
+    assert base_model.scheduler_config["clip_sample"] is False  # latents are never clipped
+    assert base_model.scaling_factor == 0.5 and base_model.reversed_condition
     beside = tmp_path / "v1.json"
     for wrong, message in (
         ({"unet": {"in_chanels": 4}}, "unet has no entry 'in_chanels'; known: sample_size, in_channels"),
@@ -225,16 +229,16 @@ def test_file_beside_the_checkpoint_changes_its_config(single, control, tmp_path
     ):
         beside.write_text(json.dumps(wrong))
         with pytest.raises(DataError, match=message):
-            check_prior_folder(tmp_path / single.name)
+            check_base_model_folder(tmp_path / single.name)
 
 
 def test_fine_tuned_single_file_loads_in_diffusers_alone(single, control, tmp_path):
-    prior = load_prior(single, controlnet=control)
-    save_prior(prior, tmp_path / "out")
+    base_model = load_base_model(single, controlnet=control)
+    save_base_model(base_model, tmp_path / "out")
     assert not [path for path in (tmp_path / "out").rglob("*") if path.suffix in (".bin", ".pt", ".pth", ".ckpt")]
     pipeline = StableDiffusionControlNetPipeline.from_pretrained(tmp_path / "out", local_files_only=True)
     for name in ("unet", "controlnet", "vae", "text_encoder"):
-        expected = getattr(prior, name).state_dict()
+        expected = getattr(base_model, name).state_dict()
         got = getattr(pipeline, name).state_dict()
         assert got.keys() == expected.keys() and all(torch.equal(got[key], expected[key]) for key in got), name
     assert pipeline.vae.config.scaling_factor == 0.25
@@ -242,18 +246,18 @@ def test_fine_tuned_single_file_loads_in_diffusers_alone(single, control, tmp_pa
     pipeline.set_progress_bar_config(disable=True)
     images = pipeline("a cup", image=torch.zeros(1, 3, SIDE, SIDE), num_inference_steps=2, output_type="np").images
     assert images.shape == (1, SIDE, SIDE, 3) and np.isfinite(images).all()
-    again = load_prior(tmp_path / "out")
+    again = load_base_model(tmp_path / "out")
     assert again.tokenizer.model_max_length == 16  # the text encoder's, which the tokenizer's folder does not know
     assert again.scheduler_config["prediction_type"] == "epsilon" and again.controlnet is not None
 
 
 def test_cache_key_sees_every_file(single, control, folder):
     beside = [single.with_suffix(".json"), single.with_name("tokenizer")]
-    assert prior_places(single) == [single, *beside]
-    places = prior_places(single, controlnet=control, needs_controlnet=True)
+    assert base_model_places(single) == [single, *beside]
+    places = base_model_places(single, controlnet=control, needs_controlnet=True)
     assert places == [single, *beside, control, control.with_suffix(".json")]
     control_folder = folder.with_name("sd-controlnet")
-    assert prior_places(folder, controlnet=control_folder) == [folder, control_folder]
+    assert base_model_places(folder, controlnet=control_folder) == [folder, control_folder]
 
 
 def changed(models, tmp_path, drop=(), **tensors):
@@ -278,7 +282,7 @@ def test_other_architectures_are_named(tmp_path, case):
     name, message = FOREIGN[case]
     path = write_single({name: torch.zeros(2, 2)}, tmp_path / "file.safetensors")
     with pytest.raises(DataError, match=message):
-        check_prior_folder(path)
+        check_base_model_folder(path)
 
 
 def test_parts_that_a_single_file_lacks_are_named(models, single, tmp_path):
@@ -287,33 +291,33 @@ def test_parts_that_a_single_file_lacks_are_named(models, single, tmp_path):
         ("cond_stage_model.", "the text encoder is missing"),
     ):
         with pytest.raises(DataError, match=message):
-            check_prior_folder(changed(models, tmp_path, drop=prefix))
+            check_base_model_folder(changed(models, tmp_path, drop=prefix))
     path = changed(models, tmp_path)
     with pytest.raises(DataError, match=r"tokenizer: no such folder.*put a folder 'tokenizer' with CLIP's vocab.json"):
-        check_prior_folder(path)
+        check_base_model_folder(path)
     shutil.copytree(single.with_name("tokenizer"), tmp_path / "tokenizer")
-    check_prior_folder(path)
+    check_base_model_folder(path)
     lost = "model.diffusion_model.output_blocks.3.0.in_layers.2.weight"
     with pytest.raises(DataError, match=r"1 are missing and 0 others are there; missing: up_blocks.1.resnets.0.conv1"):
-        load_prior(changed(models, tmp_path, drop=lost))
+        load_base_model(changed(models, tmp_path, drop=lost))
     extra = {"model.diffusion_model.output_blocks.12.0.in_layers.2.weight": torch.zeros(1)}
     with pytest.raises(DataError, match=r"unknown: up_blocks.4.resnets.0.conv1"):
-        load_prior(changed(models, tmp_path, **extra))
+        load_base_model(changed(models, tmp_path, **extra))
     strange = {"first_stage_model.encoder.extra.weight": torch.zeros(1)}
     with pytest.raises(DataError, match=r"unknown: first_stage_model.encoder.extra.weight"):
-        load_prior(changed(models, tmp_path, **strange))
-    with pytest.raises(DataError, match=r"nowhere.ckpt: the prior must be .* no such folder or file"):
-        check_prior_folder(tmp_path / "nowhere.ckpt")
+        load_base_model(changed(models, tmp_path, **strange))
+    with pytest.raises(DataError, match=r"nowhere.ckpt: the base model must be .* no such folder or file"):
+        check_base_model_folder(tmp_path / "nowhere.ckpt")
 
 
 def test_inpainting_and_other_text_widths_are_refused(models, single, tmp_path):
     shutil.copytree(single.with_name("tokenizer"), tmp_path / "tokenizer")
     first = "model.diffusion_model.input_blocks.0.0.weight"
     with pytest.raises(DataError, match=r"takes 9 latent channels \(a U-Net for inpainting.*makes 4"):
-        check_prior_folder(changed(models, tmp_path, **{first: torch.zeros(8, 9, 3, 3)}))
+        check_base_model_folder(changed(models, tmp_path, **{first: torch.zeros(8, 9, 3, 3)}))
     attention = "model.diffusion_model.middle_block.1.transformer_blocks.0.attn2.to_k.weight"
     with pytest.raises(DataError, match=r"takes prompt embeddings 1024 wide \(Stable Diffusion 2\).*makes 12"):
-        check_prior_folder(changed(models, tmp_path, **{attention: torch.zeros(24, 1024)}))
+        check_base_model_folder(changed(models, tmp_path, **{attention: torch.zeros(24, 1024)}))
 
 
 def test_files_that_hold_no_fitting_controlnet_are_refused(models, single, tmp_path):
@@ -339,4 +343,4 @@ def test_files_that_hold_no_fitting_controlnet_are_refused(models, single, tmp_p
     }
     for name, (held, message) in cases.items():
         with pytest.raises(DataError, match=message):
-            check_prior_folder(single, controlnet=write_single(held, tmp_path / f"{name}.safetensors"))
+            check_base_model_folder(single, controlnet=write_single(held, tmp_path / f"{name}.safetensors"))

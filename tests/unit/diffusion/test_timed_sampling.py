@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from tiny_prior import make_data, make_prior
+from tiny_base_model import make_base_model, make_data
 
-from ctlev_core.diffusion.pretrained.loading import save_prior
+from ctlev_core.diffusion.pretrained.loading import save_base_model
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.solver_studies.timed_sampling import sample_timed
 from ctlev_core.diffusion.solver_studies.trajectory_precision import PRECISIONS, precision_errors
@@ -17,7 +17,7 @@ SEEDS = [7, 1, 4, 3, 5]
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     folder = tmp_path_factory.mktemp("checkpoint")
-    save_prior(make_prior(), folder)
+    save_base_model(make_base_model(), folder)
     return folder
 
 
@@ -29,8 +29,17 @@ def checkpoint(tmp_path_factory):
         # With and without the prompt.
         ({"guidance_scale": 2.0}, 10, 10),
         # Three of five steps lie in the noisier half; the ControlNet's residuals are not carried from one to the other.
-        ({"guidance_scale": 2.0, "guidance_interval": (0.5, 1.0), "spacing": "even"}, 8, 8),
-        ({"guidance_scale": 2.0, "guidance_interval": (0.5, 1.0), "spacing": "even", "controlnet_every": 2}, 8, 5),
+        ({"guidance_scale": 2.0, "guidance_interval": (0.5, 1.0), "timestep_spacing": "linspace"}, 8, 8),
+        (
+            {
+                "guidance_scale": 2.0,
+                "guidance_interval": (0.5, 1.0),
+                "timestep_spacing": "linspace",
+                "controlnet_every": 2,
+            },
+            8,
+            5,
+        ),
         ({"scheduler": "sa_solver"}, 5, 5),
     ],
 )
@@ -79,8 +88,8 @@ def test_fewer_digits_cost_more(checkpoint):
 
 
 def test_precision_is_not_asked_of_solvers_that_compute_in_float32(checkpoint):
-    with pytest.raises(ValueError, match=r"unipc or deis, got 'dpm\+\+'"):
-        precision_errors(checkpoint, make_data(1)[1], [SamplingOptions(scheduler="dpm++")], seeds=[0])
+    with pytest.raises(ValueError, match=r"unipc or deis, got 'dpmpp_2m'"):
+        precision_errors(checkpoint, make_data(1)[1], [SamplingOptions(scheduler="dpmpp_2m")], seeds=[0])
 
 
 def test_the_patch_code_adds_no_rounding_of_its_own(checkpoint):

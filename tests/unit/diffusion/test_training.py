@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_prior import make_data, make_prior, shared_prior
+from tiny_base_model import make_base_model, make_data, shared_base_model
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, generator_for
 from ctlev_core.diffusion.training import loop
@@ -20,11 +20,11 @@ from data_contracts.labels import Conditions
 OPTIONS = FineTuningOptions(num_steps=6, batch_size=4, warmup_steps=2, log_every=2, num_validation=0, ema_decay=0.5)
 
 
-def weights(prior):
+def weights(base_model):
     return {
         f"{name}.{key}": value.clone()
         for name in ("unet", "controlnet", "text_encoder")
-        for key, value in getattr(prior, name).state_dict().items()
+        for key, value in getattr(base_model, name).state_dict().items()
     }
 
 
@@ -53,13 +53,13 @@ def kill_after(monkeypatch, updates):
 def test_resumed_run_ends_in_the_same_weights(tmp_path, monkeypatch, accumulation):
     options = OPTIONS.model_copy(update={"gradient_accumulation": accumulation, "checkpoint_every_s": 1e-9})
     frames, conditions = make_data()
-    whole = make_prior()
+    whole = make_base_model()
     history = fine_tune(whole, frames, conditions, options, tune="both", seed=3, work=tmp_path / "whole")
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
         kill_after(patch, 3)
-        fine_tune(make_prior(), frames, conditions, options, tune="both", seed=3, work=tmp_path / "killed")
-    resumed = make_prior()
+        fine_tune(make_base_model(), frames, conditions, options, tune="both", seed=3, work=tmp_path / "killed")
+    resumed = make_base_model()
     again = fine_tune(resumed, frames, conditions, options, tune="both", seed=3, work=tmp_path / "killed")
 
     assert changed_networks(weights(whole), weights(resumed)) == set()
@@ -69,7 +69,7 @@ def test_resumed_run_ends_in_the_same_weights(tmp_path, monkeypatch, accumulatio
 
 def test_other_seed_gives_other_weights(tmp_path):
     frames, conditions = make_data()
-    one, other = make_prior(), make_prior()
+    one, other = make_base_model(), make_base_model()
     fine_tune(one, frames, conditions, OPTIONS, tune="both", seed=1, work=tmp_path / "one")
     fine_tune(other, frames, conditions, OPTIONS, tune="both", seed=2, work=tmp_path / "other")
     assert changed_networks(weights(one), weights(other)) == {"unet", "controlnet"}
@@ -77,11 +77,11 @@ def test_other_seed_gives_other_weights(tmp_path):
 
 @pytest.mark.parametrize(("tune", "learns"), [("unet", {"unet"}), ("controlnet", {"controlnet"})])
 def test_only_the_named_network_learns(tmp_path, tune, learns):
-    prior = make_prior()
-    before = weights(prior)
+    base_model = make_base_model()
+    before = weights(base_model)
     frames, conditions = make_data()
-    fine_tune(prior, frames, conditions, OPTIONS, tune=tune, seed=0, work=tmp_path)
-    assert changed_networks(before, weights(prior)) == learns
+    fine_tune(base_model, frames, conditions, OPTIONS, tune=tune, seed=0, work=tmp_path)
+    assert changed_networks(before, weights(base_model)) == learns
 
 
 def test_learns_and_uses_its_condition(tmp_path):
@@ -90,7 +90,7 @@ def test_learns_and_uses_its_condition(tmp_path):
     options = OPTIONS.model_copy(
         update={"num_steps": 60, "batch_size": 16, "learning_rate": 3e-3, "ema_decay": 0.9, "num_validation": 20}
     )
-    history = fine_tune(make_prior(), frames, conditions, options, tune="both", seed=0, work=tmp_path)
+    history = fine_tune(make_base_model(), frames, conditions, options, tune="both", seed=0, work=tmp_path)
     assert np.mean(history.loss[-5:]) < 0.7 * history.loss[0]
     assert history.shuffled_loss[-1] > 1.05 * history.validation_loss[-1]
     assert history.validation_step == [60]
@@ -99,19 +99,19 @@ def test_learns_and_uses_its_condition(tmp_path):
 def test_text_route_needs_no_condition_images(tmp_path):
     frames, conditions = make_data(40, with_images=False)
     options = OPTIONS.model_copy(update={"num_validation": 4, "prompt_dropout": 0.5})
-    prior = make_prior()
-    history = fine_tune(prior, frames, conditions, options, tune="unet", seed=0, work=tmp_path)
+    base_model = make_base_model()
+    history = fine_tune(base_model, frames, conditions, options, tune="unet", seed=0, work=tmp_path)
     assert len(history.validation_loss) == 1 and math.isfinite(history.shuffled_loss[0])
 
 
 def test_state_of_another_run_is_refused(tmp_path):
     frames, conditions = make_data()
-    fine_tune(make_prior(), frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
+    fine_tune(make_base_model(), frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
     with pytest.raises(TrainingError, match="of another run, delete it"):
-        fine_tune(make_prior(), frames[::-1], conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
+        fine_tune(make_base_model(), frames[::-1], conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
     (tmp_path / "state.pt").write_bytes(b"half a file")
     with pytest.raises(TrainingError, match="cannot be read, delete it"):
-        fine_tune(make_prior(), frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
+        fine_tune(make_base_model(), frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
 
 
 def test_non_finite_losses_are_skipped_then_raised(tmp_path, monkeypatch):
@@ -124,15 +124,15 @@ def test_non_finite_losses_are_skipped_then_raised(tmp_path, monkeypatch):
         return original(*arguments) * (math.nan if calls[-1] in (1, 2) else 1.0)
 
     monkeypatch.setattr(loop, "denoising_loss", sometimes_nan)
-    prior = make_prior()
-    history = fine_tune(prior, frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path / "some")
+    base_model = make_base_model()
+    history = fine_tune(base_model, frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path / "some")
     assert all(math.isfinite(loss) for loss in history.loss)
-    assert all(bool(torch.isfinite(value).all()) for value in weights(prior).values())
+    assert all(bool(torch.isfinite(value).all()) for value in weights(base_model).values())
 
     monkeypatch.setattr(loop, "denoising_loss", lambda *arguments: original(*arguments) * math.nan)
     options = OPTIONS.model_copy(update={"num_steps": 30})
     with pytest.raises(TrainingError, match="not finite 10 times in a row, the last at step 9"):
-        fine_tune(make_prior(), frames, conditions, options, tune="unet", seed=0, work=tmp_path / "all")
+        fine_tune(make_base_model(), frames, conditions, options, tune="unet", seed=0, work=tmp_path / "all")
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_non_finite_losses_are_skipped_then_raised(tmp_path, monkeypatch):
 )
 def test_wrong_data_is_named(tmp_path, frames, conditions, message):
     with pytest.raises(ValueError, match=message):
-        fine_tune(shared_prior(), frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
+        fine_tune(shared_base_model(), frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
 
 
 @settings(max_examples=50, deadline=None)
@@ -164,7 +164,7 @@ def test_every_epoch_visits_every_row_once(count, batch_size, seed):
 
 
 def test_min_snr_weights_follow_the_definition():
-    config = dict(shared_prior().scheduler_config)
+    config = dict(shared_base_model().scheduler_config)
     timesteps = torch.tensor([0, 100, 500, 900, 999])
     for prediction, denominator in (("v_prediction", 1.0), ("epsilon", 0.0)):
         schedule = NoiseSchedule({**config, "prediction_type": prediction})
@@ -178,7 +178,7 @@ def test_min_snr_weights_follow_the_definition():
 
 def test_a_network_that_predicts_the_latents_is_weighted_like_one_that_predicts_v():
     """|v - v'|^2 = (snr + 1) |x - x'|^2 at the same noisy latents: equal networks have equal losses up to the cap."""
-    schedule = NoiseSchedule({**shared_prior().scheduler_config, "prediction_type": "sample"})
+    schedule = NoiseSchedule({**shared_base_model().scheduler_config, "prediction_type": "sample"})
     latents, noise = torch.randn(2, 3, 4, 4), torch.randn(2, 3, 4, 4)
     assert torch.equal(schedule.noised(latents, noise, torch.tensor([10, 800]))[1], latents)
     weights = schedule.loss_weights(torch.arange(1000))
@@ -204,14 +204,14 @@ def test_evenly_drawn_time_steps_are_those_of_torch():
 
 
 def test_min_snr_weights_are_finite_at_zero_terminal_snr():
-    config = {**shared_prior().scheduler_config, "rescale_betas_zero_snr": True}
+    config = {**shared_base_model().scheduler_config, "rescale_betas_zero_snr": True}
     for prediction in ("v_prediction", "epsilon", "sample"):
         schedule = NoiseSchedule({**config, "prediction_type": prediction})
         assert bool(torch.isfinite(schedule.loss_weights(torch.arange(1000), Emphasis(5.0))).all())
 
 
 def test_velocity_target_follows_the_definition():
-    schedule = NoiseSchedule(shared_prior().scheduler_config)
+    schedule = NoiseSchedule(shared_base_model().scheduler_config)
     generator = torch.Generator().manual_seed(0)
     latents, noise = torch.randn((2, 3, 4, 4), generator=generator), torch.randn((2, 3, 4, 4), generator=generator)
     timesteps = torch.tensor([10, 800])
@@ -223,8 +223,8 @@ def test_velocity_target_follows_the_definition():
 
 
 def test_unsteered_rows_equal_the_u_net_alone():
-    prior = shared_prior()
-    denoiser = Denoiser(prior.unet, prior.controlnet)
+    base_model = shared_base_model()
+    denoiser = Denoiser(base_model.unet, base_model.controlnet)
     generator = generator_for(0, 1)
     batch = Batch(
         torch.randn((3, 48, 4, 4), generator=generator),
@@ -234,15 +234,15 @@ def test_unsteered_rows_equal_the_u_net_alone():
     timesteps = torch.tensor([5, 300, 900])
     with torch.no_grad():
         mixed = denoiser.predict(batch.latents, timesteps, batch.embeddings, batch.conditions)
-        alone = Denoiser(prior.unet).predict(batch.latents, timesteps, batch.embeddings, None)
+        alone = Denoiser(base_model.unet).predict(batch.latents, timesteps, batch.embeddings, None)
     # Other sums, same mathematics: float32 rounding.
     torch.testing.assert_close(mixed[1:], alone[1:], rtol=1e-4, atol=1e-5)
     assert (mixed[0] - alone[0]).abs().max() > 1e-3
 
 
 def test_forgotten_weights_are_random_and_repeatable():
-    prior = shared_prior()
-    one, two, other = forget_weights(prior, 0), forget_weights(prior, 0), forget_weights(prior, 1)
+    base_model = shared_base_model()
+    one, two, other = forget_weights(base_model, 0), forget_weights(base_model, 0), forget_weights(base_model, 1)
     assert changed_networks(weights(one), weights(two)) == set()
     assert changed_networks(weights(one), weights(other)) == {"unet", "controlnet"}
-    assert changed_networks(weights(prior), weights(one)) == {"unet", "controlnet"}
+    assert changed_networks(weights(base_model), weights(one)) == {"unet", "controlnet"}

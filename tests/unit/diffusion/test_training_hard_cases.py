@@ -1,4 +1,4 @@
-"""What is wrong with data, prior or gradients is named, and nothing of it gets into the weights."""
+"""What is wrong with data, base model or gradients is named, and nothing of it gets into the weights."""
 
 import dataclasses
 import logging
@@ -8,10 +8,10 @@ import re
 import numpy as np
 import pytest
 import torch
-from tiny_prior import CORPUS, make_data, make_prior, shared_prior
+from tiny_base_model import CORPUS, make_base_model, make_data, shared_base_model
 
 from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_loss, generator_for
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_prior
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_base_model
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.training import trainer
@@ -27,23 +27,25 @@ OPTIONS = FineTuningOptions(num_steps=4, batch_size=2, warmup_steps=1, log_every
 FRAMES, CONDITIONS = make_data(4)
 
 
-def tuned(work, prior=None, frames=FRAMES, conditions=CONDITIONS, options=OPTIONS):
-    prior = prior or make_prior()
-    return prior, fine_tune(prior, frames, conditions, options, tune="both", seed=0, work=work)
+def tuned(work, base_model=None, frames=FRAMES, conditions=CONDITIONS, options=OPTIONS):
+    base_model = base_model or make_base_model()
+    return base_model, fine_tune(base_model, frames, conditions, options, tune="both", seed=0, work=work)
 
 
-def finite(prior):
-    parameters = [*prior.unet.parameters(), *prior.controlnet.parameters()]
+def finite(base_model):
+    parameters = [*base_model.unet.parameters(), *base_model.controlnet.parameters()]
     return all(bool(torch.isfinite(value).all()) for value in parameters)
 
 
 @pytest.mark.parametrize("network", ["unet", "controlnet", "vae", "text_encoder"])
-def test_weights_of_the_prior_that_are_not_finite_are_named(tmp_path, network):
-    prior = make_prior()
-    key, tensor = next((key, tensor) for key, tensor in getattr(prior, network).state_dict().items() if tensor.ndim)
+def test_weights_of_the_base_model_that_are_not_finite_are_named(tmp_path, network):
+    base_model = make_base_model()
+    key, tensor = next(
+        (key, tensor) for key, tensor in getattr(base_model, network).state_dict().items() if tensor.ndim
+    )
     tensor.view(-1)[-1] = math.nan
-    save_prior(prior, tmp_path / "prior")
-    options = OPTIONS.model_copy(update={"prior": tmp_path / "prior"})
+    save_base_model(base_model, tmp_path / "base_model")
+    options = OPTIONS.model_copy(update={"base_model": tmp_path / "base_model"})
     folders = {"out": tmp_path / "out", "work": tmp_path / "work"}
     with pytest.raises(DataError, match=rf"{network}.*{re.escape(key)}.* not finite"):
         train_checkpoint(FRAMES, CONDITIONS, options, tune="both", with_controlnet=True, seed=0, **folders)
@@ -52,10 +54,10 @@ def test_weights_of_the_prior_that_are_not_finite_are_named(tmp_path, network):
 
 def test_latents_that_are_not_finite_name_their_frame(tmp_path):
     """Half-precision autoencoders overflow on saturated frames; the weights are all finite then."""
-    prior = make_prior()
+    base_model = make_base_model()
     frames = FRAMES.copy()
     frames[2] = 255
-    encode = prior.vae.encode
+    encode = base_model.vae.encode
 
     def overflowing(images):
         posterior = encode(images)
@@ -63,16 +65,16 @@ def test_latents_that_are_not_finite_name_their_frame(tmp_path):
         posterior.latent_dist.mean[saturated, 0, 0, 0] = math.inf
         return posterior
 
-    prior.vae.encode = overflowing
+    base_model.vae.encode = overflowing
     with pytest.raises(DataError, match="frame 2 of 4: the mean of its latents must be finite"):
-        tuned(tmp_path, prior, frames)
+        tuned(tmp_path, base_model, frames)
 
 
 def test_embeddings_that_are_not_finite_name_their_prompt(tmp_path, monkeypatch):
     from ctlev_core.diffusion.training import latent_cache
 
-    def broken(prior, prompts):
-        embeddings = encode_prompts(prior, prompts)
+    def broken(base_model, prompts):
+        embeddings = encode_prompts(base_model, prompts)
         embeddings[prompts.index("a photo of a cup"), 0, 0] = math.nan
         return embeddings
 
@@ -86,32 +88,32 @@ def test_a_single_image_can_be_learnt(tmp_path, batch_size):
     options = OPTIONS.model_copy(
         update={"num_steps": 40, "batch_size": batch_size, "num_validation": 8, "learning_rate": 3e-3}
     )
-    prior, history = tuned(tmp_path, frames=FRAMES[:1], conditions=CONDITIONS.take(slice(0, 1)), options=options)
-    assert finite(prior) and history.validation_loss == []  # no frame is left to be held back
+    base_model, history = tuned(tmp_path, frames=FRAMES[:1], conditions=CONDITIONS.take(slice(0, 1)), options=options)
+    assert finite(base_model) and history.validation_loss == []  # no frame is left to be held back
     assert np.mean(history.loss[-10:]) < np.mean(history.loss[:10])
 
 
 def test_prompts_beyond_the_tokenizers_limit_are_cut_off_and_named(caplog):
-    prior = shared_prior()
-    limit = prior.tokenizer.model_max_length
+    base_model = shared_base_model()
+    limit = base_model.tokenizer.model_max_length
     long = "a photo of a cup " * limit
     with caplog.at_level(logging.WARNING):
-        cache = cache_latents(prior, FRAMES[:2], Conditions((long, "a photo of a ball")))
+        cache = cache_latents(base_model, FRAMES[:2], Conditions((long, "a photo of a ball")))
     (record,) = caplog.records
     assert repr(long) in record.getMessage() and f"cut to {limit}" in record.getMessage()
     # A word is a token here, and two are taken by the marks around them.
     kept = " ".join(long.split()[: limit - 2])
     ordered = sorted([long, "a photo of a ball"])
-    torch.testing.assert_close(cache.embeddings[ordered.index(long)], encode_prompts(prior, [kept])[0])
+    torch.testing.assert_close(cache.embeddings[ordered.index(long)], encode_prompts(base_model, [kept])[0])
     caplog.clear()
     with caplog.at_level(logging.WARNING):
-        cache_latents(prior, FRAMES[:2], Conditions(CORPUS[:2]))
+        cache_latents(base_model, FRAMES[:2], Conditions(CORPUS[:2]))
     assert not caplog.records
 
 
 @pytest.mark.parametrize(("times", "noticed"), [(0.1, True), (1.0, False), (10.0, True)])
 def test_a_scaling_factor_that_does_not_fit_the_latents_is_noticed(caplog, times, noticed):
-    cache = cache_latents(shared_prior(), FRAMES, CONDITIONS)
+    cache = cache_latents(shared_base_model(), FRAMES, CONDITIONS)
     with caplog.at_level(logging.WARNING):
         check_cache(dataclasses.replace(cache, scaling_factor=times * cache.scaling_factor), CONDITIONS)
     assert [f"{times * cache.scaling_factor:g}" in record.getMessage() for record in caplog.records] == [True] * noticed
@@ -133,8 +135,8 @@ def test_a_gradient_that_overflows_changes_nothing(tmp_path, monkeypatch):
     steps = OPTIONS.model_copy(update={"num_steps": 3})
     with monkeypatch.context() as patch:
         overflow_at(patch, {0, 2})
-        prior, history = tuned(tmp_path / "some", options=steps)
-    assert finite(prior)
+        base_model, history = tuned(tmp_path / "some", options=steps)
+    assert finite(base_model)
     assert [math.isfinite(loss) for loss in history.loss] == [False, True, False]
     state = torch.load(tmp_path / "some" / "state.pt", weights_only=True)
     assert state["skipped"] == 2 and state["non_finite"] == 1
@@ -163,26 +165,26 @@ def test_ten_in_a_row_are_counted_across_a_kill(tmp_path, monkeypatch):
 def test_empty_and_saturated_frames_can_be_learnt(tmp_path):
     frames = FRAMES.copy()
     frames[0], frames[1] = 0, 255
-    prior, history = tuned(tmp_path, frames=frames, conditions=dataclasses.replace(CONDITIONS, images=frames))
-    assert finite(prior) and all(math.isfinite(loss) for loss in history.loss)
+    base_model, history = tuned(tmp_path, frames=frames, conditions=dataclasses.replace(CONDITIONS, images=frames))
+    assert finite(base_model) and all(math.isfinite(loss) for loss in history.loss)
 
 
 @pytest.mark.parametrize(("order", "convention"), [("bgr", "controlnet"), ("rgb", "controlnet_unreversed")])
 def test_colours_that_are_exchanged_twice_or_never_are_refused(order, convention):
-    prior = make_prior()
-    prior.controlnet.register_to_config(controlnet_conditioning_channel_order=order)
+    base_model = make_base_model()
+    base_model.controlnet.register_to_config(controlnet_conditioning_channel_order=order)
     asked = Conditions(("a",), made_by=ConditionChoice(name="normals", options={"convention": convention}))
     with pytest.raises(DataError, match=f"convention '{convention}' does not fit .* '{order}'; set condition.options"):
-        check_channel_order(prior, asked)
-    prior.controlnet.register_to_config(controlnet_conditioning_channel_order="bgr" if order == "rgb" else "rgb")
-    check_channel_order(prior, asked)
-    check_channel_order(prior, Conditions(("a",), made_by=ConditionChoice(name="skeleton")))
+        check_channel_order(base_model, asked)
+    base_model.controlnet.register_to_config(controlnet_conditioning_channel_order="bgr" if order == "rgb" else "rgb")
+    check_channel_order(base_model, asked)
+    check_channel_order(base_model, Conditions(("a",), made_by=ConditionChoice(name="skeleton")))
 
 
 def test_latents_are_encoded_fewer_at_a_time_where_memory_runs_out(monkeypatch):
-    prior, encoded = make_prior(), []
-    whole = cache_latents(prior, FRAMES, CONDITIONS)
-    encode = prior.vae.encode
+    base_model, encoded = make_base_model(), []
+    whole = cache_latents(base_model, FRAMES, CONDITIONS)
+    encode = base_model.vae.encode
 
     def narrow(images):
         encoded.append(len(images))
@@ -190,34 +192,41 @@ def test_latents_are_encoded_fewer_at_a_time_where_memory_runs_out(monkeypatch):
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return encode(images)
 
-    monkeypatch.setattr(prior.vae, "encode", narrow)
-    cache = cache_latents(prior, FRAMES, CONDITIONS, num_turns=4)
+    monkeypatch.setattr(base_model.vae, "encode", narrow)
+    cache = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
     assert encoded == [4, 2, *[1] * 16]
     torch.testing.assert_close(cache.mean[:4], whole.mean)
 
 
 def test_many_prompts_are_embedded_some_at_a_time(monkeypatch):
-    prior, taken = make_prior(), []
+    base_model, taken = make_base_model(), []
     prompts = [f"a photo of a {word}" for word in ("cup", "ball", "human", "moving")]
-    whole = encode_prompts(prior, prompts)
+    whole = encode_prompts(base_model, prompts)
     monkeypatch.setattr("ctlev_core.diffusion.pretrained.loading.PROMPT_BATCH", 3)
-    prior.text_encoder.register_forward_pre_hook(lambda module, inputs: taken.append(len(inputs[0])))
-    torch.testing.assert_close(encode_prompts(prior, prompts), whole)
+    base_model.text_encoder.register_forward_pre_hook(lambda module, inputs: taken.append(len(inputs[0])))
+    torch.testing.assert_close(encode_prompts(base_model, prompts), whole)
     assert taken == [3, 1]
 
 
 def test_a_controlnet_that_exchanges_colours_is_handed_them_as_they_are(tmp_path):
     """Once in its own forward pass; exchanged before, too, it would be trained on what it is never asked with."""
-    prior, seen = make_prior(), []
-    prior.controlnet.register_to_config(controlnet_conditioning_channel_order="bgr")
-    prior.controlnet.controlnet_cond_embedding.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    base_model, seen = make_base_model(), []
+    base_model.controlnet.register_to_config(controlnet_conditioning_channel_order="bgr")
+    base_model.controlnet.controlnet_cond_embedding.register_forward_pre_hook(
+        lambda module, inputs: seen.append(inputs[0])
+    )
     red = np.zeros_like(FRAMES)
     red[..., 0] = 255
-    batch = cache_latents(prior, FRAMES, Conditions(CONDITIONS.prompts, red)).batch(
+    batch = cache_latents(base_model, FRAMES, Conditions(CONDITIONS.prompts, red)).batch(
         np.arange(2), torch.Generator().manual_seed(0), 0.0, torch.device("cpu")
     )
     denoising_loss(
-        Denoiser(prior.unet, prior.controlnet), NoiseSchedule(prior.scheduler_config), batch, generator_for(0)
+        Denoiser(base_model.unet, base_model.controlnet),
+        NoiseSchedule(base_model.scheduler_config),
+        batch,
+        generator_for(0),
     )
-    sample_frames(prior, Conditions(("a",), red[:1]), SamplingOptions(num_inference_steps=1), seeds=[0], work=tmp_path)
+    sample_frames(
+        base_model, Conditions(("a",), red[:1]), SamplingOptions(num_inference_steps=1), seeds=[0], work=tmp_path
+    )
     assert [image.mean(dim=(0, 2, 3)).tolist() for image in seen] == [[0.0, 0.0, 1.0]] * 2

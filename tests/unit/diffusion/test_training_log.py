@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tiny_prior import SIDE, make_data, make_prior
+from tiny_base_model import SIDE, make_base_model, make_data
 
 from ctlev_core.diffusion.training import trainer
 from ctlev_core.diffusion.training.finetuning import SHOWN, draw_samples, fine_tune, split_rows
@@ -20,12 +20,12 @@ FRAMES, CONDITIONS = make_data(80)
 
 
 def tuned(work, options, conditions=CONDITIONS, tune="both"):
-    prior = make_prior()
-    return prior, fine_tune(prior, FRAMES, conditions, options, tune=tune, seed=3, work=work)
+    base_model = make_base_model()
+    return base_model, fine_tune(base_model, FRAMES, conditions, options, tune=tune, seed=3, work=work)
 
 
-def weights(prior):
-    return [value for network in (prior.unet, prior.controlnet) for value in network.state_dict().values()]
+def weights(base_model):
+    return [value for network in (base_model.unet, base_model.controlnet) for value in network.state_dict().values()]
 
 
 def read_events(folder):
@@ -86,12 +86,12 @@ def test_pictures_show_conditions_real_frames_and_samples(tmp_path):
 
 
 def test_pictures_are_of_the_averaged_weights_and_the_same_noise(tmp_path):
-    prior, _ = tuned(tmp_path, OPTIONS.model_copy(update={"sample_every": 4}))
+    base_model, _ = tuned(tmp_path, OPTIONS.model_copy(update={"sample_every": 4}))
     picture = cv2.imread(str(tmp_path / "samples" / "step_000004.png"))[..., ::-1]
     held_back = np.sort(split_rows(len(FRAMES), OPTIONS, seed=3)[0])[:SHOWN]
     prompts = tuple(CONDITIONS.prompts[row] for row in held_back)
     # Training ended with the weights of this very step, averaged.
-    again = draw_samples(prior, FRAMES[held_back], Conditions(prompts, CONDITIONS.images[held_back]))
+    again = draw_samples(base_model, FRAMES[held_back], Conditions(prompts, CONDITIONS.images[held_back]))
     np.testing.assert_array_equal(picture, again)
 
 

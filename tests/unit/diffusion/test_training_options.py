@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_prior import make_data, make_prior, shared_prior
+from tiny_base_model import make_base_model, make_data, shared_base_model
 
 from ctlev_core.diffusion.denoising import generator_for
 from ctlev_core.diffusion.training import acceleration, finetuning, loop, trainer
@@ -30,12 +30,14 @@ FRAMES, CONDITIONS = make_data(40)
 
 
 def tuned(work, options, tune="unet"):
-    prior = make_prior()
-    return prior, fine_tune(prior, FRAMES, CONDITIONS, options, tune=tune, seed=3, work=work)
+    base_model = make_base_model()
+    return base_model, fine_tune(base_model, FRAMES, CONDITIONS, options, tune=tune, seed=3, work=work)
 
 
-def weights(prior):
-    return [value.clone() for network in (prior.unet, prior.controlnet) for value in network.state_dict().values()]
+def weights(base_model):
+    return [
+        value.clone() for network in (base_model.unet, base_model.controlnet) for value in network.state_dict().values()
+    ]
 
 
 def same(one, other):
@@ -56,7 +58,7 @@ KILLED_WITH = {
     "best": VALIDATED.model_copy(update={"keep": "best", "patience": 9}),
     "float16": OPTIONS.model_copy(update={"precision": "float16", "gradient_accumulation": 2}),
     "epochs": OPTIONS.model_copy(update={"max_frames": 5}),
-    "turned": OPTIONS.model_copy(update={"turned_share": 0.5}),
+    "turned": OPTIONS.model_copy(update={"rot90_probability": 0.5}),
 }
 
 
@@ -102,9 +104,9 @@ def test_float16_keeps_weights_in_float32_and_steps_over_gradients_that_overflow
         lambda device, enabled: made.append(scaler(device, 2.0**20, enabled=enabled)) or made[0],
     )
     options = OPTIONS.model_copy(update={"precision": "float16", "num_steps": 8, "log_every": 8})
-    prior, history = tuned(tmp_path, options)
-    assert all(value.dtype == torch.float32 for value in prior.unet.parameters())
-    assert all(bool(torch.isfinite(value).all()) for value in weights(prior))
+    base_model, history = tuned(tmp_path, options)
+    assert all(value.dtype == torch.float32 for value in base_model.unet.parameters())
+    assert all(bool(torch.isfinite(value).all()) for value in weights(base_model))
     assert 2.0**11 < made[0].get_scale() < 2.0**20
     _, reference = tuned(tmp_path / "plain", options.model_copy(update={"precision": "float32"}))
     # Without the skipped steps the mean is over other batches; half precision itself adds a thousandth.
@@ -121,9 +123,9 @@ def test_muon_steps_matrices_by_its_own_rate(tmp_path):
     options = OPTIONS.model_copy(
         update={"optimizer": "muon", "num_steps": 1, "warmup_steps": 0, "weight_decay": 0.0, "ema_decay": 0.0}
     )
-    before = make_prior().unet.mid_block.attentions[0].proj_in.weight.detach().flatten(1)
-    prior, _ = tuned(tmp_path, options)
-    after = prior.unet.mid_block.attentions[0].proj_in.weight.detach().flatten(1)
+    before = make_base_model().unet.mid_block.attentions[0].proj_in.weight.detach().flatten(1)
+    base_model, _ = tuned(tmp_path, options)
+    after = base_model.unet.mid_block.attentions[0].proj_in.weight.detach().flatten(1)
     assert is_matrix(after) and after.shape[0] == after.shape[1]
     largest = torch.linalg.matrix_norm(after - before, ord=2).item()
     assert 0.6 < largest / (MATRIX_RATE * options.learning_rate) < 1.3  # bfloat16 iterations
@@ -147,8 +149,8 @@ def scripted(monkeypatch, losses):
 )
 def test_best_weights_are_those_of_the_lowest_validation_loss(tmp_path, monkeypatch, losses, best):
     seen = scripted(monkeypatch, losses)
-    prior, history = tuned(tmp_path, VALIDATED.model_copy(update={"keep": "best"}))
-    assert same(prior.unet.state_dict().values(), seen[best])
+    base_model, history = tuned(tmp_path, VALIDATED.model_copy(update={"keep": "best"}))
+    assert same(base_model.unet.state_dict().values(), seen[best])
     assert history.kept_step == best + 1
     assert len(seen) == 6
 
@@ -163,12 +165,12 @@ def test_best_weights_need_a_finite_validation_loss(tmp_path, monkeypatch):
 def test_patience_ends_a_run_early(tmp_path, monkeypatch, keep, kept):
     seen = scripted(monkeypatch, (3.0, 1.0, 2.0, 1.0, 0.0))
     options = VALIDATED.model_copy(update={"keep": keep, "patience": 2})
-    prior, history = tuned(tmp_path, options)
+    base_model, history = tuned(tmp_path, options)
     assert history.validation_step == [1, 2, 3, 4]
     assert history.kept_step == kept
-    assert same(prior.unet.state_dict().values(), seen[kept - 1])
+    assert same(base_model.unet.state_dict().values(), seen[kept - 1])
     again, _ = tuned(tmp_path, options)  # started again after its end: nothing is trained, nothing validated
-    assert len(seen) == 4 and same(weights(prior), weights(again))
+    assert len(seen) == 4 and same(weights(base_model), weights(again))
 
 
 @pytest.mark.parametrize("asked", [{"keep": "best"}, {"patience": 3}])
@@ -205,7 +207,7 @@ def test_no_more_frames_than_asked_for_are_learnt_from(tmp_path, monkeypatch):
 def test_names_of_a_class_are_drawn_anew_at_every_step():
     names = ("a photo of a cup", "a photo of a mug", "a photo of a beaker", "a photo of a ball")
     classes = ("cup", "cup", "cup", "ball")
-    cache = cache_latents(shared_prior(), FRAMES[:4], Conditions(names), classes)
+    cache = cache_latents(shared_base_model(), FRAMES[:4], Conditions(names), classes)
     rows = np.tile([0, 3], 600)
     embeddings = cache.batch(rows, generator_for(7), 0.0, torch.device("cpu")).embeddings
     drawn = [int((cache.embeddings - each).abs().sum(dim=(1, 2)).argmin()) for each in embeddings]
@@ -216,7 +218,7 @@ def test_names_of_a_class_are_drawn_anew_at_every_step():
     assert all(142 < count < 258 for count in counts)  # 600 draws at 1/3: five standard deviations either way
     again = cache.batch(rows, generator_for(7), 0.0, torch.device("cpu")).embeddings
     assert torch.equal(embeddings, again)
-    own = cache_latents(shared_prior(), FRAMES[:4], Conditions(names)).batch(
+    own = cache_latents(shared_base_model(), FRAMES[:4], Conditions(names)).batch(
         rows, generator_for(7), 0.0, torch.device("cpu")
     )
     assert torch.equal(own.embeddings[0], cache.embeddings[position[names[0]]].to(own.embeddings))
@@ -225,11 +227,11 @@ def test_names_of_a_class_are_drawn_anew_at_every_step():
 
 def test_class_names_change_what_is_learnt_and_belong_to_the_run(tmp_path):
     def run(work, class_names):
-        prior = make_prior()
+        base_model = make_base_model()
         fine_tune(
-            prior, FRAMES, CONDITIONS, OPTIONS, tune="unet", seed=3, work=tmp_path / work, class_names=class_names
+            base_model, FRAMES, CONDITIONS, OPTIONS, tune="unet", seed=3, work=tmp_path / work, class_names=class_names
         )
-        return weights(prior)
+        return weights(base_model)
 
     fixed, drawn = run("fixed", None), run("drawn", ["thing"] * 40)
     assert not same(fixed, drawn)
@@ -238,15 +240,15 @@ def test_class_names_change_what_is_learnt_and_belong_to_the_run(tmp_path):
 
 
 def test_turned_frames_are_those_of_turned_pictures():
-    prior = shared_prior()
+    base_model = shared_base_model()
     frames, conditions = FRAMES[:5], Conditions(CONDITIONS.prompts[:5], images=FRAMES[5:10])
     rows, turns = np.array([4, 0, 2, 2, 1]), np.array([0, 1, 2, 3, 1])
-    cache = cache_latents(prior, frames, conditions, num_turns=4)
+    cache = cache_latents(base_model, frames, conditions, num_turns=4)
     batch = cache.batch(rows, generator_for(1), 0.0, torch.device("cpu"), turns)
     for position, (row, turn) in enumerate(zip(rows, turns, strict=True)):
         frame = np.rot90(frames[row], turn)[None].copy()
         condition = np.rot90(conditions.images[row], turn)[None].copy()
-        alone = cache_latents(prior, frame, Conditions(conditions.prompts[row : row + 1], images=condition))
+        alone = cache_latents(base_model, frame, Conditions(conditions.prompts[row : row + 1], images=condition))
         expected = alone.batch(np.array([0]), generator_for(1), 0.0, torch.device("cpu"))
         torch.testing.assert_close(batch.latents[position], expected.latents[0], rtol=1e-5, atol=1e-5)
         assert torch.equal(batch.conditions[position], expected.conditions[0])
@@ -275,11 +277,11 @@ def test_turns_have_their_share_and_a_stream_of_their_own():
 
 
 def test_only_square_frames_are_turned(tmp_path):
-    prior, wide = make_prior(), np.zeros((4, 16, 32, 3), np.uint8)
-    prior = dataclasses.replace(prior, image_size=(32, 16))
-    options = OPTIONS.model_copy(update={"turned_share": 0.1})
+    base_model, wide = make_base_model(), np.zeros((4, 16, 32, 3), np.uint8)
+    base_model = dataclasses.replace(base_model, image_size=(32, 16))
+    options = OPTIONS.model_copy(update={"rot90_probability": 0.1})
     with pytest.raises(DataError, match=r"square frames, got 32 x 16 px"):
-        fine_tune(prior, wide, Conditions(CONDITIONS.prompts[:4]), options, tune="unet", seed=0, work=tmp_path)
+        fine_tune(base_model, wide, Conditions(CONDITIONS.prompts[:4]), options, tune="unet", seed=0, work=tmp_path)
 
 
 def test_gradient_checkpointing_saves_memory_and_changes_nothing(tmp_path):
@@ -288,8 +290,8 @@ def test_gradient_checkpointing_saves_memory_and_changes_nothing(tmp_path):
         with torch.autograd.graph.saved_tensors_hooks(
             lambda value: kept.append(value.numel()) or value, lambda value: value
         ):
-            prior, history = tuned(tmp_path / work, options, tune="controlnet")
-        return sum(kept), weights(prior), history, prior
+            base_model, history = tuned(tmp_path / work, options, tune="controlnet")
+        return sum(kept), weights(base_model), history, base_model
 
     options = OPTIONS.model_copy(update={"num_steps": 2})
     plain = measured("plain", options)
@@ -308,11 +310,11 @@ def test_attention_is_in_float32_on_a_cpu_and_afterwards_as_it_was(tmp_path, mon
         return attend(query, *arguments, **settings)
 
     monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", record)
-    prior, _ = tuned(tmp_path, OPTIONS.model_copy(update={"precision": "bfloat16", "num_steps": 1}), tune="both")
+    base_model, _ = tuned(tmp_path, OPTIONS.model_copy(update={"precision": "bfloat16", "num_steps": 1}), tune="both")
     assert seen == {torch.float32}
-    for network in (prior.unet, prior.controlnet):
+    for network in (base_model.unet, base_model.controlnet):
         assert {type(each).__name__ for each in network.attn_processors.values()} == {"AttnProcessor2_0"}
-    usual, in_float32 = prior.unet, copy.deepcopy(prior.unet)
+    usual, in_float32 = base_model.unet, copy.deepcopy(base_model.unet)
     use_float32_attention(in_float32)
     noisy, prompts = (2, usual.config.in_channels, 8, 8), (2, 7, usual.config.cross_attention_dim)
     inputs = (torch.randn(noisy), torch.tensor([10, 900]), torch.randn(prompts))
@@ -329,9 +331,9 @@ def test_training_goes_on_without_a_compiler(tmp_path, monkeypatch, caplog):
     plain, _ = tuned(tmp_path / "plain", OPTIONS)
     monkeypatch.setattr(torch, "compile", no_compiler)
     with caplog.at_level(logging.WARNING):
-        prior, _ = tuned(tmp_path / "asked", OPTIONS.model_copy(update={"compile_networks": True}))
+        base_model, _ = tuned(tmp_path / "asked", OPTIONS.model_copy(update={"compile_networks": True}))
     assert "training goes on uncompiled: no C++ compiler was found" in caplog.text
-    assert same(weights(plain), weights(prior))
+    assert same(weights(plain), weights(base_model))
 
 
 def test_networks_are_compiled_for_the_training_alone(tmp_path, monkeypatch):
@@ -343,16 +345,16 @@ def test_networks_are_compiled_for_the_training_alone(tmp_path, monkeypatch):
 
     monkeypatch.setattr(acceleration, "compiler_works", lambda device: True)
     monkeypatch.setattr(torch, "compile", record)
-    prior, _ = tuned(tmp_path, OPTIONS.model_copy(update={"compile_networks": True}), tune="both")
+    base_model, _ = tuned(tmp_path, OPTIONS.model_copy(update={"compile_networks": True}), tune="both")
     assert len(compiled) == 2 and len(calls) == 2 * OPTIONS.num_steps
-    assert prior.unet._compiled_call_impl is None and prior.controlnet._compiled_call_impl is None
+    assert base_model.unet._compiled_call_impl is None and base_model.controlnet._compiled_call_impl is None
 
 
 @pytest.mark.slow
 def test_compiled_networks_learn_the_same(tmp_path):
     """For real: minutes on a CPU."""
     plain, _ = tuned(tmp_path / "plain", OPTIONS)
-    prior, _ = tuned(tmp_path / "compiled", OPTIONS.model_copy(update={"compile_networks": True}))
-    for one, other in zip(weights(plain), weights(prior), strict=True):
+    base_model, _ = tuned(tmp_path / "compiled", OPTIONS.model_copy(update={"compile_networks": True}))
+    for one, other in zip(weights(plain), weights(base_model), strict=True):
         # Other orders of sums; six steps of 1e-3 and less can turn rounding into a full step where a gradient is 0.
         torch.testing.assert_close(one, other, rtol=0, atol=4e-3)

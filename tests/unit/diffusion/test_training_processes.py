@@ -7,11 +7,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_prior import make_data, make_prior
+from tiny_base_model import make_base_model, make_data
 
-from ctlev_core.diffusion.pretrained.loading import load_prior, save_prior
+from ctlev_core.diffusion.pretrained.loading import load_base_model, save_base_model
 from ctlev_core.diffusion.training import loop
-from ctlev_core.diffusion.training.distributed import Ranks
+from ctlev_core.diffusion.training.distributed import DistributedContext
 from ctlev_core.diffusion.training.entry import train_checkpoint
 from ctlev_core.diffusion.training.launch import child_environment
 from ctlev_core.diffusion.training.options import FineTuningOptions
@@ -24,12 +24,12 @@ OPTIONS = FineTuningOptions(
 )  # fmt: skip
 
 
-def trained(folder, prior, options, tune="both"):
+def trained(folder, base_model, options, tune="both"):
     frames, conditions = make_data(40)
     return train_checkpoint(
         frames,
         conditions,
-        options.model_copy(update={"prior": prior}),
+        options.model_copy(update={"base_model": base_model}),
         tune=tune,
         with_controlnet=True,
         seed=5,
@@ -39,15 +39,15 @@ def trained(folder, prior, options, tune="both"):
 
 
 @pytest.fixture(scope="module")
-def prior_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("prior")
-    save_prior(make_prior(), folder)
+def base_model_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("base_model")
+    save_base_model(make_base_model(), folder)
     return folder
 
 
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_every_batch_of_a_step_is_one_processs(count, share):
-    shares = [Ranks(rank, count).batches(count * share) for rank in range(count)]
+    shares = [DistributedContext(rank, count).batches(count * share) for rank in range(count)]
     assert sorted(number for each in shares for number in each) == list(range(count * share))
     assert {len(each) for each in shares} == {share}
 
@@ -64,9 +64,9 @@ def assert_alike(one, two):
 
 def assert_same_run(one, two, start):
     """The checkpoints in two folders are those of one training that began in a third."""
-    priors = [load_prior(folder) for folder in (one, two, start)]
+    base_models = [load_base_model(folder) for folder in (one, two, start)]
     for name in ("unet", "controlnet"):
-        states = [getattr(prior, name).state_dict() for prior in priors]
+        states = [getattr(base_model, name).state_dict() for base_model in base_models]
         for key, value in states[0].items():
             assert_alike(value, states[1][key])
         assert max((states[0][key] - states[2][key]).abs().max().item() for key in states[0]) > 1e-3
@@ -81,10 +81,12 @@ def assert_same_run(one, two, start):
         pytest.param({"fsdp": True, "gradient_checkpointing": True}, marks=pytest.mark.slow),
     ],
 )
-def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder, shared):
-    alone = trained(tmp_path / "alone", prior_folder, OPTIONS)
-    together = trained(tmp_path / "together", prior_folder, OPTIONS.model_copy(update={"num_processes": 2, **shared}))
-    assert_same_run(tmp_path / "alone" / "out", tmp_path / "together" / "out", prior_folder)
+def test_two_processes_end_in_the_weights_of_one(tmp_path, base_model_folder, shared):
+    alone = trained(tmp_path / "alone", base_model_folder, OPTIONS)
+    together = trained(
+        tmp_path / "together", base_model_folder, OPTIONS.model_copy(update={"num_processes": 2, **shared})
+    )
+    assert_same_run(tmp_path / "alone" / "out", tmp_path / "together" / "out", base_model_folder)
     assert together.step == alone.step and together.kept_step == alone.kept_step
     for name in ("loss", "validation_loss", "shuffled_loss"):
         np.testing.assert_allclose(getattr(together, name), getattr(alone, name), rtol=1e-4)
@@ -99,15 +101,15 @@ def test_two_processes_end_in_the_weights_of_one(tmp_path, prior_folder, shared)
     for index, moments in states[0]["optimizer"]["state"].items():
         for name, value in moments.items():
             assert_alike(value, states[1]["optimizer"]["state"][index][name])
-    again = trained(tmp_path / "together", prior_folder, OPTIONS)
+    again = trained(tmp_path / "together", base_model_folder, OPTIONS)
     assert vars(again) == vars(together)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-def test_parts_of_weights_go_on_from_whole_ones(tmp_path, prior_folder, monkeypatch):
+def test_parts_of_weights_go_on_from_whole_ones(tmp_path, base_model_folder, monkeypatch):
     """One process is killed in its third step; two that share out the weights end where it would have."""
-    trained(tmp_path / "alone", prior_folder, OPTIONS)
+    trained(tmp_path / "alone", base_model_folder, OPTIONS)
     loss = loop.denoising_loss
     calls = iter(range(2 * OPTIONS.gradient_accumulation))
 
@@ -118,20 +120,20 @@ def test_parts_of_weights_go_on_from_whole_ones(tmp_path, prior_folder, monkeypa
 
     monkeypatch.setattr(loop, "denoising_loss", killed)
     with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path / "resumed", prior_folder, OPTIONS.model_copy(update={"checkpoint_every_s": 1e-9}))
+        trained(tmp_path / "resumed", base_model_folder, OPTIONS.model_copy(update={"checkpoint_every_s": 1e-9}))
     assert torch.load(tmp_path / "resumed" / "work" / "state.pt", weights_only=True)["step"] == 2
-    trained(tmp_path / "resumed", prior_folder, OPTIONS.model_copy(update={"num_processes": 2, "fsdp": True}))
-    assert_same_run(tmp_path / "alone" / "out", tmp_path / "resumed" / "out", prior_folder)
+    trained(tmp_path / "resumed", base_model_folder, OPTIONS.model_copy(update={"num_processes": 2, "fsdp": True}))
+    assert_same_run(tmp_path / "alone" / "out", tmp_path / "resumed" / "out", base_model_folder)
 
 
 @pytest.mark.slow
 def test_failure_of_a_process_is_reported(tmp_path):
-    prior = make_prior()
+    base_model = make_base_model()
     with torch.no_grad():
-        prior.unet.conv_in.weight[0] = torch.nan
-    save_prior(prior, tmp_path / "prior")
+        base_model.unet.conv_in.weight[0] = torch.nan
+    save_base_model(base_model, tmp_path / "base_model")
     with pytest.raises(TrainingError, match=r"in 2 processes failed: process \d: .*'conv_in.weight'.* not finite"):
-        trained(tmp_path, tmp_path / "prior", OPTIONS.model_copy(update={"num_processes": 2}))
+        trained(tmp_path, tmp_path / "base_model", OPTIONS.model_copy(update={"num_processes": 2}))
     assert not (tmp_path / "out").exists()
 
 
@@ -145,27 +147,27 @@ def test_failure_of_a_process_is_reported(tmp_path):
         ({"num_processes": 2, "fsdp": True, "precision": "float16"}, "fsdp needs precision float32 or bfloat16"),
     ],
 )
-def test_what_processes_cannot_share_is_refused_before_they_start(tmp_path, prior_folder, changed, message):
+def test_what_processes_cannot_share_is_refused_before_they_start(tmp_path, base_model_folder, changed, message):
     with pytest.raises(ValueError, match=message):
-        trained(tmp_path, prior_folder, OPTIONS.model_copy(update=changed))
+        trained(tmp_path, base_model_folder, OPTIONS.model_copy(update=changed))
     assert not (tmp_path / "work").exists()
 
 
-def test_an_outer_launcher_says_how_many(tmp_path, prior_folder, monkeypatch):
+def test_an_outer_launcher_says_how_many(tmp_path, base_model_folder, monkeypatch):
     """`accelerate launch --num_processes 3 flows/train_generator.py ...` is asked for three here too."""
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
     with pytest.raises(ValueError, match="a multiple of the 3 processes"):
-        trained(tmp_path, prior_folder, OPTIONS)
+        trained(tmp_path, base_model_folder, OPTIONS)
 
 
-def test_an_outer_launcher_says_whether_weights_are_shared_out(tmp_path, prior_folder, monkeypatch):
+def test_an_outer_launcher_says_whether_weights_are_shared_out(tmp_path, base_model_folder, monkeypatch):
     """`accelerate launch --use_fsdp`, or an `accelerate config` that chose it, leaves that in the environment."""
     monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
     options = OPTIONS.model_copy(update={"num_processes": 2, "optimizer": "muon"})
     with pytest.raises(ValueError, match="fsdp needs optimizer=adamw"):
-        trained(tmp_path, prior_folder, options)
+        trained(tmp_path, base_model_folder, options)
     with pytest.raises(ValueError, match="a multiple of the 3 processes"):  # a preset that says no is heeded
-        trained(tmp_path, prior_folder, options.model_copy(update={"fsdp": False, "num_processes": 3}))
+        trained(tmp_path, base_model_folder, options.model_copy(update={"fsdp": False, "num_processes": 3}))
 
 
 def test_children_hear_nothing_of_an_outer_launcher():

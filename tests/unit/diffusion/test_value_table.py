@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_prior import SIDE, make_data, make_prior
+from tiny_base_model import SIDE, make_base_model, make_data
 
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, images_to_tensor, save_prior
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, images_to_tensor, save_base_model
 from ctlev_core.diffusion.sampling import value_table
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
@@ -38,15 +38,15 @@ class Blind(torch.nn.Module):
 
 def test_rows_are_the_shares_of_real_values():
     """Two halves of the image are expected at 40 and 200; real values there are known mixtures."""
-    prior = make_prior()
+    base_model = make_base_model()
     expected = np.full((32, SIDE, SIDE, 3), 40, np.uint8)
     expected[:, :, SIDE // 2 :] = 200
     rng = np.random.default_rng(0)
     frames = np.where(expected == 40, rng.choice([0, 51], expected.shape, p=[0.8, 0.2]),
                       rng.choice([102, 153, 255], expected.shape, p=[0.3, 0.5, 0.2])).astype(np.uint8)  # fmt: skip
-    latents = prior.vae.encode(images_to_tensor(expected))[0].mode() * prior.scaling_factor
+    latents = base_model.vae.encode(images_to_tensor(expected))[0].mode() * base_model.scaling_factor
     blind = replace(
-        prior, unet=Blind(latents), scheduler_config={**prior.scheduler_config, "prediction_type": "sample"}
+        base_model, unet=Blind(latents), scheduler_config={**base_model.scheduler_config, "prediction_type": "sample"}
     )
     table = fit_value_table(blind, frames, latents, torch.zeros(32, 1, 1), timestep=400, seed=0)
     np.testing.assert_allclose(table.sum(axis=1), 1, atol=1e-5)
@@ -60,8 +60,8 @@ def test_rows_are_the_shares_of_real_values():
 def test_clean_latents_of_every_kind_of_prediction(prediction_type):
     from ctlev_core.diffusion.denoising import NoiseSchedule
 
-    prior = make_prior()
-    schedule = NoiseSchedule({**prior.scheduler_config, "prediction_type": prediction_type})
+    base_model = make_base_model()
+    schedule = NoiseSchedule({**base_model.scheduler_config, "prediction_type": prediction_type})
     clean, noise = torch.randn(2, 5, 4, 4, 4)
     steps = torch.tensor([0, 100, 500, 800, 950])
     noisy, target = schedule.noised(clean, noise, steps)
@@ -86,11 +86,11 @@ def test_drawn_values_have_the_moments_of_their_row_and_depend_on_their_seed_alo
 
 def test_a_checkpoint_carries_its_table(tmp_path):
     frames, conditions = make_data(with_images=False)
-    prior = replace(make_prior(), controlnet=None)
+    base_model = replace(make_base_model(), controlnet=None)
     options = FineTuningOptions(num_steps=2, batch_size=4, num_validation=0, values_at=0.3)
-    history = fine_tune(prior, frames, conditions, options, tune="unet", seed=0, work=tmp_path / "w")
+    history = fine_tune(base_model, frames, conditions, options, tune="unet", seed=0, work=tmp_path / "w")
     assert history.value_table is not None and history.value_table.shape == (256, 256)
-    save_prior(prior, tmp_path / "checkpoint")
+    save_base_model(base_model, tmp_path / "checkpoint")
     asked = Conditions(("a photo of a cup",) * 3)
     drawn = SamplingOptions(num_inference_steps=2, values="drawn")
     with pytest.raises(DataError, match="needs a checkpoint that learnt its values"):
@@ -122,8 +122,8 @@ def test_damaged_tables_are_refused(tmp_path):
 
 
 def test_rows_of_different_prompts_are_embedded_in_their_order():
-    prior = make_prior()
-    one, other = encode_prompts(prior, ["a photo of a cup", "a photo of a ball"])
+    base_model = make_base_model()
+    one, other = encode_prompts(base_model, ["a photo of a cup", "a photo of a ball"])
     assert not torch.equal(one, other)
 
 

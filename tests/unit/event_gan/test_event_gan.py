@@ -370,4 +370,4 @@ def test_run_settings_stay_out_of_the_checkpoint(tmp_path):
     record = config(model)
     assert record["model"] == "event_gan" and record["image_size"] == [16, 16] and record["one_event"] == 1.0
     assert "device" not in record["options"] and "checkpoint_every_s" not in record["options"]
-    assert len(record["discriminator_loss"]) == 2 and event_gan.prior_folders(event_gan.Options()) == []
+    assert len(record["discriminator_loss"]) == 2 and event_gan.base_model_folders(event_gan.Options()) == []

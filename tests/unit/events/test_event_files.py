@@ -1,4 +1,4 @@
-"""Reading and writing event files of any format: in pieces, in stretches, and one format for each file."""
+"""Reading and writing event files of any format: in chunks, in stretches, and one format for each file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
-from ctlev_core.events.decoding import event_pieces
+from ctlev_core.events.decoding import event_chunks
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -76,10 +76,10 @@ def test_every_format_that_writes_is_tested_here():
 @given(
     num_events=st.integers(1, 300),
     duration_us=st.sampled_from([1, 100, 10**6, 2**24 + 5, 2**33]),
-    piece=st.integers(1, 400),
+    chunk=st.integers(1, 400),
     seed=st.integers(0, 100),
 )
-def test_write_then_read_whole_or_in_pieces(name, num_events, duration_us, piece, seed):
+def test_write_then_read_whole_or_in_chunks(name, num_events, duration_us, chunk, seed):
     if name == "atis":
         duration_us = min(max(duration_us, 100), 10**6)  # times that stand still do not tell an ATIS file
     if name == "dat":
@@ -91,9 +91,9 @@ def test_write_then_read_whole_or_in_pieces(name, num_events, duration_us, piece
         module.write(path, events)
         assert event_files.find_format(path) is module
         assert_same(event_files.read_events_file(path), events)
-        pieces = list(event_files.read_event_chunks(path, piece))
-    assert [len(part) for part in pieces[:-1]] == [piece] * (len(pieces) - 1)
-    assert_same(event_pieces.concatenate(pieces), events)
+        chunks = list(event_files.read_event_chunks(path, chunk))
+    assert [len(part) for part in chunks[:-1]] == [chunk] * (len(chunks) - 1)
+    assert_same(event_chunks.concatenate(chunks), events)
 
 
 @pytest.mark.parametrize("name", WRITABLE)
@@ -105,14 +105,14 @@ def test_equal_events_in_large_blocks(name, tmp_path):
     path = tmp_path / f"events{SUFFIXES.get(name, '')}"
     plugins.load("formats", name).write(path, events)
     assert_same(event_files.read_events_file(path), events)
-    assert_same(event_pieces.concatenate(event_files.read_event_chunks(path, 40_001)), events)
+    assert_same(event_chunks.concatenate(event_files.read_event_chunks(path, 40_001)), events)
 
 
 @pytest.mark.parametrize("name", ["csv", "evt2", "evt3", "hdf5", "npz", "parquet"])
-def test_a_recording_without_events_is_one_empty_piece(name, tmp_path):
+def test_a_recording_without_events_is_one_empty_chunk(name, tmp_path):
     plugins.load("formats", name).write(tmp_path / "events", make_events(0))
-    pieces = list(event_files.read_event_chunks(tmp_path / "events"))
-    assert [(len(piece), piece.sensor_size) for piece in pieces] == [(0, SIZE)]
+    chunks = list(event_files.read_event_chunks(tmp_path / "events"))
+    assert [(len(chunk), chunk.sensor_size) for chunk in chunks] == [(0, SIZE)]
     assert_same(event_files.read_events_file(tmp_path / "events"), make_events(0))
 
 
@@ -148,7 +148,7 @@ def test_formats_without_a_signature_are_asked_last(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "file", ["person/tonic_sample.aedat4", "street/expelliarmus_evt3.raw", "spot/expelliarmus_evt2.raw"]
 )
-def test_real_recordings_in_pieces(file, tmp_path):
+def test_real_recordings_in_chunks(file, tmp_path):
     events = event_files.read_events_file(REAL / file)
     summary = event_files.write_event_chunks_parquet(
         tmp_path / "a.parquet", event_files.read_event_chunks(REAL / file, 10_007)
@@ -167,15 +167,15 @@ def test_a_file_that_cannot_be_read_is_a_data_error(tmp_path, monkeypatch):
         event_files.find_format(tmp_path / "a.raw")
 
 
-# Pieces ------------------------------------------------------------------------------------------------------------
+# Chunks ------------------------------------------------------------------------------------------------------------
 
 
-def test_pieces_that_do_not_join_are_an_error(tmp_path, monkeypatch):
+def test_chunks_that_do_not_join_are_an_error(tmp_path, monkeypatch):
     module = plugins.load("formats", "evt2")
     module.write(tmp_path / "a.raw", make_events(5))
 
-    def give(*pieces):
-        monkeypatch.setattr(module, "read_chunks", lambda path, num_events: iter(pieces))
+    def give(*chunks):
+        monkeypatch.setattr(module, "read_chunks", lambda path, num_events: iter(chunks))
         return list(event_files.read_event_chunks(tmp_path / "a.raw"))
 
     late, early = make_events(5), make_events(5)
@@ -219,24 +219,24 @@ def test_time_that_jumps_back_at_a_joint_is_found(name, tmp_path):
 def test_regroup_keeps_events_and_order(lengths, size):
     events = make_events(sum(lengths))
     stops = np.cumsum(lengths).tolist()
-    pieces = [events.slice(stop - length, stop) for length, stop in zip(lengths, stops, strict=True)]
-    groups = list(event_pieces.regroup(pieces, size))
+    chunks = [events.slice(stop - length, stop) for length, stop in zip(lengths, stops, strict=True)]
+    groups = list(event_chunks.regroup(chunks, size))
     assert [len(group) for group in groups[:-1]] == [size] * (len(groups) - 1)
     assert len(groups) == max(1, -(-sum(lengths) // size))
-    assert_same(event_pieces.concatenate(groups), events)
+    assert_same(event_chunks.concatenate(groups), events)
 
 
 # Our own files -----------------------------------------------------------------------------------------------------
 
 
-def test_parquet_written_in_pieces_is_the_file_written_whole(tmp_path):
+def test_parquet_written_in_chunks_is_the_file_written_whole(tmp_path):
     events = make_events(600_000)
     event_files.write_events_parquet(tmp_path / "whole.parquet", events)
-    pieces = event_pieces.regroup([events], 7_001)
-    summary = event_files.write_event_chunks_parquet(tmp_path / "pieces.parquet", pieces)
+    chunks = event_chunks.regroup([events], 7_001)
+    summary = event_files.write_event_chunks_parquet(tmp_path / "chunks.parquet", chunks)
     assert summary.result() == event_files.summarise(events)
-    assert (tmp_path / "whole.parquet").read_bytes() == (tmp_path / "pieces.parquet").read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["pieces.parquet", "whole.parquet"]
+    assert (tmp_path / "whole.parquet").read_bytes() == (tmp_path / "chunks.parquet").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["chunks.parquet", "whole.parquet"]
 
 
 def test_a_stretch_of_a_parquet_file_is_the_slice(tmp_path):
@@ -254,12 +254,12 @@ def test_a_stretch_of_a_parquet_file_is_the_slice(tmp_path):
         event_files.read_events_range(tmp_path / "a.raw", 0, 1)
 
 
-def test_wrong_pieces_leave_no_file(tmp_path):
+def test_wrong_chunks_leave_no_file(tmp_path):
     good, bad = make_events(10), make_events(10)
     bad.x[3] = 640
-    for pieces in ([good, bad], [good, good.slice(0, 1)], []):
+    for chunks in ([good, bad], [good, good.slice(0, 1)], []):
         with pytest.raises(DataError, match="events to be written"):
-            event_files.write_event_chunks_parquet(tmp_path / "a.parquet", pieces)
+            event_files.write_event_chunks_parquet(tmp_path / "a.parquet", chunks)
         assert not list(tmp_path.iterdir())
 
 
@@ -272,7 +272,7 @@ def test_wrong_pieces_leave_no_file(tmp_path):
 def test_memory_of_a_chunked_read_does_not_grow_with_the_file(name, tmp_path):
     # A process of its own, because the highest memory of this one is behind it (and VmHWM, because ru_maxrss is taken
     # over from the parent). 8 million events are 104 MB as columns;
-    # what is allowed holds the pieces (3 MB) and the libraries but not the recording.
+    # what is allowed holds the chunks (3 MB) and the libraries but not the recording.
     events = make_events(8_000_000, WRITABLE[name], 16_000_000 if name != "atis" else 8_000_000)
     plugins.load("formats", name).write(tmp_path / "events", events)
     plugins.load("formats", name).write(tmp_path / "few", events.slice(0, 1000))
@@ -288,13 +288,13 @@ def test_memory_of_a_chunked_read_does_not_grow_with_the_file(name, tmp_path):
         except ValueError:
             pass
         before = peak()
-        total = sum(len(piece) for piece in event_files.read_event_chunks(folder / "events", 1 << 18))
-        pieces = peak() - before
+        total = sum(len(chunk) for chunk in event_files.read_event_chunks(folder / "events", 1 << 18))
+        chunks = peak() - before
         event_files.read_events_file(folder / "events")
-        print(total, pieces, peak() - before)
+        print(total, chunks, peak() - before)
     """
     result = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
-    total, in_pieces, whole = (float(number) for number in result.stdout.split())
+    total, in_chunks, whole = (float(number) for number in result.stdout.split())
     assert total == 8_000_000
-    assert in_pieces < 80, f"{in_pieces} MB"
+    assert in_chunks < 80, f"{in_chunks} MB"
     assert whole > 95, f"{whole} MB: the measurement sees no memory"

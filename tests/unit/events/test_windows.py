@@ -109,7 +109,7 @@ def test_max_windows_keeps_a_subset_in_order(times, method, size, limit):
     assert kept == [window for window in everything if window in kept]
 
 
-# Recordings in pieces ----------------------------------------------------------------------------------------------
+# Recordings in chunks ----------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=200, deadline=None)
@@ -121,13 +121,13 @@ def test_max_windows_keeps_a_subset_in_order(times, method, size, limit):
     st.integers(1, 4),
     st.none() | st.integers(1, 5),
 )
-def test_pieces_give_the_same_windows_however_they_are_cut(times, bounds, method, size, min_events, limit):
+def test_chunks_give_the_same_windows_however_they_are_cut(times, bounds, method, size, min_events, limit):
     options = {
         "method": method, "num_events": size, "duration_us": size, "min_events": min_events, "max_windows": limit
     }  # fmt: skip
     edges = [0, *sorted(min(bound, len(times)) for bound in bounds), len(times)]
-    pieces = [np.array(times[a:b], np.int64) for a, b in itertools.pairwise(edges)]
-    result = cut_chunks(iter(pieces), Windows(**options))
+    chunks = [np.array(times[a:b], np.int64) for a, b in itertools.pairwise(edges)]
+    result = cut_chunks(iter(chunks), Windows(**options))
     assert result.tolist() == ranges(times, **options)
     assert result.dtype == np.int64 and result.shape[1:] == (2,)
 
@@ -143,7 +143,7 @@ def test_a_window_is_given_out_as_soon_as_it_is_complete():
 
 
 @pytest.mark.parametrize("method", ["count", "duration", "whole"])
-def test_a_recording_without_pieces_or_events_has_no_windows(method):
+def test_a_recording_without_chunks_or_events_has_no_windows(method):
     assert cut_chunks([], Windows(method=method)).shape == (0, 2)
     assert cut_chunks([np.zeros(0, np.int64)] * 2, Windows(method=method)).shape == (0, 2)
 
@@ -154,14 +154,14 @@ def test_one_event():
     assert ranges([7], method="duration", duration_us=2) == []
 
 
-def test_equal_time_stamps_across_two_pieces_stay_in_one_window():
-    pieces = [np.array([5, 10]), np.array([10, 10]), np.array([14, 15])]
-    assert cut_chunks(pieces, Windows(method="duration", duration_us=5)).tolist() == [[0, 1], [1, 5]]
+def test_equal_time_stamps_across_two_chunks_stay_in_one_window():
+    chunks = [np.array([5, 10]), np.array([10, 10]), np.array([14, 15])]
+    assert cut_chunks(chunks, Windows(method="duration", duration_us=5)).tolist() == [[0, 1], [1, 5]]
 
 
-def test_a_jump_of_the_clock_between_two_pieces():
-    pieces = [np.array([0, 1]), np.array([2**62, 2**62 + 9])]
-    assert cut_chunks(pieces, Windows(method="duration", duration_us=2)).tolist() == [[0, 2], [2, 3], [3, 4]]
+def test_a_jump_of_the_clock_between_two_chunks():
+    chunks = [np.array([0, 1]), np.array([2**62, 2**62 + 9])]
+    assert cut_chunks(chunks, Windows(method="duration", duration_us=2)).tolist() == [[0, 2], [2, 3], [3, 4]]
 
 
 def test_windows_of_the_dataset_are_not_cut_here():

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from generated_frames import REFUSED_ROW, make_generated, make_labels, publish
+from generated_frames import REJECTED_ROW, make_generated, make_labels, publish
 from torch.utils.data import ConcatDataset, DataLoader
 
 from ctlev_core.export.event_dataset import EventDataset
@@ -18,7 +18,7 @@ from data_contracts.errors import DataError
 from data_contracts.manifest import label_columns
 from tasks.export_images import write_image_folder
 
-ROWS = [row for row in range(7) if row != REFUSED_ROW]
+ROWS = [row for row in range(7) if row != REJECTED_ROW]
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_a_transform_sees_the_whole_sample(place):
 
 
 def test_refused_frames_are_there_when_asked_for(made):
-    assert [sample["seed"] for sample in EventDataset(made.synthetic, refused=True)] == list(range(100, 107))
+    assert [sample["seed"] for sample in EventDataset(made.synthetic, rejected=True)] == list(range(100, 107))
 
 
 def test_indices(place):

@@ -60,11 +60,11 @@ def test_the_line_that_ends_the_header_ends_it(tmp_path):
     st.lists(st.sampled_from([0, 1, 2**31 - 1, 2**31, 2**31 + 1, 2**32 - 2, 2**32 - 1]), min_size=1, max_size=30),
     st.integers(1, 31),
 )
-def test_unwrapped_times_equal_a_slow_loop_in_pieces_of_any_size(tmp_path_factory, clock, size):
+def test_unwrapped_times_equal_a_slow_loop_in_chunks_of_any_size(tmp_path_factory, clock, size):
     path = write_records(tmp_path_factory.mktemp("a") / "a.aedat", [(7, time) for time in clock])
-    pieces = list(aedat2.read_record_chunks(path, size))
-    assert [len(times) for _, times in pieces[:-1]] == [size] * (len(pieces) - 1)
-    assert np.concatenate([times for _, times in pieces]).tolist() == slow_unwrap(clock)
+    chunks = list(aedat2.read_record_chunks(path, size))
+    assert [len(times) for _, times in chunks[:-1]] == [size] * (len(chunks) - 1)
+    assert np.concatenate([times for _, times in chunks]).tolist() == slow_unwrap(clock)
 
 
 def test_a_clock_that_was_reset_shows_in_the_times(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
-from ctlev_core.events.decoding import event_pieces, record_files
+from ctlev_core.events.decoding import event_chunks, record_files
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -27,12 +27,12 @@ def to_rows(events: Events) -> list[Row]:
 
 
 def read_both_ways(path: Path, name: str) -> Events:
-    """Read whole and in pieces of two, which must agree."""
+    """Read whole and in chunks of two, which must agree."""
     module = plugins.load("formats", name)
     events = module.read(path)
-    pieces = list(module.read_chunks(path, 2))
-    assert to_rows(event_pieces.concatenate(pieces)) == to_rows(events)
-    assert all(piece.sensor_size == events.sensor_size for piece in pieces)
+    chunks = list(module.read_chunks(path, 2))
+    assert to_rows(event_chunks.concatenate(chunks)) == to_rows(events)
+    assert all(chunk.sensor_size == events.sensor_size for chunk in chunks)
     return events
 
 

@@ -1,4 +1,4 @@
-"""SMPL-ESIM: events of a filmed body where, when and of the polarity that pictures of it say."""
+"""SMPL-ESIM: events of a recorded body where, when and of the polarity that pictures of it say."""
 
 from dataclasses import fields, replace
 
@@ -62,7 +62,7 @@ def scene_of(motions, row, seed, **options):
 
 
 def silhouette(motions, key):
-    """Where the body of row 0 is at a key pose, [H, W] bool, from another renderer than the film's."""
+    """Where the body of row 0 is at a key pose, [H, W] bool, from another renderer than the record's."""
     body = load_body()
     rotations = matrix_from_axis_angle(motions.smpl_pose[:, key].reshape(-1, 24, 3))
     vertices, _ = pose_vertices(body, rotations, motions.smpl_betas, motions.smpl_transl[:, key])
@@ -164,11 +164,11 @@ def test_a_row_depends_on_itself_and_its_seed_alone():
 def test_rows_come_one_by_one():
     motions = motions_of(2)
     conditions = Conditions(("",) * 2, None, motions)
-    film = smpl_esim.sample_events(conditions, SIZE, smpl_esim.SampleOptions(), seeds=[0, 1])
-    assert iter(film) is film
-    assert len(next(film)) > 0 and len(next(film)) > 0
+    record = smpl_esim.sample_events(conditions, SIZE, smpl_esim.SampleOptions(), seeds=[0, 1])
+    assert iter(record) is record
+    assert len(next(record)) > 0 and len(next(record)) > 0
     with pytest.raises(StopIteration):
-        next(film)
+        next(record)
 
 
 def test_nothing_happens_where_nobody_moves():
@@ -243,10 +243,10 @@ def test_another_body_file_is_used(tmp_path):
 def test_a_row_beyond_the_budget_is_named():
     motions = motions_of(2)
     most = max(len(events) for events in sample(take(motions, [0])))
-    film = smpl_esim.sample_events(
+    record = smpl_esim.sample_events(
         Conditions(("",) * 2, None, motions), SIZE, smpl_esim.SampleOptions(max_events=most), seeds=[0, 1]
     )
-    assert len(next(film)) == most
+    assert len(next(record)) == most
     assert issubclass(EventBudgetError, DataError)
     with pytest.raises(DataError, match=r"'smpl_esim', row 0: .*more than max_events = 10"):
         sample(motions, max_events=10)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from ctlev_core.metrics import fd_infinity, frechet, kid, prdc
 from ctlev_core.scoring.frechet import frechet_distance
-from ctlev_core.scoring.kid import kernel_distance
-from ctlev_core.scoring.prdc import neighbour_scores
+from ctlev_core.scoring.kid import compute_kid
+from ctlev_core.scoring.prdc import compute_prdc
 from ctlev_core.statistics.feature_distances import DISTANCE_ESTIMATES, estimate_distances, estimates_table
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
@@ -43,7 +43,7 @@ def test_kid_agrees_with_a_loop_over_pairs(seed, n, m, width, offset):
     a, b = normal(seed, n, width, 1.5, offset), normal(seed + 1, m, width, 1.0, offset)
     # The loop cancels numbers of the size of the kernel.
     size = max(1.0, (max(np.abs(a).max(), np.abs(b).max()) ** 2 + 1) ** 3)
-    assert kernel_distance(a, b) == pytest.approx(slow_kid(a, b), rel=1e-9, abs=1e-13 * size)
+    assert compute_kid(a, b) == pytest.approx(slow_kid(a, b), rel=1e-9, abs=1e-13 * size)
 
 
 def test_the_reference_may_be_a_file_of_statistics(tmp_path):
@@ -87,28 +87,28 @@ def test_kid_of_large_offsets_keeps_its_digits():
         return sum(kernel) / len(kernel)
 
     exact = mean(rows[0], rows[0], True) + mean(rows[1], rows[1], True) - 2 * mean(rows[0], rows[1], False)
-    assert kernel_distance(a, b) == pytest.approx(float(exact), rel=1e-10)
+    assert compute_kid(a, b) == pytest.approx(float(exact), rel=1e-10)
 
 
 def test_subsets_of_kid_have_the_same_mean_and_a_seed():
     a, b = normal(1, 400), normal(2, 300, offset=0.5)
-    whole = kernel_distance(a, b, subset_size=0)
-    drawn = [kernel_distance(a, b, subset_size=100, num_subsets=12, seed=seed) for seed in (0, 0, 1)]
+    whole = compute_kid(a, b, subset_size=0)
+    drawn = [compute_kid(a, b, subset_size=100, num_subsets=12, seed=seed) for seed in (0, 0, 1)]
     assert drawn[0] == drawn[1] != drawn[2]
     assert drawn[0] == pytest.approx(whole, rel=0.15)
     assert kid.compute(a, b, kid.Options()) == {"kid": whole}  # 100 subsets of 1,000 rows have more pairs
-    assert kernel_distance(np.full((5, 3), 2.0), np.full((7, 3), 2.0)) == 0
+    assert compute_kid(np.full((5, 3), 2.0), np.full((7, 3), 2.0)) == 0
     with pytest.raises(ValueError, match="at least 2 rows"):
-        kernel_distance(a, b, subset_size=1)
+        compute_kid(a, b, subset_size=1)
 
 
 def test_kid_of_equal_distributions_lies_around_zero():
-    values = [kernel_distance(normal(seed, 60), normal(seed + 1000, 40)) for seed in range(60)]
+    values = [compute_kid(normal(seed, 60), normal(seed + 1000, 40)) for seed in range(60)]
     assert abs(np.mean(values)) < 3 * np.std(values) / np.sqrt(60)
     assert min(values) < 0 < max(values)
 
 
-def slow_neighbour_scores(judged, reference, k):
+def slow_prdc(judged, reference, k):
     def radius(rows, i):
         return sorted(np.linalg.norm(rows - rows[i], axis=1))[k]
 
@@ -128,28 +128,28 @@ def slow_neighbour_scores(judged, reference, k):
 @given(st.integers(0, 10_000), st.integers(6, 25), st.integers(6, 25), st.integers(1, 5), st.floats(0, 3))
 def test_neighbour_scores_agree_with_a_loop(seed, n, m, k, offset):
     judged, reference = normal(seed, n, 4, 1.0, offset), normal(seed + 1, m, 4)
-    assert neighbour_scores(judged, reference, k) == pytest.approx(slow_neighbour_scores(judged, reference, k))
+    assert compute_prdc(judged, reference, k) == pytest.approx(slow_prdc(judged, reference, k))
 
 
 def test_neighbour_scores_where_rows_repeat_and_far_from_the_origin():
     a = normal(3, 50)
-    identical = neighbour_scores(a, a.copy(), 3)
+    identical = compute_prdc(a, a.copy(), 3)
     assert identical["precision"] == identical["recall"] == identical["coverage"] == 1
     constant = np.full((9, 2), 5.0)
     everything = {"precision": 1.0, "recall": 1.0, "coverage": 1.0}
-    assert neighbour_scores(constant, constant, 3) == everything | {"density": 3.0}
-    assert set(neighbour_scores(constant + 1, constant, 3).values()) == {0.0}
+    assert compute_prdc(constant, constant, 3) == everything | {"density": 3.0}
+    assert set(compute_prdc(constant + 1, constant, 3).values()) == {0.0}
     judged, reference = np.round(64 * normal(4, 60)), np.round(64 * normal(5, 50))
-    far = neighbour_scores(judged + 2.0**40, reference + 2.0**40, 5)
-    assert far == neighbour_scores(judged, reference, 5)
+    far = compute_prdc(judged + 2.0**40, reference + 2.0**40, 5)
+    assert far == compute_prdc(judged, reference, 5)
     with pytest.raises(ValueError, match=r"5 neighbours need .* got 60 and 5"):
-        neighbour_scores(judged, reference[:5], 5)
+        compute_prdc(judged, reference[:5], 5)
 
 
 def test_prdc_names_its_neighbours():
     a, b = normal(6, 40), normal(7, 40)
     found = prdc.compute(a, b, prdc.Options(num_neighbours=3))
-    assert found == {f"{name}_k3": value for name, value in neighbour_scores(a, b, 3).items()}
+    assert found == {f"{name}_k3": value for name, value in compute_prdc(a, b, 3).items()}
 
 
 def test_fd_infinity_takes_away_the_bias_of_small_sets():
@@ -190,7 +190,7 @@ def test_distances_name_bad_rows(metric):
 
 
 def score(a, b):
-    return {"fd": frechet_distance(a, b), "kid": kernel_distance(a, b)}
+    return {"fd": frechet_distance(a, b), "kid": compute_kid(a, b)}
 
 
 @pytest.mark.parametrize(("shift", "frames"), [(0.5, 1), (0.5, 4), (0.0, 1)])
@@ -241,7 +241,7 @@ def test_estimates_become_rows_with_what_they_have_to_be_read_with():
     table = estimates_table("made", {"x": full["fd"], "y": alone["fd"]})
     rows = check_table(table, DISTANCE_ESTIMATES, "here").to_pylist()
     expected = [
-        {"setting": "made", "metric": name, **{k: None if math.isnan(v) else v for k, v in asdict(found["fd"]).items()}}
+        {"subject": "made", "metric": name, **{k: None if math.isnan(v) else v for k, v in asdict(found["fd"]).items()}}
         for name, found in (("x", full), ("y", alone))
     ]
     assert rows == expected and rows[1]["floor"] is None and (rows[0]["num_target"], rows[0]["num_features"]) == (90, 6)
@@ -252,7 +252,7 @@ def test_too_few_recordings_leave_the_value_alone():
     few = estimate_distances(score, a, b, predicted_groups=np.repeat(list("abcd"), 10))["fd"]
     assert few.value == frechet_distance(a, b) and np.isnan([few.low, few.high, few.halved, few.floor]).all()
     # Halves of eight rows have no ten neighbours.
-    short = estimate_distances(lambda x, y: neighbour_scores(x, y, 6), a[:12], b)["precision"]
+    short = estimate_distances(lambda x, y: compute_prdc(x, y, 6), a[:12], b)["precision"]
     assert 0 <= short.value <= 1 and np.isnan(short.low)
     with pytest.raises(ValueError, match=r"groups must be \[30\]"):
         estimate_distances(score, a, b, target_groups=["a"])

@@ -28,7 +28,7 @@ def name_of(options) -> str:
 
 
 def edge_counts(count: int, polarity: bool, seed: int = 0, size: tuple[int, int] = (40, 56)) -> np.ndarray:
-    """Windows [N, C, H, W] uint16 with bright bands, lone events, and few pixels that fire much more often."""
+    """Windows [N, C, H, W] uint16 with bright bands, isolated events, and few pixels that fire much more often."""
     rng = np.random.default_rng(seed)
     channels = 2 if polarity else 1
     distance = np.abs(np.arange(size[1]) - rng.uniform(0, size[1], (count, channels, size[0], 1)))

@@ -17,7 +17,7 @@ from ctlev_core.provenance.records import (
     versions_of,
     write_provenance,
 )
-from ctlev_core.provenance.scores import TRACED_SCORES, paired_samples, trace_scores
+from ctlev_core.provenance.scores import SCORE_LINEAGE, paired_samples, trace_lineage
 from ctlev_core.report.sections.costs import cost_table, options_table, versions_table
 from ctlev_core.report.studies.run_comparison import Run, compare_runs, find_run, read_run
 from data_contracts import tables
@@ -121,11 +121,11 @@ def test_costs_are_added_up_by_stage_the_dearest_first(store):
     assert ["stage encode", "1"] in versions_table(found).rows
 
 
-def score_rows(value, setting="real", samples=30):
+def score_rows(value, subject="real", samples=30):
     return pa.Table.from_pylist(
         [
             {
-                "task": "pose2d", "setting": setting, "seed": 0, "group": "all", "metric": "mpjpe2d_px", "value": value,
+                "task": "pose2d", "subject": subject, "seed": 0, "group": "all", "metric": "mpjpe2d_px", "value": value,
                 "low": value - 0.1, "high": value + 0.1, "num_samples": samples, "num_train": 2,
                 "model_digest": "digest-0e", "data_digest": "digest-0b",
             }
@@ -136,15 +136,15 @@ def score_rows(value, setting="real", samples=30):
 
 def test_a_score_is_traced_to_training_sets_generators_recordings_config_and_code(store):
     records = records_of(store)
-    table = trace_scores([("0f", score_rows(5.0))], records)
-    tables.check_table(table, TRACED_SCORES, "here")
+    table = trace_lineage([("0f", score_rows(5.0))], records)
+    tables.check_table(table, SCORE_LINEAGE, "here")
     (row,) = table.to_pylist()
     assert row["score_digest"] == "digest-0f" and row["split"] == "test"
     assert row["training_digests"] == ["digest-0b", "digest-0d"]
     assert row["checkpoint_digests"] == ["digest-0c"] and row["recordings_digests"] == ["digest-0a"]
 
     def digests(changed):
-        (other,) = trace_scores([("0f", score_rows(5.0))], changed).to_pylist()
+        (other,) = trace_lineage([("0f", score_rows(5.0))], changed).to_pylist()
         return other["config_digest"] != row["config_digest"], other["code_digest"] != row["code_digest"]
 
     def change(key, **values):
@@ -164,7 +164,7 @@ def run_of(store, name, value, *, digest="d", shift=0.0, **changes) -> Run:
     samples = samples.append_column("metric", pa.array([scores["metric"][0].as_py()] * 30))
     folder = store.parent / "reports" / name
     folder.mkdir(parents=True, exist_ok=True)
-    pq.write_table(trace_scores([("0f", scores)], records), folder / "scores.parquet")
+    pq.write_table(trace_lineage([("0f", scores)], records), folder / "scores.parquet")
     pq.write_table(paired_samples([(scores.to_pylist(), samples, digest)]), folder / "samples.parquet")
     write_provenance(folder / "provenance.json", changed)
     return read_run(name, folder)
@@ -213,7 +213,7 @@ def test_what_is_no_report_of_this_version_is_refused(store, tmp_path):
     run_of(store, "a", 5.0)
     folder = store.parent / "reports" / "a"
     pq.write_table(score_rows(5.0), folder / "scores.parquet")
-    with pytest.raises(DataError, match=r"scores.parquet: table 'traced_scores': missing columns"):
+    with pytest.raises(DataError, match=r"scores.parquet: table 'score_lineage': missing columns"):
         read_run("a", folder)
     (folder / "scores.parquet").write_bytes(b"no table")
     with pytest.raises(DataError, match=r"scores.parquet: is not a table of a report"):

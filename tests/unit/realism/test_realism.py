@@ -165,7 +165,7 @@ def test_numbers_of_an_image_by_hand():
     frame = np.zeros((1, 6, 8, 3), np.uint8)
     frame[0, 0, 0, 0] = 200  # a speckle of one
     frame[0, 5, 6:8, 2] = 100  # a speckle of two
-    frame[0, 2:4, 2:4, 0] = 50  # a piece of four
+    frame[0, 2:4, 2:4, 0] = 50  # a block of four
     frame[0, 0, 7] = 24  # below the limit
     summary = summarise_frames(frame)
     assert summary.numbers["active_pixel_share"] == 7 / 48

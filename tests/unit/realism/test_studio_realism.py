@@ -81,7 +81,14 @@ def test_an_ideal_sensor_fails(person):
 def test_the_sensor_preset_is_what_the_recording_tells(person):
     estimated = calibrate(person).options.model_dump()
     preset = PRESETS["dvxplorer"].model_dump()
-    measured = ("refractory_us", "leak_rate_hz", "shot_rate_hz", "rate_spread", "hot_pixel_fraction", "hot_rate_hz")
+    measured = (
+        "refractory_us",
+        "leak_rate_hz",
+        "shot_noise_rate_hz",
+        "rate_spread",
+        "hot_pixel_fraction",
+        "hot_rate_hz",
+    )
     for name in measured:
         # The preset's numbers are rounded to two figures or three.
         assert preset.pop(name) == pytest.approx(estimated.pop(name), rel=0.01), name

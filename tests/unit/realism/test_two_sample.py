@@ -69,14 +69,14 @@ def noise(count: int, share: float, seed: int, side: int = 16) -> np.ndarray:
     return (active * np.uint8(120)).repeat(3, axis=-1)
 
 
-def bars(count: int, seed: int, lone: int = 0, side: int = 16) -> np.ndarray:
-    """Frames of a bright upright bar at a random place, with some lone pixels."""
+def bars(count: int, seed: int, isolated: int = 0, side: int = 16) -> np.ndarray:
+    """Frames of a bright upright bar at a random place, with some isolated pixels."""
     rng = np.random.default_rng(seed)
     frames = np.zeros((count, side, side, 3), np.uint8)
     for frame in frames:
         column = rng.integers(1, side - 2)
         frame[2:-2, column : column + 2] = 150
-        for _ in range(lone):
+        for _ in range(isolated):
             frame[rng.integers(side), rng.integers(side)] = 150
     return frames
 
@@ -99,7 +99,7 @@ def test_frames_of_one_distribution_cannot_be_told_apart():
 
 
 def test_the_floor_of_halves_is_a_half():
-    found = compare_halves(bars(100, 0, lone=3), names(100, per_recording=2))
+    found = compare_halves(bars(100, 0, isolated=3), names(100, per_recording=2))
     assert found.low < 0.5 < found.high and found.value == pytest.approx(0.5, abs=0.12)
     assert (found.num_first, found.num_second, found.note) == (50, 50, "")
 
@@ -111,12 +111,12 @@ def test_an_easy_difference_is_told_always():
 
 def test_lone_pixels_are_told():
     """What a decoder smooths away, and no classifier of digits looks at."""
-    found = compare(bars(120, 0, lone=3), bars(120, 1))
+    found = compare(bars(120, 0, isolated=3), bars(120, 1))
     assert found.value > 0.9 and found.low > 0.5
 
 
 def test_exchanging_the_sets_gives_the_same_area_up_to_noise():
-    first, second = bars(80, 0, lone=1), bars(80, 1)
+    first, second = bars(80, 0, isolated=1), bars(80, 1)
     one, other = compare(first, second), compare(second, first)
     assert one.value == pytest.approx(other.value, abs=3 * max(one.deviation, other.deviation, 0.02))
 
@@ -132,7 +132,7 @@ def test_names_of_recordings_do_not_matter_and_mixed_sets_are_a_half():
 
 
 def test_equal_seeds_give_equal_results_with_any_number_of_threads():
-    first, second = bars(45, 0, lone=1), bars(45, 1)
+    first, second = bars(45, 0, isolated=1), bars(45, 1)
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -159,7 +159,7 @@ def test_frames_of_a_recording_are_never_on_both_sides():
 
 def test_copies_are_learnt_from_with_their_originals():
     """A copy that names its original's recording is in the same half, and tells nothing."""
-    frames = bars(60, 0, lone=4)
+    frames = bars(60, 0, isolated=4)
     found = compare_frames(frames, frames, first_groups=names(60), second_groups=names(60))
     assert found.value == pytest.approx(0.5, abs=0.06) and found.low <= 0.5 <= found.high
 
@@ -191,7 +191,7 @@ def test_what_cannot_be_measured_is_not_a_number_with_the_reason(first, second, 
     assert np.isnan([found.value, found.low, found.high, found.deviation]).all()
     assert reason in found.note and (found.num_first, found.num_second) == (len(first), len(second))
     row = found.row()
-    assert row["value"] is None and {"group", "setting", *row} == {c.name for c in TWO_SAMPLE_TESTS.columns}
+    assert row["value"] is None and {"group", "subject", *row} == {c.name for c in TWO_SAMPLE_TESTS.columns}
 
 
 def test_few_recordings_have_an_area_without_an_interval_and_cannot_be_halved_twice():

@@ -21,7 +21,7 @@ class Scores:
         return self.table
 
 
-def estimated(setting, rows, groups):
+def estimated(training_set, rows, groups):
     random = np.random.default_rng(rows)
     real, made = random.normal(size=(40, 3)), random.normal(0.5, 1, size=(rows, 3))
 
@@ -29,7 +29,7 @@ def estimated(setting, rows, groups):
         return frechet.compute(predicted, target, frechet.Options())
 
     found = estimate_distances(compute, made, real, predicted_groups=groups, target_groups=np.arange(40) // 2)
-    return Scores(estimates_table(setting, found)), found["fd"]
+    return Scores(estimates_table(training_set, found)), found["fd"]
 
 
 def test_distances_stand_beside_their_floor_and_the_numbers_they_depend_on():

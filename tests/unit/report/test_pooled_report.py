@@ -6,7 +6,7 @@ import re
 
 import pytest
 from pooled_study import DRAWS, NUM_GENERATORS, pooled_groups, write_pooled_study
-from report_artefacts import SETTINGS, Experiment
+from report_artefacts import TRAINING_SETS, Experiment
 
 from ctlev_core.plugins import PluginError
 from ctlev_core.report.page.tables import split_number
@@ -35,8 +35,8 @@ def test_the_page_begins_with_the_answer_and_shows_each_group_once(study):
     texts += ["60 test recordings, 3 random draws of the training recordings, 5 fine-tunings", "and 3 classifier seeds"]
     # In reading order: real frames, real ones with others, others alone, and what is no test score.
     texts += [f"(<code>{name}</code>)</td>" for name in ("real", "real+synthetic", "real+augmentation")]
-    texts += [f"(<code>{name}</code>)</td>" for name in ("real+more_real", "synthetic", "more_real")]
-    texts += ["label agreement (<code>labels of synthetic</code>)", "Differences that matter</h2>", "<svg"]
+    texts += [f"(<code>{name}</code>)</td>" for name in ("real+oracle", "synthetic", "oracle")]
+    texts += ["label agreement (<code>label agreement of synthetic</code>)", "Differences that matter</h2>", "<svg"]
     texts += ["How probable is it that the first is better?", "2 recordings a class (<code>k2_0</code>): asked for"]
     texts += ["20 recordings a class (<code>k20_0</code>): asked for", "Quality of the frames</h2>"]
     texts += [f'href="numbers/k{count}_{draw}/report.html"' for count in COUNTS for draw in range(DRAWS)]
@@ -78,7 +78,7 @@ def test_experiments_in_no_group_are_shown_as_ever(tmp_path):
     home = tmp_path / "home"
     home.mkdir()
     shown = {
-        "settings": [[]] * DRAWS + [list(SETTINGS)],
+        "training_sets": [[]] * DRAWS + [list(TRAINING_SETS)],
         "generator_names": [["synthetic"]] * DRAWS + [["synthetic", "gan"]],
     }
     page = write_pooled_study(home, (2,), (other,), names=names, **shown)
@@ -148,7 +148,7 @@ def test_a_preset_declares_groups(tmp_path):
         ({"g": ["a", "z"]}, {}, r"pooled names experiments of the study, a, b, c, d; got \['z'\]"),
         ({"g": ["a", "b"], "h": ["b", "c"]}, {}, r"each experiment once, got \['b'\]"),
         ({"g": ["a"]}, {}, r"'g': expected at least two experiments, got \['a'\]"),
-        ({"g": ["a", "b"]}, {"b": {"settings": ["real"]}}, r"'g': experiments must have the same settings"),
+        ({"g": ["a", "b"]}, {"b": {"training_sets": ["real"]}}, r"'g': experiments must have the same training sets"),
         ({"g": ["a", "b"]}, {"b": {"downstream_seeds": [0]}}, "same number of downstream_seeds, got 2 of a and 1 of b"),
         ({"g": ["a", "b"]}, {"b": {"num_generators": 2}}, "same num_generators, got 1 of a and 2 of b"),
         (

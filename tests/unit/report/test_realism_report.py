@@ -6,10 +6,10 @@ from ctlev_core.report.page.html import Curves, Table, render_report
 from ctlev_core.report.sections.realism import realism_sections
 
 
-def row(group: str, setting: str, metric: str, value: float, low: float | None = None, high: float | None = None):
+def row(group: str, training_set: str, metric: str, value: float, low: float | None = None, high: float | None = None):
     return {
-        "group": group, "setting": setting, "metric": metric, "value": value, "low": low, "high": high,
-        "num_samples": {"real": 6, "synthetic": 9}.get(setting, 5),
+        "group": group, "subject": training_set, "metric": metric, "value": value, "low": low, "high": high,
+        "num_samples": {"real": 6, "synthetic": 9}.get(training_set, 5),
     }  # fmt: skip
 
 
@@ -26,8 +26,8 @@ ROWS = [
     row("frames", "real against real", "value_js_bits", 0.02, 0.0, 0.04),
 ]
 DISTRIBUTIONS = [
-    {"group": "frames", "setting": setting, "axis": axis, "centre": centre, "share": share}
-    for setting, shares in (("real", (0.75, 0.25)), ("synthetic", (0.5, 0.5)))
+    {"group": "frames", "subject": training_set, "axis": axis, "centre": centre, "share": share}
+    for training_set, shares in (("real", (0.75, 0.25)), ("synthetic", (0.5, 0.5)))
     for axis in ("value", "other")
     for centre, share in zip((26.0, 27.0), shares, strict=True)
 ]
@@ -54,9 +54,9 @@ def test_bold_is_what_lies_above_the_interval_of_the_floor():
 def test_a_ratio_beyond_a_factor_of_ten_is_bold():
     numbers = [(0.05, 0.6), (0.05, 0.004), (0.05, 0.4), (0.0, 0.4)]
     rows = [
-        row("reference", setting, f"number{i}", value)
+        row("reference", training_set, f"number{i}", value)
         for i, pair in enumerate(numbers)
-        for setting, value in zip(("reference", "train"), pair, strict=True)
+        for training_set, value in zip(("reference", "train"), pair, strict=True)
     ]
     (table,) = realism_sections(rows, [])
     assert isinstance(table, Table) and table.title == "How alike are the recordings and the reference?"
@@ -65,10 +65,10 @@ def test_a_ratio_beyond_a_factor_of_ten_is_bold():
 
 def test_frames_of_baselines_have_tables_of_their_own_and_a_line_in_the_chart():
     baseline = [
-        {**one, "group": "frames of gan", "setting": one["setting"].replace("synthetic", "gan")} for one in ROWS[4:]
+        {**one, "group": "frames of gan", "subject": one["subject"].replace("synthetic", "gan")} for one in ROWS[4:]
     ]
     more = [
-        {**one, "group": "frames of gan", "setting": one["setting"].replace("synthetic", "gan")}
+        {**one, "group": "frames of gan", "subject": one["subject"].replace("synthetic", "gan")}
         for one in DISTRIBUTIONS
     ]
     _, values, of_gan, _ = realism_sections([*ROWS, *baseline], [*DISTRIBUTIONS, *more])
@@ -96,9 +96,10 @@ def test_what_is_missing_is_left_out():
     assert "How real do the synthetic frames look?" in page and "<svg" in page
 
 
-def told(setting: str, value: float | None, low: float | None, high: float | None, note: str = "") -> dict:
+def told(training_set: str, value: float | None, low: float | None, high: float | None, note: str = "") -> dict:
     return {
-        "group": "frames", "setting": setting, "value": value, "low": low, "high": high, "deviation": value and 0.0123,
+        "group": "frames", "subject": training_set, "value": value, "low": low, "high": high,
+        "deviation": value and 0.0123,
         "num_first": 50, "num_second": 50, "note": note,
     }  # fmt: skip
 

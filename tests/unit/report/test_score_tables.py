@@ -22,32 +22,33 @@ METRIC = "mpjpe2d_px"
 NAMES = [f"s{number}" for number in range(40)]
 
 
-def row(setting, value, *, seed=0, metric=METRIC, group="all", task="pose2d", num_train=100, low=None, high=None):
+def row(training_set, value, *, seed=0, metric=METRIC, group="all", task="pose2d", num_train=100, low=None, high=None):
     return {
-        "task": task, "setting": setting, "seed": seed, "group": group, "metric": metric, "value": value, "low": low,
-        "high": high, "num_samples": 40, "num_train": num_train, "model_digest": f"{setting}{seed}", "data_digest": "d",
+        "task": task, "subject": training_set, "seed": seed, "group": group, "metric": metric, "value": value,
+        "low": low, "high": high, "num_samples": 40, "num_train": num_train, 
+        "model_digest": f"{training_set}{seed}", "data_digest": "d",
     }  # fmt: skip
 
 
-def scored(setting, shift, *, seed=0, noise=0.1, names=NAMES):
+def scored(training_set, shift, *, seed=0, noise=0.1, names=NAMES):
     """Rows, scores of samples, and a digest, of one training whose errors are those of `real` plus a shift."""
-    random = np.random.default_rng([seed, len(setting)])
+    random = np.random.default_rng([seed, len(training_set)])
     values = 6 + np.random.default_rng(9).normal(0, 1, len(names)) + shift + random.normal(0, noise, len(names))
     columns = {"sample_id": names, "recording_id": names, "value": values, "weight": np.ones(len(names))}
     samples = pa.table({**columns, "metric": [METRIC] * len(names)})
-    return [row(setting, float(values.mean()), seed=seed)], samples, "d"
+    return [row(training_set, float(values.mean()), seed=seed)], samples, "d"
 
 
-def tables_of(*parts, more=(), settings=("real",)):
+def tables_of(*parts, more=(), training_sets=("real",)):
     rows = [one for rows, _, _ in parts for one in rows] + list(more)
     paired = PairedScores(paired_samples(parts))
-    return score_tables(rows, settings, paired), paired, rows
+    return score_tables(rows, training_sets, paired), paired, rows
 
 
 def test_only_what_the_paired_interval_shows_is_bold():
     parts = [scored("real", 0, noise=0), scored("synthetic", -0.5), scored("real+synthetic", 0.01, noise=0.5)]
     parts += [scored("worse", 0.5)]
-    (table, *_), _, _ = tables_of(*parts, settings=("real", "synthetic", "real+synthetic", "worse"))
+    (table, *_), _, _ = tables_of(*parts, training_sets=("real", "synthetic", "real+synthetic", "worse"))
     assert table.columns[:4] == ["trained on", f"{METRIC} ↓", f"{METRIC}: minus real", "trainings"]
     assert [cells[0] for cells in table.rows] == ["real", "synthetic", "real+synthetic", "worse"]
     # Better: score and difference; undecided: neither; worse: the difference alone.
@@ -56,25 +57,25 @@ def test_only_what_the_paired_interval_shows_is_bold():
 
 
 def test_trainings_are_averaged_and_counted_and_unknown_settings_follow_the_known():
-    parts = [scored("more_real", -1), scored("real", 0, seed=1), scored("real", 0.2, seed=2), scored("thing+other", 0)]
-    (table, *_), _, rows = tables_of(*parts, settings=("real",))
-    assert [cells[0] for cells in table.rows] == ["real", "more_real", "thing+other"]
+    parts = [scored("oracle", -1), scored("real", 0, seed=1), scored("real", 0.2, seed=2), scored("thing+other", 0)]
+    (table, *_), _, rows = tables_of(*parts, training_sets=("real",))
+    assert [cells[0] for cells in table.rows] == ["real", "oracle", "thing+other"]
     assert [cells[3] for cells in table.rows] == [2, 1, 1]
-    mean = np.mean([one["value"] for one in rows if one["setting"] == "real"])
+    mean = np.mean([one["value"] for one in rows if one["subject"] == "real"])
     assert table.rows[0][1] == f"{mean:.3f}"
     assert any("the most they can give" in note for note in table.footnotes)
 
 
 def test_labels_shuffled_labels_and_distances_have_tables_of_their_own():
     more = [
-        row("labels of synthetic", 5.0),
-        row("shuffled labels of synthetic", 15.0),
+        row("label agreement of synthetic", 5.0),
+        row("shuffled label agreement of synthetic", 15.0),
         row("held-out real", 3.0, task="distance", metric="fd_event_x"),
         row("synthetic", 9.0, task="distance", metric="fd_event_x", low=8.0, high=10.0),
     ]
     (headline, labels, distances), _, _ = tables_of(scored("real", 0), more=more)
     assert [cells[0] for cells in headline.rows] == ["real"]
-    names = ["held-out real (floor)", "labels of synthetic", "shuffled labels of synthetic"]
+    names = ["held-out real (floor)", "label agreement of synthetic", "shuffled label agreement of synthetic"]
     assert [cells[0] for cells in labels.rows] == names
     assert distances.rows[1][:2] == ["synthetic", "9.00 [8.00, 10.00]"]
 
@@ -95,15 +96,15 @@ def test_two_tasks_are_two_tables_and_classes_against_the_rest_a_third():
 
 def test_scores_of_other_samples_are_not_paired():
     parts = [scored("real", 0), scored("synthetic", -0.5, names=NAMES[::-1])]
-    (table, *_), paired, _ = tables_of(*parts, settings=("real", "synthetic"))
+    (table, *_), paired, _ = tables_of(*parts, training_sets=("real", "synthetic"))
     assert paired.difference("real", "synthetic", METRIC) is None and not table.bold
 
 
 def test_baselines_stand_beside_the_first_generator():
-    settings = {"real": 0, "synthetic": 0.3, "gan": 0.6, "real+synthetic": -0.5, "real+gan": -0.2}
-    _, paired, _ = tables_of(*(scored(name, shift) for name, shift in settings.items()))
+    training_sets = {"real": 0, "synthetic": 0.3, "gan": 0.6, "real+synthetic": -0.5, "real+gan": -0.2}
+    _, paired, _ = tables_of(*(scored(name, shift) for name, shift in training_sets.items()))
     (table,) = baseline_tables(["synthetic", "gan", "absent"], METRIC, paired)
-    # Means of 40 samples, each with noise of 0.1 in both settings.
+    # Means of 40 samples, each with noise of 0.1 in both training sets.
     found = [float(str(cell).split()[0]) for cell in table.rows[0][1:]]
     assert found == pytest.approx([-0.3, -0.3, -0.2], abs=0.08) and table.bold == {(0, 1), (0, 2), (0, 3)}
     assert table.rows[1] == ["absent", "", "", ""]
@@ -112,7 +113,7 @@ def test_baselines_stand_beside_the_first_generator():
 
 def test_groups_by_origin_and_by_class_are_apart():
     groups = ("walk", "classes with real training frames", "classes without training frames")
-    rows = [row(setting, 5.0, group=group) for setting in ("real", "new") for group in groups]
+    rows = [row(training_set, 5.0, group=group) for training_set in ("real", "new") for group in groups]
     (origins,), (classes,) = group_tables([row("real", 5.0), *rows], ["real"])
     assert [cells[0] for cells in origins.rows] == [*groups[1:]]
     assert classes.columns == ["classes", "real", "new", "frames scored"]
@@ -122,7 +123,7 @@ def test_groups_by_origin_and_by_class_are_apart():
 
 def test_subjects_have_a_table_of_their_own():
     groups = ("walk", "subject 14", "subjects not learnt from")
-    rows = [row(setting, 5.0, group=group) for setting in ("real", "new") for group in groups]
+    rows = [row(training_set, 5.0, group=group) for training_set in ("real", "new") for group in groups]
     (subjects,), (classes,) = group_tables(rows, ["real", "new"])
     assert subjects.columns == ["subjects", "real", "new", "frames scored"]
     assert [cells[0] for cells in subjects.rows] == [*groups[1:]]
@@ -156,13 +157,13 @@ def test_scaling_points_are_amounts_for_each_real_frame():
 
 
 def test_the_verdict_says_how_much_of_the_ceiling_was_reached_and_whether_labels_hold():
-    rows = [row(name, value) for name, value in (("real", 7.0), ("real+synthetic", 6.4), ("real+more_real", 6.0))]
-    rows += [row("labels of synthetic", 5.5), row("shuffled labels of synthetic", 15.0)]
-    settings = ("real", "real+synthetic", "real+more_real")
+    rows = [row(name, value) for name, value in (("real", 7.0), ("real+synthetic", 6.4), ("real+oracle", 6.0))]
+    rows += [row("label agreement of synthetic", 5.5), row("shuffled label agreement of synthetic", 15.0)]
+    training_sets = ("real", "real+synthetic", "real+oracle")
     difference, gain = Difference(-0.6, -0.8, -0.4), Difference(-1.0, -1.2, -0.8)
-    text = verdict(rows, settings, difference, ceiling=(gain, Difference(0.6, 0.45, 0.75)))
+    text = verdict(rows, training_sets, difference, oracle=(gain, Difference(0.6, 0.45, 0.75)))
     assert "Adding synthetic data made it better" in text and "9% of what real data alone gives" in text
     assert "synthetic ones give 60% [45%, 75%] of that." in text
     assert "scores 5.500 on synthetic frames against their labels, and 15.00 on them with shuffled labels." in text
-    unsure = verdict(rows, settings, difference, ceiling=(Difference(-0.1, -0.3, 0.1), None))
+    unsure = verdict(rows, training_sets, difference, oracle=(Difference(-0.1, -0.3, 0.1), None))
     assert "change it by -0.100 [-0.300, +0.100]." in unsure and "of that" not in unsure

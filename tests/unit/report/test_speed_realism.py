@@ -13,14 +13,14 @@ from ctlev_core.report.studies.speed_realism import realism_table
 from ctlev_core.statistics.sampling_errors import HELD_OUT
 
 
-def pictures(count: int, lone: bool, seed: int) -> np.ndarray:
-    """A block of 2 x 2 pixels and, perhaps, a lone one far from it."""
+def pictures(count: int, isolated: bool, seed: int) -> np.ndarray:
+    """A block of 2 x 2 pixels and, perhaps, an isolated one far from it."""
     rng = np.random.default_rng(seed)
     frames = np.zeros((count, 12, 12, 3), np.uint8)
     for frame in frames:
         row, column = rng.integers(0, 4, 2)
         frame[row : row + 2, column : column + 2] = 200
-        if lone:
+        if isolated:
             frame[11, rng.integers(12)] = 200
     return frames
 

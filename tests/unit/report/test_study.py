@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from report_artefacts import SETTINGS, Experiment
+from report_artefacts import TRAINING_SETS, Experiment
 
 from ctlev_core.datasets import studio_objects
 from ctlev_core.plugins import PluginError, load_options
@@ -70,7 +70,7 @@ def publish_study(folders, home):
     made = home / "made"
     made.mkdir()
     manifests = [Manifest(ManifestRef(key="k", path=folder), None, (), ()) for folder in folders]
-    shown = {"settings": [list(SETTINGS)] * 2, "generator_names": [["synthetic", "gan"]] * 2}
+    shown = {"training_sets": [list(TRAINING_SETS)] * 2, "generator_names": [["synthetic", "gan"]] * 2}
     found = study_report.function(
         Output(made, made), manifests, title="both", notice="Data: `x`.", names=PARTS, **shown
     )
@@ -86,8 +86,8 @@ OTHER = replace(CHART, title="Another")
 def test_speed_against_error_is_a_section_with_a_link_to_its_page(reports, tmp_path, charts):
     folder = tmp_path / "speed"
     folder.mkdir()
-    settings = Table("Every setting", ["sampler", "U-Net"], [["UniPC", "10"]], bold={(0, 0)})
-    write_speed_summary(folder, SpeedSummary("second", "Recommended: UniPC.", charts, settings))
+    training_sets = Table("Every training set", ["sampler", "U-Net"], [["UniPC", "10"]], bold={(0, 0)})
+    write_speed_summary(folder, SpeedSummary("second", "Recommended: UniPC.", charts, training_sets))
     (folder / "report.html").write_text("the page")
     pq.write_table(pa.table({"line": ["UniPC"]}), folder / "speed_vs_error.parquet")
     found, home = publish_study([*reports, folder], tmp_path), tmp_path / "reports"
@@ -139,18 +139,18 @@ def test_links_lead_to_the_experiments_own_reports(published, reports):
 
 
 def test_an_experiment_that_trains_on_nothing_synthetic_shows_samples_and_figures(reports):
-    def part(settings):
+    def part(training_sets):
         summary = Summary("the verdict", [], ImageGrid("g", []), [replace(CHART, title="By amount")])
         rows = pq.read_table(reports[0] / "scores.parquet").to_pylist()
         paired = PairedScores(pq.read_table(reports[0] / "samples.parquet"))
-        return Part("first", rows, settings, ["synthetic"], paired, summary)
+        return Part("first", rows, training_sets, ["synthetic"], paired, summary)
 
-    for settings in (["real"], list(SETTINGS)):
-        parts = [part(settings)]
+    for training_sets in (["real"], list(TRAINING_SETS)):
+        parts = [part(training_sets)]
         tables = study_tables(parts)
         titles = [section.title for section in study_sections(parts, tables)]
         assert {"2D pose (`first`): asked for, and sampled", "2D pose (`first`): by amount"} <= set(titles)
-        told = settings != ["real"]
+        told = training_sets != ["real"]
         assert bool(tables[0]) == told == any("Paper, Table 2" in title for title in titles)
         assert ("the verdict" in study_words(parts)) == told
 
@@ -168,7 +168,7 @@ def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
         rows = [
             {
                 "metric": metric,
-                "setting": "real",
+                "subject": "real",
                 "task": "test",
                 "group": "all",
                 "value": 6.0,
@@ -194,7 +194,7 @@ def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
     )
     assert len(others) == 6 and others[0] == "2D pose (`a`): told."
     assert study_verdict(parts[3:]) == ""  # one alone needs no summing up
-    table = study_overview([*parts, replace(parts[0], settings=["real"])])
+    table = study_overview([*parts, replace(parts[0], training_sets=["real"])])
     assert [row[:2] for row in table.rows[:2]] == [
         ["2D pose (`a`)", "mpjpe2d_px ↓"],
         ["Object recognition (`b`)", "accuracy ↑"],
@@ -271,22 +271,22 @@ def test_the_bundled_study_is_made_of_its_presets():
 def test_the_demo_trains_once_what_its_experiments_share():
     study = load_study("demo", [])
     assert isinstance(study, Study)
-    pose, cdehp, prior, body, motion, objects, zero_shot = study.experiments.values()
+    pose, cdehp, base_model, body, motion, objects, zero_shot = study.experiments.values()
     assert pose.baselines.items() <= body.baselines.items() and pose.baselines == cdehp.baselines
-    for one, other in ((pose, prior), (body, motion)):
+    for one, other in ((pose, base_model), (body, motion)):
         for name in ("dataset", "windows", "encoding", "condition", "generator", "downstream", "downstream_seeds",
                      "feature_extractor", "seed"):  # fmt: skip
             assert getattr(one, name) == getattr(other, name)
-        assert other.settings == ("real",)  # trained for `one`
-    assert body.baselines["foreign_poses"].generator == body.generator
+        assert other.training_sets == ("real",)  # trained for `one`
+    assert body.baselines["out_of_domain_poses"].generator == body.generator
     alike = {"random_50": {"random_init": True, "num_steps": 50}, "random_150": {"random_init": True},
-             "prior_50": {"num_steps": 50}}  # fmt: skip
+             "base_model_50": {"num_steps": 50}}  # fmt: skip
     for name, changes in alike.items():
-        baseline = prior.baselines[name]
-        assert baseline.generator.options == prior.generator.options | changes
-        assert (baseline.condition, baseline.sampling) == (prior.condition, prior.sampling)
+        baseline = base_model.baselines[name]
+        assert baseline.generator.options == base_model.generator.options | changes
+        assert (baseline.condition, baseline.sampling) == (base_model.condition, base_model.sampling)
     assert load_options(pose.dataset) == load_options(body.dataset)  # one says what is the other's default
-    for name in ("windows", "encoding", "num_synthetic", "feature_extractor", "seed", "max_tries"):
+    for name in ("windows", "encoding", "num_synthetic", "feature_extractor", "seed", "max_attempts"):
         assert getattr(pose, name) == getattr(body, name)
     for name in ("dataset", "windows", "encoding", "condition", "generator", "feature_extractor", "seed"):
         assert getattr(objects, name) == getattr(zero_shot, name)
@@ -342,7 +342,7 @@ def test_a_study_measures_the_generator_of_one_of_its_experiments(tmp_path):
     measured = speed_vs_error_of(study)
     assert measured.experiment == study.experiments["a"] and measured.title == "a"
     assert measured.options.num_images == 5
-    points = [(setting.line, setting.num_inference_steps) for setting, _ in measured.points()]
+    points = [(training_set.line, training_set.num_inference_steps) for training_set, _ in measured.points()]
     assert points == [("reference", 12), ("converged", 16), ("UniPC", 3), ("UniPC", 6)]
     assert {choice.options["palette"] for _, choice in measured.points()} == {"rgb"}
     assert speed_vs_error_of(load_measured(tmp_path, SPEED, ["speed_vs_error=null"])) is None
@@ -393,11 +393,11 @@ def test_a_path_that_is_given_is_no_longer_missing(tmp_path):
         load_study("paper", [f"paths.smpl={tmp_path / 'body.npz'}"])
     assert "paths.smpl" not in str(raised.value)
     parts = raised.value.asked.experiments
-    # What is drawn, filmed, learnt and measured is one body.
-    body, filmed = parts["body"], parts["body"].baselines["smpl_esim"]
+    # What is drawn, recorded, learnt and measured is one body.
+    body, recorded = parts["body"], parts["body"].baselines["smpl_esim"]
     metric = next(metric for metric in body.metrics if metric.name == "pve")
     learnt = (body.condition.options, body.downstream.options, metric.options)
-    for options in (*learnt, filmed.condition.options, filmed.sampling):
+    for options in (*learnt, recorded.condition.options, recorded.sampling):
         assert options["body"] == str(tmp_path / "body.npz")
     # The same lines of the file serve several experiments, and each has a ControlNet of its own.
     controlnets = {name: part.generator.options["controlnet"] for name, part in parts.items() if "pose" in name}
@@ -426,8 +426,8 @@ def test_costs_are_those_of_the_operations():
 
 def test_costs_of_smaller_images_and_guidance_are_between_the_counted_ones():
     asked = (
-        "generator.options.prior=FOLDER",
-        "generator={name: stable_diffusion, options: {prior: x}}",
+        "generator.options.base_model=FOLDER",
+        "generator={name: stable_diffusion, options: {base_model: x}}",
         "condition={name: text}",
     )
 
@@ -456,14 +456,14 @@ def test_an_experiment_is_left_out_without_the_folder_it_needs(tmp_path):
     preset.write_text(
         "name: two\ndata_notice: Simulated.\npaths: {images: null}\nexperiments:\n"
         "  always: {extends: smoke, name: a}\n"
-        "  filmed: {extends: smoke, name: b, only_with: [images], set: ['data_notice={images}']}\n"
+        "  recorded: {extends: smoke, name: b, only_with: [images], set: ['data_notice={images}']}\n"
     )
     study = load_study(str(preset), [])
     assert list(study.experiments) == ["always"]
-    assert study.data_notice == "Simulated. Left out: `filmed`, which needs --set paths.images=...."
-    assert load_study(str(preset), ["paths.images=x"]).experiments["filmed"].data_notice == "x"
-    with pytest.raises(PluginError, match=r"experiments.filmed.seed=1: Left out: `filmed`, which needs"):
-        load_study(str(preset), ["experiments.filmed.seed=1"])
+    assert study.data_notice == "Simulated. Left out: `recorded`, which needs --set paths.images=...."
+    assert load_study(str(preset), ["paths.images=x"]).experiments["recorded"].data_notice == "x"
+    with pytest.raises(PluginError, match=r"experiments.recorded.seed=1: Left out: `recorded`, which needs"):
+        load_study(str(preset), ["experiments.recorded.seed=1"])
 
 
 @pytest.mark.parametrize("wanted", ["images", "[pictures]", "[1]"])

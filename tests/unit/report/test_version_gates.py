@@ -11,8 +11,15 @@ OFF = dict.fromkeys(Gates.model_fields)
 DIGEST = "0123abcd"
 
 
-def row(task, setting, metric, value, group="all"):
-    return {"task": task, "setting": setting, "metric": metric, "value": value, "group": group, "num_samples": 1000}
+def row(task, training_set, metric, value, group="all"):
+    return {
+        "task": task,
+        "subject": training_set,
+        "metric": metric,
+        "value": value,
+        "group": group,
+        "num_samples": 1000,
+    }
 
 
 def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px", realism=(0.75, 0.1)):
@@ -22,14 +29,14 @@ def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px", re
         row("distance", "held-out real", f"kid_event_classifier_{DIGEST}", -0.1),
         row("distance", "synthetic", f"kid_event_classifier_{DIGEST}", 99.0),
         row("distance", "synthetic", f"fd_event_classifier_{DIGEST}", distance),
-        row("copies", "synthetic", "duplicates", 5.0, "small pictures"),
-        row("copies", "synthetic", "close_share", copies[0], "small pictures"),
-        row("copies", "synthetic", "close_share", copies[1], "features of classifier"),
+        row("memorisation", "synthetic", "duplicates", 5.0, "small pictures"),
+        row("memorisation", "synthetic", "close_share", copies[0], "small pictures"),
+        row("memorisation", "synthetic", "close_share", copies[1], "features of classifier"),
         row("net", "real", metric, real_error),
         row("net", "real", metric, 100.0, "walk"),
         row("net", "real", "pck_px4", 0.9),
-        row("net", "labels of synthetic", metric, error),
-        row("net", "labels of synthetic", "pck_px4", 0.1),
+        row("net", "label agreement of synthetic", metric, error),
+        row("net", "label agreement of synthetic", "pck_px4", 0.1),
         row("realism", "synthetic against real", "c2st", 0.99, "frames"),
         row("realism", "synthetic against test", "c2st", realism[0], "frames"),
         row("realism", "real against real", "isolated_pixel_share", 0.9, "frames"),
@@ -38,9 +45,13 @@ def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px", re
     ]
 
 
-def check(gates, found, refused_share=0.0):
+def check(gates, found, rejected_share=0.0):
     return check_gates(
-        Gates(**{**OFF, **gates}), found, task="net", labels_of="labels of synthetic", refused_share=refused_share
+        Gates(**{**OFF, **gates}),
+        found,
+        task="net",
+        labels_of="label agreement of synthetic",
+        rejected_share=rejected_share,
     )
 
 
@@ -56,7 +67,7 @@ def check(gates, found, refused_share=0.0):
             scores(error=0.49, metric="accuracy"),
             0.5,
         ),
-        ({"max_copies_share": 0.02}, scores(), scores(copies=(0.03, 0.0)), 0.02),
+        ({"max_memorised_share": 0.02}, scores(), scores(copies=(0.03, 0.0)), 0.02),
         ({"max_c2st": 0.75}, scores(), scores(realism=(0.76, 0.1)), 0.75),
         ({"max_realism_distances": {"isolated_pixel_share": 0.1}}, scores(), scores(realism=(0.5, 0.11)), 0.1),
     ],
@@ -68,7 +79,7 @@ def test_each_gate_is_kept_up_to_its_limit(gate, at_limit, above, limit):
 
 
 def test_refused_frames_are_judged_by_their_share():
-    assert [check({"max_refused_share": 0.1}, [], share)[0].passed for share in (0.1, 0.11)] == [True, False]
+    assert [check({"max_rejected_share": 0.1}, [], share)[0].passed for share in (0.1, 0.11)] == [True, False]
 
 
 def test_gates_that_are_not_asked_need_no_scores():
@@ -81,22 +92,24 @@ def test_gates_that_are_not_asked_need_no_scores():
         ({"max_distance_ratio": 2}, ("distance", "synthetic", "fd_")),
         ({"max_distance_ratio": 2}, ("distance", "held-out real", "fd_")),
         ({"max_label_error_ratio": 2}, ("net", "real", "")),
-        ({"max_copies_share": 1}, ("copies", "synthetic", "close")),
+        ({"max_memorised_share": 1}, ("memorisation", "synthetic", "close")),
         ({"max_c2st": 1}, ("realism", "synthetic against test", "c2st")),
         ({"max_realism_distances": {"isolated_pixel_share": 1}}, ("realism", "synthetic against real", "isolated")),
     ],
 )
 def test_a_gate_without_its_score_is_no_gate_that_was_kept(gate, without):
-    task, setting, metric = without
+    task, training_set, metric = without
     found = [
-        r for r in scores() if not (r["task"] == task and r["setting"] == setting and r["metric"].startswith(metric))
+        r
+        for r in scores()
+        if not (r["task"] == task and r["subject"] == training_set and r["metric"].startswith(metric))
     ]
     with pytest.raises(DataError, match="gate"):
         check(gate, found)
 
 
 def test_no_error_of_real_frames_leaves_no_room():
-    found = [r | {"value": 0.0} if (r["task"], r["setting"]) == ("net", "real") else r for r in scores(error=0.1)]
+    found = [r | {"value": 0.0} if (r["task"], r["subject"]) == ("net", "real") else r for r in scores(error=0.1)]
     assert not check({"max_label_error_ratio": 100}, found)[0].passed
 
 
@@ -120,6 +133,6 @@ def test_a_distance_that_cannot_be_measured_is_refused_unless_it_is_not_asked_fo
 
 def test_exact_copies_count_even_where_real_frames_are_alike():
     found = [r for r in scores() if r["metric"] != "duplicates"]
-    found.append(row("copies", "synthetic", "duplicates", 100.0, "small pictures"))
-    (judged,) = check({"max_copies_share": 0.05}, found)
+    found.append(row("memorisation", "synthetic", "duplicates", 100.0, "small pictures"))
+    (judged,) = check({"max_memorised_share": 0.05}, found)
     assert judged.value == 0.1 and judged.value > judged.limit

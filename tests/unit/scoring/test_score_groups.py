@@ -67,7 +67,7 @@ def score(tmp_path, monkeypatch):
 
     def run(data, *training_sets):
         table = score_model.function(
-            Output(tmp_path, tmp_path), data, data, list(training_sets), [], setting="real", split="test", seed=0,
+            Output(tmp_path, tmp_path), data, data, list(training_sets), [], subject="real", split="test", seed=0,
             downstream=DownstreamChoice(name="classifier"), metrics=[MetricChoice(name="classification")],
         )  # fmt: skip
         rows = [row for row in table.to_pylist() if row["metric"] == "accuracy"]
@@ -134,10 +134,10 @@ def test_a_distance_lies_beside_what_real_frames_score_against_one_another(tmp_p
     (tmp_path / "out").mkdir()
     table = score_distance.function(
         Output(tmp_path / "out", tmp_path), data, data, data, downstream=DownstreamChoice(name="classifier"),
-        distances=[MetricChoice(name="frechet"), MetricChoice(name="kid")], setting="held-out", split="test", seed=0,
+        distances=[MetricChoice(name="frechet"), MetricChoice(name="kid")], subject="held-out", split="test", seed=0,
     )  # fmt: skip
     beside = pq.read_table(tmp_path / "out" / "distance_estimates.parquet").to_pylist()
-    same = ("setting", "metric", "value", "low", "high")
+    same = ("subject", "metric", "value", "low", "high")
     assert [[row[name] for name in same] for row in beside] == [
         [row[name] for name in same] for row in table.to_pylist()
     ]

@@ -87,7 +87,7 @@ def test_a_still_scene_costs_next_to_nothing_and_noise_goes_on():
         calls.append(t_s)
         return BACKGROUND
 
-    options, noisy = RenderingOptions(max_interval_us=100_000), SensorOptions(shot_rate_hz=50.0, leak_rate_hz=9.0)
+    options, noisy = RenderingOptions(max_interval_us=100_000), SensorOptions(shot_noise_rate_hz=50.0, leak_rate_hz=9.0)
     events, times_us = simulate_rendered(
         still, 0, STOP_US, noisy, options, sensor_seed=3, seed=4, speed_bound=lambda begin_s, end_s: 0.0
     )

@@ -39,7 +39,7 @@ def events_of(frames, **options):
 @pytest.mark.parametrize("threshold_off", [0.2, 0.26])
 def test_spread_and_imbalance_of_thresholds(frames, sigma, threshold_off):
     options = SensorOptions(
-        threshold=0.2, threshold_off=threshold_off, threshold_sigma=sigma, shot_rate_hz=0.3, leak_rate_hz=0.2
+        threshold=0.2, threshold_off=threshold_off, threshold_sigma=sigma, shot_noise_rate_hz=0.3, leak_rate_hz=0.2
     )
     events = events_of(frames, **options.model_dump())
     calibration = calibrate(events, SensorOptions(threshold=0.2))
@@ -52,10 +52,10 @@ def test_spread_and_imbalance_of_thresholds(frames, sigma, threshold_off):
 
 
 def test_noise_and_leak(frames):
-    events = events_of(frames, shot_rate_hz=0.8, shot_rate_bright=1.0, leak_rate_hz=0.3, rate_spread=0.5)
+    events = events_of(frames, shot_noise_rate_hz=0.8, shot_noise_rate_bright=1.0, leak_rate_hz=0.3, rate_spread=0.5)
     options = calibrate(events).options
     # About 4,500 pixels x 6 s; their rates have a spread of their own, 0.5 / sqrt(4,500).
-    assert options.shot_rate_hz == pytest.approx(0.8, rel=0.06)
+    assert options.shot_noise_rate_hz == pytest.approx(0.8, rel=0.06)
     # A leak starts anywhere between the thresholds: half an event a pixel is missing at the beginning.
     assert options.leak_rate_hz == pytest.approx(0.3 - 0.5 / SECONDS, rel=0.1)
     assert options.rate_spread == pytest.approx(0.5, rel=0.15)
@@ -63,7 +63,7 @@ def test_noise_and_leak(frames):
 
 def test_a_sensor_without_noise(frames):
     options = calibrate(events_of(frames)).options
-    assert options.leak_rate_hz == options.shot_rate_hz == options.hot_pixel_fraction == 0
+    assert options.leak_rate_hz == options.shot_noise_rate_hz == options.hot_pixel_fraction == 0
 
 
 @pytest.mark.parametrize("refractory_us", [2_000, 7_000])
@@ -74,7 +74,7 @@ def test_refractory_time(frames, refractory_us):
 
 
 def test_hot_pixels(frames):
-    events = events_of(frames, hot_pixel_fraction=0.004, hot_rate_hz=(40.0, 90.0), shot_rate_hz=0.2)
+    events = events_of(frames, hot_pixel_fraction=0.004, hot_rate_hz=(40.0, 90.0), shot_noise_rate_hz=0.2)
     calibration = calibrate(events)
     # Those in the pattern may hide among its events: two thirds of 28 are certain.
     assert 18 / 6912 <= calibration.options.hot_pixel_fraction <= 28 / 6912
@@ -82,7 +82,7 @@ def test_hot_pixels(frames):
     assert 33 < low < high < 100  # four standard deviations of a count of 240 and 540
     assert calibration.measured["hot_on_share"] > 0.97
     # The neighbourhood of hot pixels is no source of noise.
-    assert calibration.options.shot_rate_hz == pytest.approx(0.2 * (1 - 0.75 * 0.3), rel=0.1)
+    assert calibration.options.shot_noise_rate_hz == pytest.approx(0.2 * (1 - 0.75 * 0.3), rel=0.1)
 
 
 def test_a_sensor_that_is_read_out_at_fixed_times(frames):
@@ -107,7 +107,14 @@ def test_what_a_short_recording_does_not_tell_is_taken_from_the_base_and_named()
     )
     base = PRESETS["dvs346"]
     calibration = calibrate(events, base)
-    for name in ("threshold", "threshold_sigma", "refractory_us", "leak_rate_hz", "shot_rate_hz", "cutoff_dark_hz"):
+    for name in (
+        "threshold",
+        "threshold_sigma",
+        "refractory_us",
+        "leak_rate_hz",
+        "shot_noise_rate_hz",
+        "cutoff_dark_hz",
+    ):
         assert name in calibration.assumed and getattr(calibration.options, name) == getattr(base, name)
     for bad in (events.slice(0, 0), events.slice(0, 1)):
         with pytest.raises(DataError, match="over some time"):
@@ -134,7 +141,7 @@ def test_the_real_person(tmp_path, capsys):
     main([str(recording), "--out", str(tmp_path / "preset.yaml"), "--base", "dvs346"])
     assert "isolated_off_events" in capsys.readouterr().out
     options = read_preset(tmp_path / "preset.yaml")
-    assert 0.05 < options.shot_rate_hz < 0.12 and 0.005 < options.leak_rate_hz < 0.015
+    assert 0.05 < options.shot_noise_rate_hz < 0.12 and 0.005 < options.leak_rate_hz < 0.015
     assert options.refractory_us == 197
     assert options.hot_pixel_fraction == pytest.approx(60 / 76_800)
     options = options.model_copy(update={"hot_pixel_fraction": 0.0, "leak_rate_hz": 0.0})
@@ -142,4 +149,4 @@ def test_the_real_person(tmp_path, capsys):
     events = simulate_events(still, np.array([0, 590_000]), options, sensor_seed=0, seed=0)
     # 45,000 s of pixel time, 3,600 events; but rates of pixels differ by factors, sqrt(exp(1.84^2) / 76,800) = 2 %.
     noise_rate_hz = summarise_events(events).numbers["noise_rate_hz"]
-    assert noise_rate_hz == pytest.approx(options.shot_rate_hz, rel=0.15)
+    assert noise_rate_hz == pytest.approx(options.shot_noise_rate_hz, rel=0.15)

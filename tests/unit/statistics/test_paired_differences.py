@@ -1,4 +1,4 @@
-"""Differences of two settings on the same samples, against closed forms and simulated experiments."""
+"""Differences of two training sets on the same samples, against closed forms and simulated experiments."""
 
 from dataclasses import replace
 
@@ -56,12 +56,12 @@ def test_intervals_cover_the_truth_about_as_often_as_they_say():
     for run in range(runs):
         recordings = [f"r{row // 3}" for row in range(90)]
         shared = np.repeat(random.normal(0, 1, 30), 3) + random.normal(0, 1, 90)
-        settings = []
+        training_sets = []
         for effect in (0.0, -0.5):
             own = np.repeat(random.normal(0, 0.5, 30), 3)
             seeds = random.normal(0, 0.2, (5, 1))
-            settings.append(trainings(shared + own + effect + seeds + random.normal(0, 0.3, (5, 90)), recordings))
-        found = paired_difference(*settings, seed=run)
+            training_sets.append(trainings(shared + own + effect + seeds + random.normal(0, 0.3, (5, 90)), recordings))
+        found = paired_difference(*training_sets, seed=run)
         covered += found.low <= -0.5 <= found.high
     # 5 trainings and 30 recordings: a little less than 95 %; the binomial spread of 60 runs is 3 %.
     assert 0.83 <= covered / runs <= 0.99

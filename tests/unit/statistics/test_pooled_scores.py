@@ -93,7 +93,7 @@ def test_equal_settings_differ_by_exactly_zero():
         found = scores.difference(before, after)
         assert (found.value, found.low, found.high) == (0, 0, 0)
         assert scores.probability(after, before) == 0.5
-    # Draws and recordings are paired: what all settings share is in no difference.
+    # Draws and recordings are paired: what all training sets share is in no difference.
     gained = scores.difference(REAL, SYNTHETIC)
     assert (gained.value, gained.low, gained.high) == pytest.approx((0.1, 0.1, 0.1))
     assert scores.score(SYNTHETIC).high - scores.score(SYNTHETIC).low > 0.2
@@ -110,17 +110,17 @@ def test_probabilities_say_what_intervals_say():
 
 
 def test_the_share_of_a_gain():
-    effects = {REAL: 0.5, SYNTHETIC: 0.56, "real+more_real": 0.6}
+    effects = {REAL: 0.5, SYNTHETIC: 0.56, "real+oracle": 0.6}
     draws = simulate_draws(np.random.default_rng(0), effects, recording=0.4, seed=0.01)
     scores = pooled(draws)
-    share = scores.share_of_gain(REAL, SYNTHETIC, "real+more_real")
-    gained, most = scores.difference(REAL, SYNTHETIC), scores.difference(REAL, "real+more_real")
+    share = scores.share_of_gain(REAL, SYNTHETIC, "real+oracle")
+    gained, most = scores.difference(REAL, SYNTHETIC), scores.difference(REAL, "real+oracle")
     assert share.value == pytest.approx(gained.value / most.value) and 0.4 < share.low < share.value < share.high < 0.8
     # Where the gain is much larger than its error, the interval is about that of the delta method.
     errors = [(d.high - d.low) / 2 for d in (gained, most)]
     assert share.high - share.value < np.hypot(errors[0], errors[1]) / most.value
-    unchanged = [values | {"real+more_real": values[REAL]} for values in draws]
-    assert pooled(unchanged).share_of_gain(REAL, SYNTHETIC, "real+more_real") is None
+    unchanged = [values | {"real+oracle": values[REAL]} for values in draws]
+    assert pooled(unchanged).share_of_gain(REAL, SYNTHETIC, "real+oracle") is None
 
 
 def test_the_order_of_rows_changes_nothing():
@@ -199,8 +199,8 @@ def test_other_bad_input_is_refused():
 
 def test_settings_scored_on_samples_of_their_own_are_left_out():
     one = samples_table({REAL: np.zeros((1, 6))})
-    labels = changed(samples_table({"labels of synthetic": np.zeros((1, 9))}), "samples_digest", ["other"] * 9)
-    assert PooledScores([pa.concat_tables([one, labels])] * 2, "accuracy", 1).settings == (REAL,)
+    labels = changed(samples_table({"label agreement of synthetic": np.zeros((1, 9))}), "samples_digest", ["other"] * 9)
+    assert PooledScores([pa.concat_tables([one, labels])] * 2, "accuracy", 1).training_sets == (REAL,)
 
 
 def test_pooled_values_have_the_width_of_their_spread():

@@ -33,7 +33,7 @@ def test_an_empty_test_split_is_refused_before_the_model_is_read(tmp_path):
     with pytest.raises(DataError, match=r"real: no rows in split 'test' to score on"):
         score_model.function(
             Output(tmp_path, tmp_path), None, data, [data], [], downstream=DownstreamChoice(name="classifier"),
-            metrics=[MetricChoice(name="classification")], setting="real", split="test", seed=0,
+            metrics=[MetricChoice(name="classification")], subject="real", split="test", seed=0,
         )  # fmt: skip
 
 
@@ -49,5 +49,5 @@ def test_an_empty_set_of_frames_is_compared_with_nothing(tmp_path, splits, named
     with pytest.raises(DataError, match=named):
         score_distance.function(
             Output(tmp_path, tmp_path), extractor, real, other, downstream=DownstreamChoice(name="classifier"),
-            distances=[MetricChoice(name="frechet")], setting="synthetic", split="test", seed=0,
+            distances=[MetricChoice(name="frechet")], subject="synthetic", split="test", seed=0,
         )  # fmt: skip

@@ -18,7 +18,7 @@ from data_contracts.events import Events
 from data_contracts.labels import Labels
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, label_columns, read_manifest, write_manifest
 from tasks import export_events as task
-from tasks.copy_check import copy_check
+from tasks.memorisation import memorisation
 from tasks.stage import Output
 
 SIZE = (24, 18)
@@ -93,8 +93,8 @@ def write_generated(folder, frames: np.ndarray) -> Manifest:
     names = [f"synthetic/{row:06d}" for row in range(count)]
     same = {
         "subject": "s", "split": "train", "class_name": "walk", "prompt": "", "generator": "test 1", "scheduler": "",
-        "checkpoint_digest": "", "num_inference_steps": 1, "guidance_scale": 1.0, "num_tries": 1,
-        "refused": "",
+        "checkpoint_digest": "", "num_inference_steps": 1, "guidance_scale": 1.0, "num_attempts": 1,
+        "rejected": "",
     }  # fmt: skip
     ids = {name: names for name in ("sample_id", "recording_id", "condition_id", "source_id")}
     columns = {**ids, **{name: [value] * count for name, value in same.items()}, "seed": list(range(count))}
@@ -205,7 +205,9 @@ def test_copies_are_found_with_the_frames_they_copy(tmp_path):
     generated = write_generated(tmp_path / "generated", np.concatenate([made, noise[:6].reshape(6, 18, 24, 3)]))
     folder = tmp_path / "out"
     folder.mkdir()
-    table = copy_check.function(Output(folder, tmp_path), frames, generated, None, downstream=None, setting="synthetic")
+    table = memorisation.function(
+        Output(folder, tmp_path), frames, generated, None, downstream=None, subject="synthetic"
+    )
     manifest = read_manifest(write_manifest(folder, table, tables.SCORES))
     values = dict(zip(manifest.column("metric"), manifest.column("value"), strict=True))
     assert values["duplicates"] == 2 and values["close_share"] >= 0.25

@@ -11,7 +11,7 @@ import numpy as np
 import pandas
 import pyarrow.parquet as pq
 import pytest
-from generated_frames import REFUSED_ROW, make_generated, publish
+from generated_frames import REJECTED_ROW, make_generated, publish
 
 from ctlev_core.events import files as event_files
 from ctlev_core.export.event_dataset import EventDataset
@@ -39,7 +39,7 @@ def test_pandas_and_opencv_read_every_image_with_its_label(tmp_path):
     made = make_generated(tmp_path / "home")
     folder = export(made, tmp_path / "mine")
     labels = pandas.read_parquet(folder / "labels.parquet")
-    rows = [row for row in range(7) if row != REFUSED_ROW]
+    rows = [row for row in range(7) if row != REJECTED_ROW]
     assert labels["sample_id"].tolist() == [f"synthetic/{row:06d}" for row in rows]
     assert labels["file_name"][1] == "images/000/synthetic_000002.png"
     for number, row in enumerate(rows):
@@ -204,9 +204,9 @@ def test_nothing_to_export(tmp_path):
     made = make_generated(tmp_path / "home", count=2)
     frames = tmp_path / "home" / "artefacts" / "sample" / made.synthetic.key
     table = pq.read_table(frames / "manifest.parquet")
-    columns = {name: table[name] for name in table.column_names} | {"refused": ["empty"] * 2}
+    columns = {name: table[name] for name in table.column_names} | {"rejected": ["empty"] * 2}
     refused = publish(tmp_path / "home", "sample", "none", columns, tables.SYNTHETIC, {}, frames=made.frames)
-    with pytest.raises(DataError, match="the gate refused all 2 frames"):
+    with pytest.raises(DataError, match="the quality filter rejected all 2 frames"):
         export(made, tmp_path / "mine", synthetic=refused)
     assert not (tmp_path / "mine").exists()
 
@@ -253,7 +253,7 @@ def test_event_streams_come_along(tmp_path, one_file):
     ref = publish(home, "export_events", KEY, columns, tables.EVENT_STREAMS, {"generated": made.synthetic})
     folder = export(made, tmp_path / "mine", **{"event streams": ref})
     dataset = EventDataset(folder)
-    rows = [row for row in range(7) if row != REFUSED_ROW]
+    rows = [row for row in range(7) if row != REJECTED_ROW]
     for index, row in enumerate(rows):
         events = dataset.read_events(index)
         for column in "txyp":
@@ -273,7 +273,7 @@ def test_a_table_that_another_program_wrote_is_read(tmp_path):
     folder = export(make_generated(tmp_path / "home"), tmp_path / "mine")
     labels = pandas.read_parquet(folder / "labels.parquet")
     labels["note"] = "good"
-    labels["num_tries"] = labels["num_tries"].astype("int64")
+    labels["num_attempts"] = labels["num_attempts"].astype("int64")
     labels[labels["class_name"] == "walk"].to_parquet(folder / "labels.parquet")
     assert read_image_table(folder)["class_name"].to_pylist() == ["walk"] * 3
     assert {sample["class_name"] for sample in EventDataset(folder)} == {"walk"}

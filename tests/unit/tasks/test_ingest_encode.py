@@ -224,10 +224,10 @@ def test_recordings_larger_than_what_is_held_give_the_same_frames(frames_of, mon
     monkeypatch.setattr("tasks.encode.MAX_WINDOWS", 2)
     monkeypatch.setattr("tasks.encode.MAX_GAP", 3)
     monkeypatch.setattr(encode, "version", 10**6)  # not the cached artefact
-    _, pieces = frames_of(make_dataset(), windows=windows)
+    _, chunks = frames_of(make_dataset(), windows=windows)
     for name, array in zip(("histograms", "frames"), expected[0], strict=True):
-        np.testing.assert_array_equal(pieces.array(name), array)
-    assert pieces.table.drop_columns("joints3d_mm").equals(expected[1]), "without a column of NaN, which equals nothing"
+        np.testing.assert_array_equal(chunks.array(name), array)
+    assert chunks.table.drop_columns("joints3d_mm").equals(expected[1]), "without a column of NaN, which equals nothing"
 
 
 def test_recordings_without_events_have_no_event_numbers_in_the_realism_table(frames_of):

@@ -31,7 +31,7 @@ def artefact(key, stage="sample"):
 
 
 def version_of(number, *, passed=True, name="studio"):
-    check = GateCheck(gate="max_copies_share", score="share of copies", value=0.5, limit=0.6 if passed else 0.1)
+    check = GateCheck(gate="max_memorised_share", score="share of copies", value=0.5, limit=0.6 if passed else 0.1)
     return Version(
         experiment=name,
         number=number,
@@ -39,7 +39,7 @@ def version_of(number, *, passed=True, name="studio"):
         made="2026-01-01T00:00:00Z",
         synthetic=artefact(f"{number:032x}"),
         made_from=(artefact("a" * 32, "finetune"),),
-        scored_in=(artefact(f"{number + 1000:032x}", "copy_check"),),
+        scored_in=(artefact(f"{number + 1000:032x}", "memorisation"),),
         scores={"all: fd": 1.5},
         gates=Gates(),
         checks=(check,),
@@ -66,7 +66,7 @@ def test_numbers_follow_and_only_what_passed_becomes_the_latest(tmp_path, folder
     found = latest_frames(tmp_path, "studio")
     assert found.path == tmp_path / "artefacts" / "sample" / f"{2:032x}" and found.digest == "d" * 64
     assert str(made[2]) == (
-        "version 3 of studio was refused: max_copies_share: share of copies is 0.5, 0.1 at most was asked for"
+        "version 3 of studio was rejected: max_memorised_share: share of copies is 0.5, 0.1 at most was asked for"
     )
     assert str(made[1]) == "version 2 of studio is published"
     assert sorted(path.name for path in folder.iterdir()) == [

@@ -39,7 +39,7 @@ def synthetic_set(folder, pictures, sources):
         "subject": ["ann"] * count, "split": ["train"] * count, "class_name": ["a"] * count, "prompt": ["p"] * count,
         "generator": ["g"] * count, "checkpoint_digest": ["c"] * count, "scheduler": ["ddim"] * count,
         "num_inference_steps": pa.array([4] * count, pa.int32()), "guidance_scale": [1.0] * count,
-        "seed": [0] * count, "num_tries": pa.array([1] * count, pa.int32()), "refused": [""] * count,
+        "seed": [0] * count, "num_attempts": pa.array([1] * count, pa.int32()), "rejected": [""] * count,
         **label_columns(Labels(("a",) * count, np.zeros(count, np.int64))),
     }  # fmt: skip
     table = pa.table(columns).select([column.name for column in tables.SYNTHETIC.columns])
@@ -58,7 +58,7 @@ def run(tmp_path):
         folder.mkdir()
         table = realism.function(Output(folder, folder), None, real, generated, None, names=names)
         tests = pq.read_table(folder / f"{TWO_SAMPLE_TESTS.name}.parquet").to_pylist()
-        return table.to_pylist(), {(test["group"], test["setting"]): test for test in tests}
+        return table.to_pylist(), {(test["group"], test["subject"]): test for test in tests}
 
     return call
 
@@ -81,7 +81,7 @@ def test_every_generator_is_told_from_training_and_test_frames_beside_both_floor
             assert test["value"] > 0.95
         else:
             assert test["low"] < 0.5 < test["high"], (group, setting)
-    scored = {(row["group"], row["setting"]): row for row in rows if row["metric"] == "c2st"}
+    scored = {(row["group"], row["subject"]): row for row in rows if row["metric"] == "c2st"}
     floors = ("real against real", "test against test", "test against real")
     assert set(scored) == {*tests, *(("frames of gan", setting) for setting in floors)}
     found = scored["frames of gan", "gan against test"]

@@ -3,10 +3,10 @@
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from report_artefacts import SETTINGS, Experiment
+from report_artefacts import TRAINING_SETS, Experiment
 
 from ctlev_core.provenance.records import read_provenance
-from ctlev_core.provenance.scores import PAIRED_SAMPLES, TRACED_SCORES
+from ctlev_core.provenance.scores import PAIRED_SAMPLES, SCORE_LINEAGE
 from ctlev_core.report.page.report_files import publish_report
 from ctlev_core.report.sections import pictures
 from ctlev_core.report.sections.pictures import evenly_by_class, runs, sample_grid, steps
@@ -41,15 +41,15 @@ def test_the_page_says_first_what_data_it_is_then_the_verdict_then_what_was_done
     folded = ("Where the time went", "The paper&#x27;s own numbers, on other data")
     places += [page.index(f"{text}</h2></summary>") for text in folded]
     assert places == sorted(places)
-    for expected in ("real+more_real", "synthetic ones give 50% [", "15.00 on them with shuffled labels"):
+    for expected in ("real+oracle", "synthetic ones give 50% [", "15.00 on them with shuffled labels"):
         assert expected in page
     assert "http://" not in page and "https://" not in page
 
 
 def test_every_number_can_be_traced(published, experiment):
     folder = published / "tiny"
-    scores = check_table(pq.read_table(folder / "scores.parquet"), TRACED_SCORES, "scores").to_pylist()
-    assert {row["setting"] for row in scores} >= set(SETTINGS)
+    scores = check_table(pq.read_table(folder / "scores.parquet"), SCORE_LINEAGE, "scores").to_pylist()
+    assert {row["subject"] for row in scores} >= set(TRAINING_SETS)
     records = {record.digest: record for record in read_provenance(folder / "provenance.json")}
     for row in scores:
         assert records[row["score_digest"]].stage == "score_model"
@@ -57,7 +57,7 @@ def test_every_number_can_be_traced(published, experiment):
         assert [records[digest].role for digest in row["recordings_digests"]] == ["recordings"]
         assert row["model_digest"] in records and row["data_digest"] in records
     samples = check_table(pq.read_table(folder / "samples.parquet"), PAIRED_SAMPLES, "samples")
-    assert len(samples) == len(SETTINGS) * 2 * 6 and len(set(samples["samples_digest"].to_pylist())) == 1
+    assert len(samples) == len(TRAINING_SETS) * 2 * 6 and len(set(samples["samples_digest"].to_pylist())) == 1
 
 
 def test_tables_hold_what_the_page_holds(published):
@@ -69,8 +69,11 @@ def test_tables_hold_what_the_page_holds(published):
 
 def test_several_sets_of_a_generator_and_more_real_frames_are_taken(experiment, tmp_path):
     arguments = experiment.arguments
-    arguments |= {"generated": [*experiment.generated, experiment.generated[0]], "more_real": experiment.frames}
-    arguments |= {"copies": [*experiment.copies, experiment.copies[0]], "generator_names": ["synthetic", "gan", "gan"]}
+    arguments |= {"generated": [*experiment.generated, experiment.generated[0]], "oracle": experiment.frames}
+    arguments |= {
+        "memorisation": [*experiment.memorisation, experiment.memorisation[0]],
+        "generator_names": ["synthetic", "gan", "gan"],
+    }
     report.function(Output(tmp_path, tmp_path), **arguments)
     page = (tmp_path / "report.html").read_text()
     assert page.count("<span>gan</span>") == 1 and "real, same moment" in page

@@ -1,4 +1,5 @@
-"""The stage that samples frames: the gate before them, tries that are counted, rows that can be made again alone."""
+"""The stage that samples frames: the quality filter before them, tries that are counted, rows that can be made again
+alone."""
 
 from __future__ import annotations
 
@@ -7,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow as pa
 import pytest
-from tiny_prior import make_data, shared_prior
+from tiny_base_model import make_data, shared_base_model
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling import sampling
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.postprocessing.rejection import find_causes, fit_gate, seed_of_try
-from ctlev_core.seeds import row_seeds
+from ctlev_core.postprocessing.quality_filter import find_causes, fit_quality_filter, seed_of_attempt
+from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.config import SamplingChoice
 from data_contracts.labels import Conditions, Labels
@@ -26,8 +27,8 @@ COUNT, SEED = 6, 3
 
 
 def draw(conditions: Conditions, seeds, work) -> np.ndarray:
-    """Noise of the random prior; where the seed is odd, nothing."""
-    frames = sampling.sample_frames(shared_prior(), conditions, OPTIONS, seeds=seeds, work=work)
+    """Noise of the random base model; where the seed is odd, nothing."""
+    frames = sampling.sample_frames(shared_base_model(), conditions, OPTIONS, seeds=seeds, work=work)
     frames[np.array(seeds) % 2 == 1] = 0
     return frames
 
@@ -87,22 +88,22 @@ def inputs(tmp_path):
     return frames, frames, write_conditions(tmp_path / "conditions")
 
 
-def run(tmp_path, inputs, name="out", max_tries=20) -> Manifest:
+def run(tmp_path, inputs, name="out", max_attempts=20) -> Manifest:
     folder, work = tmp_path / name, tmp_path / f"{name}_work"
     folder.mkdir()
     work.mkdir(exist_ok=True)
     table = task.sample.function(
-        Output(folder, work), *inputs, sampling=SamplingChoice(name="tiny"), max_tries=max_tries, seed=SEED
+        Output(folder, work), *inputs, sampling=SamplingChoice(name="tiny"), max_attempts=max_attempts, seed=SEED
     )
     return read_manifest(write_manifest(folder, table, tables.SYNTHETIC))
 
 
 def test_refused_rows_are_sampled_again_and_every_row_can_be_made_alone(tmp_path, inputs):
     made = run(tmp_path, inputs)
-    first, used, tries = row_seeds(SEED, COUNT), made.column("seed"), made.column("num_tries")
+    first, used, tries = sample_seeds(SEED, COUNT), made.column("seed"), made.column("num_attempts")
     assert min(tries) == 1 < max(tries), "some rows must pass at once and others not"
-    assert used == [seed_of_try(seed, number - 1) for seed, number in zip(first, tries, strict=True)]
-    assert made.column("refused") == [""] * COUNT and not any(seed % 2 for seed in used)
+    assert used == [seed_of_attempt(seed, number - 1) for seed, number in zip(first, tries, strict=True)]
+    assert made.column("rejected") == [""] * COUNT and not any(seed % 2 for seed in used)
     asked = conditions_of(inputs[2])
     for row, seed in enumerate(used):
         alone = draw(asked.take(slice(row, row + 1)), [seed], tmp_path / f"alone_{row}")
@@ -112,11 +113,11 @@ def test_refused_rows_are_sampled_again_and_every_row_can_be_made_alone(tmp_path
 
 
 def test_rows_that_never_pass_keep_their_last_frame_and_say_why(tmp_path, inputs):
-    made = run(tmp_path, inputs, max_tries=1)
-    refused = np.array([bool(cause) for cause in made.column("refused")])
-    np.testing.assert_array_equal(refused, np.array(row_seeds(SEED, COUNT)) % 2 == 1)
-    assert made.column("num_tries") == [1] * COUNT and made.column("seed") == row_seeds(SEED, COUNT)
-    assert all(cause.startswith("empty: active_share 0, expected") for cause in made.column("refused") if cause)
+    made = run(tmp_path, inputs, max_attempts=1)
+    refused = np.array([bool(cause) for cause in made.column("rejected")])
+    np.testing.assert_array_equal(refused, np.array(sample_seeds(SEED, COUNT)) % 2 == 1)
+    assert made.column("num_attempts") == [1] * COUNT and made.column("seed") == sample_seeds(SEED, COUNT)
+    assert all(cause.startswith("empty: active_share 0, expected") for cause in made.column("rejected") if cause)
     assert not made.array("frames")[refused].any() and made.array("frames")[~refused].any()
 
 
@@ -140,7 +141,7 @@ def test_a_run_killed_in_a_later_try_goes_on_from_what_it_sampled(tmp_path, inpu
     counted.clear()
     monkeypatch.setattr(sampling, "sample_latents", until(-1))
     resumed = run(tmp_path, inputs, "killed")
-    assert sum(counted) == sum(whole.column("num_tries")) - COUNT, "the first try was not sampled again"
+    assert sum(counted) == sum(whole.column("num_attempts")) - COUNT, "the first try was not sampled again"
     assert resumed.table.equals(whole.table)
     np.testing.assert_array_equal(resumed.array("frames"), whole.array("frames"))
 
@@ -157,15 +158,15 @@ def drawn_alone(folder, conditions, options, *, seeds, work):
 def test_frames_written_block_by_block_are_those_written_at_once(tmp_path, inputs, monkeypatch):
     plugin = plugins.Plugin("generators", "alone", SimpleNamespace(sample=drawn_alone, VERSION=1), OPTIONS)
     monkeypatch.setattr(task.plugins, "load_options", lambda choice: plugin)
-    loose = fit_gate(
+    loose = fit_quality_filter(
         drawn_alone(None, conditions_of(inputs[2]), None, seeds=range(0, 2 * COUNT, 2), work=None), polarity=False
     )
-    monkeypatch.setattr(task, "gate_of", lambda frames: loose)
+    monkeypatch.setattr(task, "quality_filter_of", lambda frames: loose)
     whole = run(tmp_path, inputs, "whole")
     monkeypatch.setattr(task, "SHARD", 2)
     monkeypatch.setattr(task, "BLOCK_BYTES", 1)
     blocks = run(tmp_path, inputs, "blocks")
-    assert max(whole.column("num_tries")) > 1
+    assert max(whole.column("num_attempts")) > 1
     assert blocks.ref.digest == whole.ref.digest, "the table, and through it the array, byte by byte"
     np.save(tmp_path / "saved.npy", np.asarray(whole.array("frames")))
     assert file_digest(tmp_path / "saved.npy") == whole.files["frames.npy"]["sha256"], "as NumPy writes it"
@@ -183,16 +184,16 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, inputs, monkey
     monkeypatch.setattr(task.plugins, "load_options", lambda choice: plugin)
     monkeypatch.setattr(task, "SHARD", 1)
     monkeypatch.setattr(task, "BLOCK_BYTES", 2 * inputs[0].array("frames")[0].nbytes)
-    assert len(run(tmp_path, inputs, max_tries=2)) == COUNT and max(held) == 2
+    assert len(run(tmp_path, inputs, max_attempts=2)) == COUNT and max(held) == 2
 
 
 def test_the_gate_is_that_of_the_training_frames(tmp_path):
     bars, _ = make_data(4)
     bars[:, 0, 0] = 255
-    grey = task.gate_of(write_frames(tmp_path / "grey", bars))
-    coloured = task.gate_of(write_frames(tmp_path / "coloured", bars * np.array([1, 0, 1], np.uint8)))
+    grey = task.quality_filter_of(write_frames(tmp_path / "grey", bars))
+    coloured = task.quality_filter_of(write_frames(tmp_path / "coloured", bars * np.array([1, 0, 1], np.uint8)))
     assert (grey.polarity, coloured.polarity) == (False, True)
     assert find_causes(bars, grey) == [""] * 4 and find_causes(bars, coloured) != [""] * 4
     odd = bars.copy()
     odd[-1] = 255  # of split `test`
-    assert task.gate_of(write_frames(tmp_path / "odd", odd)) == grey
+    assert task.quality_filter_of(write_frames(tmp_path / "odd", odd)) == grey

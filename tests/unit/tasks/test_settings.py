@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from ctlev_core import plugins
 from ctlev_core.encodings import event_histogram
 from ctlev_core.plugins import PluginError
-from ctlev_core.postprocessing.rejection import GatedImages
+from ctlev_core.postprocessing.quality_filter import FilteredImages
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
 from data_contracts.errors import DataError
@@ -24,7 +24,7 @@ from flows.inputs import check_inputs
 from tasks.evaluate import _groups_by_origin, _others
 from tasks.sample import _check_rounding, _rounded
 from tasks.stage import Output, call_flow, planning
-from tasks.subset import take_faithful, take_share
+from tasks.subset import take_label_consistent, take_share
 
 COUNT = 12
 
@@ -33,19 +33,19 @@ def smoke(*overrides):
     return load_preset(Experiment, PRESETS, "smoke", list(overrides))
 
 
-def test_settings_are_named_after_what_is_learnt_from():
-    names = smoke("scaling=[0.5,0.25]").trained_settings
+def test_training_sets_are_named_after_what_is_learnt_from():
+    names = list(map(str, smoke("scaling=[0.5,0.25]").all_training_sets))
     assert names == [
-        "real", "synthetic", "event_gan", "smpl_esim", "faithful", "more_real", "real+synthetic", "real+event_gan",
-        "real+smpl_esim", "real+faithful", "real+more_real", "real+synthetic@0.25", "real+synthetic@0.5",
+        "real", "synthetic", "event_gan", "smpl_esim", "label_consistent", "oracle", "real+synthetic", "real+event_gan",
+        "real+smpl_esim", "real+label_consistent", "real+oracle", "real+synthetic@0.25", "real+synthetic@0.5",
     ]  # fmt: skip
-    plain = smoke("scaling=[]", "keep_faithful=null", "more_real=null", "baselines={}")
-    assert plain.trained_settings == ["real", "synthetic", "real+synthetic"]
+    plain = smoke("scaling=[]", "keep_fraction=null", "oracle=null", "baselines={}")
+    assert list(map(str, plain.all_training_sets)) == ["real", "synthetic", "real+synthetic"]
 
 
-@pytest.mark.parametrize("override", ["scaling=[1.0]", "scaling=[0.5,0.5]", "scaling=[0]", "keep_faithful=1"])
+@pytest.mark.parametrize("override", ["scaling=[1.0]", "scaling=[0.5,0.5]", "scaling=[0]", "keep_fraction=1"])
 def test_shares_that_are_none_are_refused(override):
-    with pytest.raises((DataError, ValidationError, ValueError), match=r"scaling|keep_faithful"):
+    with pytest.raises((DataError, ValidationError, ValueError), match=r"scaling|keep_fraction"):
         smoke(override)
 
 
@@ -62,13 +62,11 @@ def test_what_a_baseline_leaves_out_is_the_experiments_own():
 
 
 def test_frames_of_several_generators_are_learnt_from_together():
-    names = smoke(FOREIGN, "together=[real+synthetic+foreign, synthetic+foreign]").trained_settings
+    names = list(map(str, smoke(FOREIGN, "mixtures=[real+synthetic+foreign, synthetic+foreign]").all_training_sets))
     assert names[-2:] == ["real+synthetic+foreign", "synthetic+foreign"]
-    for wrong in ("real+nobody", "real", "real+real", "real+faithful+gan"):
-        with pytest.raises(
-            ValueError, match=r"together joins different ones of foreign, gan, more_real, real, synthetic"
-        ):
-            smoke(FOREIGN, f"together=[{wrong}]")
+    for wrong in ("real+nobody", "real", "real+real", "real+label_consistent+gan"):
+        with pytest.raises(ValueError, match=r"mixtures join different ones of foreign, gan, oracle, real, synthetic"):
+            smoke(FOREIGN, f"mixtures=[{wrong}]")
 
 
 def plan(*overrides):
@@ -115,7 +113,7 @@ def test_a_share_is_the_first_rows(tmp_path):
         np.testing.assert_array_equal(np.load(folder / "frames.npy"), synthetic.frames[:expected])
 
 
-def test_faithful_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
+def test_label_consistent_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
     errors = np.array([3, 9, 1, 1, 8, 2, 2, 7, 3, np.nan, 6, 4.0])
     model = SimpleNamespace(predict=lambda folder, frames: {})
 
@@ -131,7 +129,7 @@ def test_faithful_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
     def kept(name):
         folder = tmp_path / name
         folder.mkdir()
-        table = take_faithful.function(
+        table = take_label_consistent.function(
             Output(folder, folder),
             SimpleNamespace(ref=SimpleNamespace(path=tmp_path)),
             Synthetic(),
@@ -160,7 +158,7 @@ def test_rounded_frames_show_whole_counts():
     frames = SimpleNamespace(array=lambda name: counts, rows_where=lambda split: np.arange(20))
     # A decoder that is unsure where an event is spreads it over two pixels.
     blurred = ((real.astype(int) + np.roll(real, 1, axis=1)) // 2).astype(np.uint8)
-    rounded = _rounded(GatedImages(blurred, list(range(20)), [1] * 20, [""] * 20), frames, encoding)
+    rounded = _rounded(FilteredImages(blurred, list(range(20)), [1] * 20, [""] * 20), frames, encoding)
 
     def active_share(images):
         return (images > 0).mean()
@@ -173,15 +171,15 @@ def test_rounded_frames_show_whole_counts():
 
 
 def test_only_event_histograms_can_be_rounded_to_counts():
-    with pytest.raises((DataError, ValidationError, ValueError), match="round_to_counts needs encoding"):
-        smoke("round_to_counts=true", "encoding={name: voxel_grid}")
+    with pytest.raises((DataError, ValidationError, ValueError), match="stochastic_rounding needs encoding"):
+        smoke("stochastic_rounding=true", "encoding={name: voxel_grid}")
 
 
 AREA = "encoding={name: event_histogram, options: {polarity: false, image_size: [32, 32]}}"
 EVENTS = "encoding={name: event_histogram, options: {polarity: false, image_size: [32, 32], resampling: events}}"
 
 
-@pytest.mark.parametrize("asked", ["round_to_counts=true", "export={}"])
+@pytest.mark.parametrize("asked", ["stochastic_rounding=true", "export={}"])
 def test_images_without_whole_counts_are_refused_before_anything_runs(asked):
     what = asked.partition("=")[0]
     with pytest.raises(
@@ -198,10 +196,10 @@ def test_frames_without_whole_counts_are_refused_before_they_are_sampled():
     arrays = {"histograms": np.zeros((2, 1, 24, 24), np.uint16), "frames": np.zeros((2, 16, 16, 3), np.uint8)}
     ref = SimpleNamespace(path="frames")
     manifest = SimpleNamespace(array=arrays.__getitem__, column=lambda name: [3, 0], ref=ref)
-    with pytest.raises(DataError, match="round_to_counts needs whole counts"):
+    with pytest.raises(DataError, match="stochastic_rounding needs whole counts"):
         _check_rounding(manifest)
     arrays["frames"] = np.zeros((2, 24, 24, 3), np.uint8)
-    with pytest.raises(DataError, match="round_to_counts needs event counts"):
+    with pytest.raises(DataError, match="stochastic_rounding needs event counts"):
         _check_rounding(manifest)
 
 
@@ -228,7 +226,7 @@ def test_shuffled_labels_are_those_of_others(count):
 
 
 def test_subsets_are_tables_of_synthetic_frames():
-    assert take_share.schema is tables.SYNTHETIC and take_faithful.schema is tables.SYNTHETIC
+    assert take_share.schema is tables.SYNTHETIC and take_label_consistent.schema is tables.SYNTHETIC
 
 
 def test_a_preset_extends_another(tmp_path):

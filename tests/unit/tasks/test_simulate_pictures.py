@@ -1,4 +1,4 @@
-"""The stage `simulate` without motions: pictures filmed as whole recordings, fitted to those of training."""
+"""The stage `simulate` without motions: pictures recorded as whole recordings, fitted to those of training."""
 
 import json
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctlev_core.events.files import write_events_parquet
-from ctlev_core.generators import filmed_pictures
+from ctlev_core.generators import picture_simulator
 from data_contracts.config import ConditionChoice, DatasetChoice, EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
@@ -37,8 +37,8 @@ def inputs(tmp_path_factory):
     labels = np.array(["upright", "lying"])[np.arange(24) % 2]
     np.savez(root / "pictures.npz", images=images[8:].repeat(2, axis=0), labels=labels[8:].repeat(2))
     asked = Conditions(("",) * 8, np.repeat(images[:8, ..., None], 3, axis=3))
-    options = filmed_pictures.SampleOptions.model_validate(MADE_WITH)
-    made = filmed_pictures.sample_events(asked, (34, 34), options, seeds=range(8))
+    options = picture_simulator.SampleOptions.model_validate(MADE_WITH)
+    made = picture_simulator.sample_events(asked, (34, 34), options, seeds=range(8))
     for number, (events, name) in enumerate(zip(made, labels, strict=False)):
         folder = root / "recordings" / str(name)
         folder.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ def make(home, patch, inputs, windows, sampling=None, condition="picture", seed=
         condition_samples, poses=recordings, condition=choice, order="random", views="labelled", count=COUNT, seed=1,
         **given,
     )  # fmt: skip
-    chosen = SamplingChoice(name="filmed_pictures", options=sampling or {})
+    chosen = SamplingChoice(name="picture_simulator", options=sampling or {})
     made = run(simulate, conditions=asked, sampling=chosen, seed=seed, **given)
     return read_manifest(made, full=True), read_manifest(asked), read_manifest(given["frames"])
 
@@ -75,10 +75,10 @@ def test_whole_recordings_are_filmed_and_fitted_to_those_of_training(tmp_path, m
     assert found["options"]["threshold"] == pytest.approx(0.3, rel=0.1) and found["options"]["negative"] is True
     assert found["measured"]["recordings"] == 6 and "calibration.json" in made.files
     # The frame of a row is that of all events of its picture, from its own seed.
-    options = filmed_pictures.SampleOptions.model_validate(found["options"])
+    options = picture_simulator.SampleOptions.model_validate(found["options"])
     shown = Conditions(("",) * COUNT, np.asarray(asked.array("images")))
     lit = [np.asarray(frame).any(axis=-1) for frame in made.array("frames")]
-    events = filmed_pictures.sample_events(shown, (34, 34), options, seeds=made.column("seed"))
+    events = picture_simulator.sample_events(shown, (34, 34), options, seeds=made.column("seed"))
     for image, of_row in zip(lit, events, strict=True):
         active = np.zeros((34, 34), bool)
         active[of_row.y, of_row.x] = True
@@ -116,7 +116,7 @@ def test_a_class_without_pictures_is_said_before_anything_runs(inputs):
                 "baselines": {
                     "simulator": {
                         "condition": {"name": "picture", "options": {"root": str(inputs / "pictures.npz")}},
-                        "generator": {"name": "filmed_pictures"},
+                        "generator": {"name": "picture_simulator"},
                     }
                 },
             }

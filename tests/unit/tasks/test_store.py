@@ -169,8 +169,8 @@ def test_what_cannot_be_synced_is_not_published(tmp_path, monkeypatch):
 
 def test_an_artefact_whose_path_an_option_names_stays(tmp_path):
     store = Store(tmp_path)
-    prior = add(store, 1, stage="pretrain_prior", age_days=99)
-    add(store, 2, arguments={"prior": f"{prior}/prior"})
+    base_model = add(store, 1, stage="pretrain", age_days=99)
+    add(store, 2, arguments={"base_model": f"{base_model}/base_model"})
     assert store.prune(30) == []
 
 
@@ -416,7 +416,7 @@ def test_pruning_keeps_published_versions_with_their_scores_and_what_they_were_m
     store = Store(tmp_path)
     source = add(store, 1, age_days=99, stage="finetune")
     versions = [add(store, number, inputs=[1], age_days=99, stage="sample") for number in (2, 3, 4)]
-    score = add(store, 5, inputs=[2], age_days=99, stage="copy_check")
+    score = add(store, 5, inputs=[2], age_days=99, stage="memorisation")
     publish(store, 1, versions[0], score)
     publish(store, 2, versions[1])
     assert command(prune, monkeypatch, tmp_path, "--apply") == 0

@@ -97,7 +97,7 @@ def test_new_views_of_labels_without_bodies_are_refused():
 
 
 def row(setting, value, metric="mpjpe2d_px"):
-    return {"setting": setting, "group": "all", "metric": metric, "value": value}
+    return {"subject": setting, "group": "all", "metric": metric, "value": value}
 
 
 SETTINGS = ("real", "synthetic", "real+synthetic")
@@ -136,7 +136,7 @@ def test_verdict_sets_each_baseline_beside_in_a_sentence_of_its_own():
 
 
 def test_without_both_together_synthetic_data_is_told_beside_real_data():
-    rows = [{**one, "metric": "accuracy"} for one in ROWS if one["setting"] != "real+synthetic"]
+    rows = [{**one, "metric": "accuracy"} for one in ROWS if one["subject"] != "real+synthetic"]
     text = verdict(rows, SETTINGS, instead=Difference(0.5, 0.25, 0.75))
     assert "Training on synthetic data instead of real data made it better: paired difference +0.500 [+0.250" in text
     unsure = verdict(rows, SETTINGS, instead=Difference(0.5, -0.25, 1.25))

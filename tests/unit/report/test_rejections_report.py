@@ -1,16 +1,16 @@
-"""What the report says about frames the gate refused."""
+"""What the report says about frames the quality filter rejected."""
 
 import numpy as np
 import pyarrow as pa
 
 from ctlev_core.report.page.html import Table
-from ctlev_core.report.sections.refusals import Refusals, count_refusals, refusal_sections
+from ctlev_core.report.sections.rejections import Rejections, count_rejections, rejection_sections
 from data_contracts import tables
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, label_columns, read_manifest, write_manifest
 
 
-def write_generated(folder, num_tries, refused) -> Manifest:
+def write_generated(folder, num_attempts, refused) -> Manifest:
     folder.mkdir()
     count = len(refused)
     names = [f"synthetic/{row:06d}" for row in range(count)]
@@ -23,8 +23,8 @@ def write_generated(folder, num_tries, refused) -> Manifest:
             "num_inference_steps": pa.array([1] * count, pa.int32()),
             "guidance_scale": [1.0] * count,
             "seed": list(range(count)),
-            "num_tries": pa.array(num_tries, pa.int32()),
-            "refused": refused,
+            "num_attempts": pa.array(num_attempts, pa.int32()),
+            "rejected": refused,
             **label_columns(Labels(("",) * count, np.arange(count))),
         }
     )
@@ -35,11 +35,11 @@ def write_generated(folder, num_tries, refused) -> Manifest:
 def test_refusals_are_counted_by_cause(tmp_path):
     causes = ["", "too dark: brightness 0", "empty: active_share 0", "", "too dark: brightness 0.1"]
     mixed = write_generated(tmp_path / "mixed", [1, 3, 3, 2, 3], causes)
-    counts = count_refusals(mixed)
-    assert counts == Refusals(5, 4, 3, {"too dark": 2, "empty": 1})
-    assert str(counts) == "5 frames, 4 sampled again, 3 refused to the last (too dark 2, empty 1)"
+    counts = count_rejections(mixed)
+    assert counts == Rejections(5, 4, 3, {"too dark": 2, "empty": 1})
+    assert str(counts) == "5 frames, 4 sampled again, 3 rejected to the last (too dark 2, empty 1)"
     clean = write_generated(tmp_path / "clean", [1, 1], ["", ""])
-    (table,) = refusal_sections({"synthetic": mixed, "other": clean})
+    (table,) = rejection_sections({"synthetic": mixed, "other": clean})
     assert isinstance(table, Table)
     assert [list(row) for row in table.rows] == [
         ["synthetic", 5, 4, 3, "too dark, empty"],
@@ -49,5 +49,5 @@ def test_refusals_are_counted_by_cause(tmp_path):
 
 def test_nothing_is_said_where_everything_passed_at_once(tmp_path):
     clean = write_generated(tmp_path / "clean", [1, 1], ["", ""])
-    assert refusal_sections({"synthetic": clean}) == []
-    assert str(count_refusals(clean)) == "2 frames, 0 sampled again, 0 refused to the last"
+    assert rejection_sections({"synthetic": clean}) == []
+    assert str(count_rejections(clean)) == "2 frames, 0 sampled again, 0 rejected to the last"

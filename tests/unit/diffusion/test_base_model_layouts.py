@@ -12,8 +12,14 @@ from safetensors.torch import load_file, save_file
 from tiny_stable_diffusion import CHANGES, make_models, tiny_changes, write_folder
 
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
-from ctlev_core.diffusion.pretrained.loading import Prior, decode_latents, encode_prompts, load_prior, save_prior
-from ctlev_core.diffusion.pretrained.paths import check_prior_folder, prior_places
+from ctlev_core.diffusion.pretrained.loading import (
+    PretrainedModel,
+    decode_latents,
+    encode_prompts,
+    load_base_model,
+    save_base_model,
+)
+from ctlev_core.diffusion.pretrained.paths import base_model_places, check_base_model_folder
 from ctlev_core.generators import controlnet, stable_diffusion
 from data_contracts.config import GeneratorChoice
 from data_contracts.errors import DataError
@@ -53,9 +59,11 @@ def change_weights(part, change):
     save_file(change(load_file(path)), path, metadata={"format": "pt"})
 
 
-def same_unet(prior, models, dtype=torch.float32):
+def same_unet(base_model, models, dtype=torch.float32):
     expected = models["unet"].state_dict()
-    return all(torch.equal(value, expected[name].to(dtype).float()) for name, value in prior.unet.state_dict().items())
+    return all(
+        torch.equal(value, expected[name].to(dtype).float()) for name, value in base_model.unet.state_dict().items()
+    )
 
 
 # Layouts that are read
@@ -66,19 +74,19 @@ def test_half_precision_variants_are_read_where_there_is_nothing_else(folder, mo
         for path in (folder / name).glob("*.safetensors"):
             halves = {key: value.half() for key, value in load_file(path).items()}
             save_file(halves, path.with_name(path.name.replace(".safetensors", ".fp16.safetensors")))
-    assert same_unet(load_prior(folder), models)  # the full weights come first
+    assert same_unet(load_base_model(folder), models)  # the full weights come first
     for name in ("unet", "vae", "text_encoder"):
         (full,) = [path for path in (folder / name).glob("*.safetensors") if ".fp16." not in path.name]
         full.unlink()
-    prior = load_prior(folder)
-    assert same_unet(prior, models, torch.float16) and prior.unet.dtype == torch.float32
-    assert load_prior(folder, dtype=torch.float16).unet.dtype == torch.float16
+    base_model = load_base_model(folder)
+    assert same_unet(base_model, models, torch.float16) and base_model.unet.dtype == torch.float32
+    assert load_base_model(folder, dtype=torch.float16).unet.dtype == torch.float16
     half = folder / "unet" / "diffusion_pytorch_model.fp16.safetensors"
     shutil.copy(half, half.with_name("diffusion_pytorch_model.non_ema.safetensors"))
-    assert same_unet(load_prior(folder), models, torch.float16)
+    assert same_unet(load_base_model(folder), models, torch.float16)
     half.rename(half.with_name("diffusion_pytorch_model.ema.safetensors"))
     with pytest.raises(DataError, match=r"which of .*ema.safetensors, .*non_ema.safetensors\? Keep one"):
-        check_prior_folder(folder)
+        check_base_model_folder(folder)
 
 
 @pytest.mark.parametrize("variant", ["", ".fp16"])
@@ -89,20 +97,20 @@ def test_shards_are_read_by_their_index(folder, models, variant):
     index = next(part.glob("*.index*.json"))
     shards = sorted(part.glob("*-of-*.safetensors"))
     assert len(shards) > 2
-    assert same_unet(load_prior(folder), models)
+    assert same_unet(load_base_model(folder), models)
     content = shards[1].read_bytes()
     shards[1].unlink()
     with pytest.raises(DataError, match=rf"unet: missing {shards[1].name} of the {len(shards)} shards in {index.name}"):
-        check_prior_folder(folder)
+        check_base_model_folder(folder)
     shards[1].write_bytes(content)
     weight_map = json.loads(index.read_text())["weight_map"]
     change_json(index, weight_map={**weight_map, "conv_in.weight": "../vae/diffusion_pytorch_model.safetensors"})
     with pytest.raises(DataError, match="shards lie in the same folder"):
-        check_prior_folder(folder)
+        check_base_model_folder(folder)
     for wrong in ({}, [], None):
         change_json(index, weight_map=wrong)
         with pytest.raises(DataError, match="expected an object 'weight_map'"):
-            check_prior_folder(folder)
+            check_base_model_folder(folder)
 
 
 def test_torch_files_are_read_without_running_them(folder, models):
@@ -110,10 +118,10 @@ def test_torch_files_are_read_without_running_them(folder, models):
         path = weights_of(folder / name)
         torch.save(load_file(path), path.with_name(file))
         path.unlink()
-    prior = load_prior(folder)
-    assert same_unet(prior, models)
+    base_model = load_base_model(folder)
+    assert same_unet(base_model, models)
     expected = models["text_encoder"].state_dict()
-    assert all(torch.equal(value, expected[name]) for name, value in prior.text_encoder.state_dict().items())
+    assert all(torch.equal(value, expected[name]) for name, value in base_model.text_encoder.state_dict().items())
 
 
 def test_weights_under_the_names_of_older_libraries_are_read(folder, models):
@@ -135,27 +143,27 @@ def test_weights_under_the_names_of_older_libraries_are_read(folder, models):
 
     change_weights(folder / "vae", old_attention)
     change_weights(folder / "text_encoder", old_text)
-    prior = load_prior(folder)
+    base_model = load_base_model(folder)
     for name in ("vae", "text_encoder"):
         expected = models[name].state_dict()
-        assert all(torch.equal(value, expected[key]) for key, value in getattr(prior, name).state_dict().items())
+        assert all(torch.equal(value, expected[key]) for key, value in getattr(base_model, name).state_dict().items())
 
 
 def test_schedule_comes_from_the_folder(folder, caplog):
     """The first published configs do not say what is predicted; classes' defaults would clip latents."""
     path = folder / "scheduler" / "scheduler_config.json"
     assert "prediction_type" not in json.loads(path.read_text())
-    config = load_prior(folder).scheduler_config
+    config = load_base_model(folder).scheduler_config
     assert (config["prediction_type"], config["clip_sample"], config["beta_end"]) == ("epsilon", False, 0.012)
     assert not caplog.records
     change_json(path, prediction_type="v_prediction", clip_sample=True, beta_end=0.02)
     with caplog.at_level(logging.WARNING):
-        config = load_prior(folder).scheduler_config
+        config = load_base_model(folder).scheduler_config
     assert (config["prediction_type"], config["clip_sample"], config["beta_end"]) == ("v_prediction", False, 0.02)
     assert "clip_sample of its scheduler config is ignored" in caplog.text
     change_json(path, prediction_type="flow_prediction")
     with pytest.raises(DataError, match="prediction_type must be one of epsilon, v_prediction, sample, got 'flow"):
-        check_prior_folder(folder)
+        check_base_model_folder(folder)
     change_json(path, prediction_type="epsilon")
     for changed, message in (
         ({"rescale_betas_zero_snr": True}, "expected prediction_type v_prediction or sample"),
@@ -165,10 +173,10 @@ def test_schedule_comes_from_the_folder(folder, caplog):
     ):
         change_json(path, **changed)
         with pytest.raises(DataError, match=message):
-            check_prior_folder(folder)
+            check_base_model_folder(folder)
     path.write_text(json.dumps({"_class_name": "FlowMatchEulerDiscreteScheduler", "num_train_timesteps": 1000}))
     with pytest.raises(DataError, match=r"FlowMatchEuler.* lacks beta_start, beta_end, beta_schedule"):
-        check_prior_folder(folder)
+        check_base_model_folder(folder)
 
 
 # What is refused, by the call that a dry run makes
@@ -177,9 +185,11 @@ def test_schedule_comes_from_the_folder(folder, caplog):
 def refused(folder, message, **options):
     """Both generators' plan raises, before anything is loaded."""
     with pytest.raises(DataError, match=message):
-        stable_diffusion.prior_folders(stable_diffusion.Options(prior=folder))
+        stable_diffusion.base_model_folders(stable_diffusion.Options(base_model=folder))
     with pytest.raises(DataError, match=message):
-        controlnet.prior_folders(controlnet.Options(prior=folder, controlnet=folder.with_name("sd-controlnet")))
+        controlnet.base_model_folders(
+            controlnet.Options(base_model=folder, controlnet=folder.with_name("sd-controlnet"))
+        )
 
 
 @pytest.mark.parametrize("name", ["tokenizer", "text_encoder", "vae", "unet", "scheduler"])
@@ -197,7 +207,7 @@ def test_folder_of_a_hub_cache(folder):
 def test_quantised_weights(folder):
     change_weights(folder / "vae", lambda tensors: {**tensors, "quant_conv.bias": torch.zeros(8, dtype=torch.int8)})
     with pytest.raises(DataError, match=r"quant_conv.bias is of type I8; expected F64, F32, F16, BF16"):
-        load_prior(folder)
+        load_base_model(folder)
 
 
 @pytest.mark.parametrize("name", ["text_encoder", "vae", "unet"])
@@ -271,14 +281,14 @@ def test_config_of_another_network(folder):
     change_json(folder / "unet" / "config.json", block_out_channels=[320, 640, 1280, 1280])
     refused(folder, r"config.json says block_out_channels 320, weight conv_in.weight has shape \[8, 4, 3, 3\]")
     change_json(folder / "unet" / "config.json", block_out_channels=[8, 16, 16, 32])
-    check_prior_folder(folder)  # deeper differences show when the network is built
+    check_base_model_folder(folder)  # deeper differences show when the network is built
     with pytest.raises(DataError, match=r"by its config has .* of shape \[.*32.*\], the weights file \["):
-        load_prior(folder)
+        load_base_model(folder)
     change_json(
         folder / "unet" / "config.json", block_out_channels=CHANGES["unet"]["block_out_channels"], act_fn="none"
     )
     with pytest.raises(DataError, match="its config does not make a unet"):
-        load_prior(folder)
+        load_base_model(folder)
     change_json(folder / "unet" / "config.json", sample_size=None)
     refused(folder, "sample_size in its config must be the side of square latents, got None")
 
@@ -327,7 +337,7 @@ def test_tokenizers(folder):
 
 def test_a_dry_run_reports_it(home, folder):
     inputs = [ManifestRef(key="0" * 32, path=folder)] * 2
-    choice = GeneratorChoice(name="stable_diffusion", options={"prior": str(folder)})
+    choice = GeneratorChoice(name="stable_diffusion", options={"base_model": str(folder)})
     with planning() as rows:
         finetune(*inputs, generator=choice, seed=0)
     assert [row.stage for row in rows] == ["finetune"]
@@ -339,9 +349,9 @@ def test_a_dry_run_reports_it(home, folder):
 
 def refused_controlnet(folder, message):
     control = folder.with_name("sd-controlnet")
-    check_prior_folder(folder)
+    check_base_model_folder(folder)
     with pytest.raises(DataError, match=message):
-        controlnet.prior_folders(controlnet.Options(prior=folder, controlnet=control))
+        controlnet.base_model_folders(controlnet.Options(base_model=folder, controlnet=control))
 
 
 def test_controlnets_that_do_not_fit(folder):
@@ -372,38 +382,38 @@ def test_controlnets_that_do_not_fit(folder):
         refused_controlnet(folder, message)
         (control / "config.json").write_text(config)
         weights_of(control).write_bytes(weights)
-    prior = load_prior(folder, controlnet=control)
-    assert prior.controlnet is not None
+    base_model = load_base_model(folder, controlnet=control)
+    assert base_model.controlnet is not None
     with pytest.raises(DataError, match="no subfolder 'controlnet', and no separate ControlNet folder or file"):
-        prior_places(folder, needs_controlnet=True)
+        base_model_places(folder, needs_controlnet=True)
 
 
 def test_a_controlnet_that_is_not_wanted_is_not_looked_at(folder):
     shutil.copytree(folder.with_name("sd-controlnet"), folder / "controlnet")
     weights_of(folder / "controlnet").write_bytes(b"")
-    assert load_prior(folder, with_controlnet=False).controlnet is None
-    assert stable_diffusion.prior_folders(stable_diffusion.Options(prior=folder)) == [folder]
+    assert load_base_model(folder, with_controlnet=False).controlnet is None
+    assert stable_diffusion.base_model_folders(stable_diffusion.Options(base_model=folder)) == [folder]
     with pytest.raises(DataError, match=r"controlnet/.*no safetensors file: 0 bytes"):
-        load_prior(folder)
+        load_base_model(folder)
 
 
 # Prompts and images
 
 
 def test_prompts_that_are_too_long_are_cut_and_named(written, caplog):
-    prior = load_prior(written)
+    base_model = load_base_model(written)
     short, fits = "a cup", "a cup " * 7  # start, fourteen words, end: all sixteen
     with caplog.at_level(logging.WARNING):
-        encode_prompts(prior, [short, fits.strip(), ""])
+        encode_prompts(base_model, [short, fits.strip(), ""])
     assert not caplog.records
     long = "a cup " * 7 + "and a ball"
     with caplog.at_level(logging.WARNING):
-        embeddings = encode_prompts(prior, [short, long])
+        embeddings = encode_prompts(base_model, [short, long])
     (record,) = caplog.records
     assert "is cut to 16" in record.getMessage() and repr(long) in record.getMessage()
     assert embeddings.shape == (2, 16, 12)
     # Cut means cut: what lies beyond the limit changes nothing.
-    assert torch.equal(embeddings[1:], encode_prompts(prior, ["a cup " * 7 + "and nothing else"]))
+    assert torch.equal(embeddings[1:], encode_prompts(base_model, ["a cup " * 7 + "and nothing else"]))
 
 
 class Overflowing(PatchAutoencoder):
@@ -416,8 +426,8 @@ class Overflowing(PatchAutoencoder):
         return decoded
 
 
-def half_prior(vae):
-    return Prior(None, None, vae.half(), None, None, {}, (8, 8))
+def half_base_model(vae):
+    return PretrainedModel(None, None, vae.half(), None, None, {}, (8, 8))
 
 
 def test_images_that_overflow_in_half_precision_are_decoded_again(caplog):
@@ -425,13 +435,13 @@ def test_images_that_overflow_in_half_precision_are_decoded_again(caplog):
     expected = PatchAutoencoder().decode(latents).sample
     vae = Overflowing()
     with caplog.at_level(logging.WARNING):
-        images = decode_latents(half_prior(vae), latents)
+        images = decode_latents(half_base_model(vae), latents)
     assert "2 of 4 images were not finite in float16" in caplog.text
     assert images.dtype == torch.float32 and vae.dtype == torch.float16
     assert torch.allclose(images, expected, atol=0.02)  # halves: 11 bits of values up to about 5
-    plain = decode_latents(half_prior(PatchAutoencoder()), latents)
+    plain = decode_latents(half_base_model(PatchAutoencoder()), latents)
     assert torch.equal(images[:2], plain[:2])  # those that were finite stay as they were
-    again = decode_latents(half_prior(Overflowing()), torch.cat([latents[3:], latents[3:]]))
+    again = decode_latents(half_base_model(Overflowing()), torch.cat([latents[3:], latents[3:]]))
     assert torch.equal(again[1], images[3])  # alone or in another batch
 
 
@@ -440,13 +450,13 @@ def test_images_that_are_never_finite_are_an_error():
     latents[1, 0] = float("nan")
     for vae in (PatchAutoencoder().half(), PatchAutoencoder()):
         with pytest.raises(DataError, match="the latents of 1 of 2 samples hold values that are not finite"):
-            decode_latents(Prior(None, None, vae, None, None, {}, (8, 8)), latents)
+            decode_latents(PretrainedModel(None, None, vae, None, None, {}, (8, 8)), latents)
 
 
 def test_saved_folder_keeps_scale_and_channel_order(folder, tmp_path):
     change_json(folder.with_name("sd-controlnet") / "config.json", controlnet_conditioning_channel_order="bgr")
-    save_prior(load_prior(folder, controlnet=folder.with_name("sd-controlnet")), tmp_path / "out")
-    again = load_prior(tmp_path / "out")
+    save_base_model(load_base_model(folder, controlnet=folder.with_name("sd-controlnet")), tmp_path / "out")
+    again = load_base_model(tmp_path / "out")
     assert again.reversed_condition and again.scaling_factor == 0.25
     assert {path.suffix for path in (tmp_path / "out").rglob("*") if path.is_file()} <= {
         ".json",

@@ -1,4 +1,4 @@
-"""A prior small enough to train in a test: 16 px images, 4 x 4 latents, random weights."""
+"""A base model small enough to train in a test: 16 px images, 4 x 4 latents, random weights."""
 
 from functools import cache
 
@@ -6,25 +6,25 @@ import numpy as np
 import torch
 
 from ctlev_core.diffusion.patch_autoencoder import fit_patch_autoencoder
-from ctlev_core.diffusion.pretraining.architecture import build_prior
+from ctlev_core.diffusion.pretraining.architecture import build_base_model
 from data_contracts.labels import Conditions
 
 SIDE = 16
 CORPUS = ("a moving human", "a photo of a cup", "a photo of a ball") * 4
 
 
-def make_prior(seed=0):
+def make_base_model(seed=0):
     images = torch.rand((8, 3, SIDE, SIDE), generator=torch.Generator().manual_seed(seed)) * 2 - 1
-    return build_prior(CORPUS, fit_patch_autoencoder(images), seed=seed, widths=(32, 32), image_size=SIDE)
+    return build_base_model(CORPUS, fit_patch_autoencoder(images), seed=seed, widths=(32, 32), image_size=SIDE)
 
 
 @cache
-def shared_prior():
+def shared_base_model():
     """For tests that only read it."""
-    prior = make_prior()
-    for model in (prior.unet, prior.controlnet, prior.text_encoder):
+    base_model = make_base_model()
+    for model in (base_model.unet, base_model.controlnet, base_model.text_encoder):
         model.eval().requires_grad_(False)
-    return prior
+    return base_model
 
 
 def make_data(count=12, seed=0, *, with_images=True):

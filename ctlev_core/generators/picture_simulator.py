@@ -1,4 +1,5 @@
-"""Baseline: a picture on a monitor before an event camera that makes saccades, as a user of ESIM or v2e would film it.
+"""Baseline: a picture on a monitor before an event camera that makes saccades, as a user of ESIM or v2e would record
+it.
 
 Source: N-MNIST and N-Caltech101 (Orchard et al., Converting Static Image Datasets to Spiking Neuromorphic Datasets
 Using Saccades, Frontiers in Neuroscience 2015) were recorded so: a pan-tilt unit moves an ATIS along a closed triangle,
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from ctlev_core.sensor.options import PixelMaps, SensorOptions
 
 VERSION = 1
-WHERE = "generator 'filmed_pictures'"
+WHERE = "generator 'picture_simulator'"
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 MAX_INTERVAL_US = 10_000
 PATH_STEP_US = 250
@@ -123,7 +124,7 @@ class SampleOptions(Frozen):
     )
     refractory_us: int | None = Field(default=None, ge=0, description="silence of a pixel after an event")
     leak_rate_hz: float | None = Field(default=None, ge=0, description="noise events a second of one polarity")
-    shot_rate_hz: float | None = Field(default=None, ge=0, description="noise events a second of either polarity")
+    shot_noise_rate_hz: float | None = Field(default=None, ge=0, description="noise events a second of either polarity")
     hot_pixels: tuple[tuple[int, int, float], ...] | None = Field(
         default=None, description="(x, y, Hz) of pixels that fire on their own, as leaks do; those outside are left out"
     )
@@ -160,7 +161,7 @@ UNCALIBRATED = {
     "threshold_off": 0.42,
     "refractory_us": 1780,
     "leak_rate_hz": 0.6,
-    "shot_rate_hz": 0.0,
+    "shot_noise_rate_hz": 0.0,
     "hot_pixels": (),
 }
 """In place of what neither the user nor a recording says."""
@@ -193,7 +194,7 @@ def sample_events(
         raise ValueError(f"sensor_size must be (width, height) of 1 px or more, got {sensor_size}")
     filled = fill(options)
     # Checked now rather than when the first row is asked for.
-    return (_film(images[row], row, sensor_size, filled, seed) for row, seed in enumerate(seeds))
+    return (_record(images[row], row, sensor_size, filled, seed) for row, seed in enumerate(seeds))
 
 
 def calibrate(
@@ -237,7 +238,7 @@ def frame_times_us(options: SampleOptions) -> np.ndarray:
     return _frames(options.path_us, options.path_px, options.max_displacement_px)[0]
 
 
-def _film(image: np.ndarray, row: int, sensor_size: SensorSize, options: SampleOptions, seed: int) -> Events:
+def _record(image: np.ndarray, row: int, sensor_size: SensorSize, options: SampleOptions, seed: int) -> Events:
     """The events of one picture."""
     from ctlev_core.render.panned_picture import pan
     from ctlev_core.sensor.dvs_pixel import Sensor, join
@@ -258,15 +259,15 @@ def _film(image: np.ndarray, row: int, sensor_size: SensorSize, options: SampleO
         max_events=options.max_events,
     )
     block = max(BLOCK_VALUES // (sensor_size[0] * sensor_size[1]), 1)
-    pieces = []
+    chunks = []
     for first in range(0, len(times_us), block):
         part = slice(first, first + block)
         frames = pan(light, background, side_px, sensor_size, start_px + moved_px[part], options.blur_px)
         try:
-            pieces.append(sensor.push(frames, times_us[part]))
+            chunks.append(sensor.push(frames, times_us[part]))
         except DataError as error:
             raise DataError(f"{WHERE}, row {row}: {error}") from error
-    events = join(pieces, sensor_size)
+    events = join(chunks, sensor_size)
     return Events(events.t, events.x, events.y, 1 - events.p, sensor_size) if options.flipped else events
 
 
@@ -294,8 +295,8 @@ def _sensor(sensor_size: SensorSize, options: SampleOptions) -> tuple[SensorOpti
         cutoff_bright_hz=options.cutoff_bright_hz,
         refractory_us=options.refractory_us or 0,
         leak_rate_hz=options.leak_rate_hz or 0.0,
-        shot_rate_hz=options.shot_rate_hz or 0.0,
-        shot_rate_bright=1.0,
+        shot_noise_rate_hz=options.shot_noise_rate_hz or 0.0,
+        shot_noise_rate_bright=1.0,
         rate_spread=options.rate_spread,
         starts_settled=options.starts_settled,
     )

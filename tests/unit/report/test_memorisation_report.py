@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core.report.page.html import ImageGrid, Table
-from ctlev_core.report.sections.copies import copy_sections
+from ctlev_core.report.sections.memorisation import memorisation_sections
 
 FRAMES = np.arange(4 * 8 * 8 * 3, dtype=np.uint8).reshape(4, 8, 8, 3)
 
@@ -19,12 +19,12 @@ def manifest(rows, pairs=()):
     )
 
 
-def row(setting, metric, value, low=None, high=None, group="small pictures"):
-    return {"setting": setting, "group": group, "metric": metric, "value": value, "low": low, "high": high}
+def row(training_set, metric, value, low=None, high=None, group="small pictures"):
+    return {"subject": training_set, "group": group, "metric": metric, "value": value, "low": low, "high": high}
 
 
 def test_generators_go_down_and_scores_across_with_the_closest_pairs_of_the_first():
-    pair = {"setting": "synthetic", "features": "small pictures", "generated_row": 3, "training_row": 1}
+    pair = {"subject": "synthetic", "features": "small pictures", "generated_row": 3, "training_row": 1}
     found = [
         manifest(
             [row("synthetic", "close_share", 0.02, 0.0, 0.05), row("synthetic", "duplicates", 1.0)],
@@ -35,7 +35,7 @@ def test_generators_go_down_and_scores_across_with_the_closest_pairs_of_the_firs
         ),
         manifest([row("gan", "close_share", 0.0, 0.0, 0.01), row("gan", "ratio", 1.5, group="features")]),
     ]
-    table, grid = copy_sections(manifest([]), [manifest([])], found)
+    table, grid = memorisation_sections(manifest([]), [manifest([])], found)
     assert isinstance(table, Table) and isinstance(grid, ImageGrid)
     assert table.columns == [
         "frames", "close_share, small pictures", "duplicates, small pictures", "ratio, features",
@@ -48,4 +48,4 @@ def test_generators_go_down_and_scores_across_with_the_closest_pairs_of_the_firs
 
 
 def test_nothing_compared_is_no_section():
-    assert copy_sections(manifest([]), [], []) == []
+    assert memorisation_sections(manifest([]), [], []) == []

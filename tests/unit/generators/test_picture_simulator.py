@@ -1,4 +1,5 @@
-"""Filmed pictures: events where, when and of the polarity that light says; a calibration that finds what made them."""
+"""Recorded pictures: events where, when and of the polarity that light says; a calibration that finds what made
+them."""
 
 from pathlib import Path
 
@@ -6,8 +7,14 @@ import numpy as np
 import pytest
 
 from ctlev_core.events import files as event_files
-from ctlev_core.generators import filmed_pictures
-from ctlev_core.generators.filmed_pictures import UNCALIBRATED, SampleOptions, calibrate, frame_times_us, sample_events
+from ctlev_core.generators import picture_simulator
+from ctlev_core.generators.picture_simulator import (
+    UNCALIBRATED,
+    SampleOptions,
+    calibrate,
+    frame_times_us,
+    sample_events,
+)
 from ctlev_core.render.panned_picture import pan
 from ctlev_core.sensor.dvs_pixel import EventBudgetError
 from data_contracts.errors import DataError
@@ -18,7 +25,7 @@ REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real"
 SIZE = (34, 34)
 SIDE = 28
 STILL = {
-    "centre_jitter_px": 0.0, "blur_px": 0.0, "threshold_spread": 0.0, "leak_rate_hz": 0.0, "shot_rate_hz": 0.0,
+    "centre_jitter_px": 0.0, "blur_px": 0.0, "threshold_spread": 0.0, "leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0,
     "refractory_us": 0, "starts_settled": False, "centre_px": (0.0, 0.0), "hot_pixels": (), "flipped": False,
     "negative": False, "picture_share": SIDE / 34,
 }  # fmt: skip
@@ -42,7 +49,7 @@ def strokes(count, seed=0):
     return conditions_of(images, tuple("ab"[number % 2] for number in range(count)))
 
 
-def film(conditions, seeds=None, size=SIZE, **options):
+def record(conditions, seeds=None, size=SIZE, **options):
     seeds = range(len(conditions)) if seeds is None else seeds
     return list(sample_events(conditions, size, SampleOptions(**options), seeds=seeds))
 
@@ -59,14 +66,14 @@ def same(first, second):
 
 def test_rows_depend_on_their_picture_and_seed_alone():
     asked = strokes(4)
-    made = film(asked, [5, 6, 7, 8])
+    made = record(asked, [5, 6, 7, 8])
     for events in made:
         check_events(events, "test")
         assert events.sensor_size == SIZE and len(events) > 500
         assert events.t[0] >= 0 and events.t[-1] <= SampleOptions().path_us[-1]
-    again = film(asked.take(np.array([2, 0])), [7, 5])
+    again = record(asked.take(np.array([2, 0])), [7, 5])
     assert same(again[0], made[2]) and same(again[1], made[0])
-    assert not same(film(asked.take(np.array([0])), [9])[0], made[0])
+    assert not same(record(asked.take(np.array([0])), [9])[0], made[0])
 
 
 @pytest.mark.parametrize("threshold", [0.2, 0.35])
@@ -76,7 +83,7 @@ def test_a_bright_edge_that_moves_right_sends_rising_light_ahead_as_often_as_thr
     image[:, :, : SIDE // 2] = 255
     options = STILL | {"threshold": threshold, "black": BLACK, "path_us": (0, 100_000), "path_px": ((0, 0), (3, 0))}
     middle, inside = SIZE[0] // 2, slice(8, 26)  # rows and columns whose surroundings are the picture
-    (events,) = film(conditions_of(image), **options)
+    (events,) = record(conditions_of(image), **options)
     expected = np.zeros((2, 18, 18), int)
     expected[1, :, middle - 8 : middle - 5] = most = int(np.floor(np.log(1 / BLACK) / threshold))
     np.testing.assert_array_equal(signed(events)[:, inside, inside], expected)
@@ -85,7 +92,7 @@ def test_a_bright_edge_that_moves_right_sends_rising_light_ahead_as_often_as_thr
     starts = [events.t[kept & (events.x == column)].min() for column in range(middle, middle + 3)]
     assert starts == sorted(starts)
     for changes in ({"flipped": True}, {"negative": True}):
-        (other,) = film(conditions_of(image), **options | changes)
+        (other,) = record(conditions_of(image), **options | changes)
         np.testing.assert_array_equal(signed(other)[:, inside, inside], expected[::-1], str(changes))
     assert most > 5
 
@@ -95,7 +102,7 @@ def test_the_measured_sign_is_that_of_the_trailing_edge():
     image = np.zeros((1, SIDE, SIDE))
     image[:, :, 12:16] = 255
     options = STILL | {"negative": True, "path_us": (0, 100_000), "path_px": ((0, 0), (4, 0))}
-    (events,) = film(conditions_of(image), **options)
+    (events,) = record(conditions_of(image), **options)
     inside = (events.y >= 8) & (events.y < 26)
     assert events.x[inside & (events.p == 1)].mean() < events.x[inside & (events.p == 0)].mean() - 3
 
@@ -124,17 +131,19 @@ def test_panned_pictures_are_exact_means(blur_px):
 def test_calibration_finds_what_made_the_recordings():
     """Thresholds within 5 %, the leak within a quarter, the place (of other pictures) within 0.7 px."""
     made_with = {
-        "threshold": 0.34, "threshold_off": 0.4, "leak_rate_hz": 1.0, "shot_rate_hz": 0.4, "refractory_us": 2500,
+        "threshold": 0.34, "threshold_off": 0.4, "leak_rate_hz": 1.0, "shot_noise_rate_hz": 0.4, "refractory_us": 2500,
         "centre_px": (-1.5, -2.0), "picture_share": 26 / 34, "negative": True, "flipped": False,
         "hot_pixels": ((2, 3, 40.0),),
     }  # fmt: skip
-    recordings = film(strokes(12, seed=1), **made_with)
+    recordings = record(strokes(12, seed=1), **made_with)
     names = ["ab"[number % 2] for number in range(12)]
     found, measured = calibrate(iter(recordings), names, strokes(40, seed=2), SampleOptions())
     assert found.threshold == pytest.approx(0.34, rel=0.05) and found.threshold_off == pytest.approx(0.4, rel=0.05)
     assert found.negative is True and found.flipped is False
     assert found.refractory_us == pytest.approx(2500, rel=0.1)
-    assert found.leak_rate_hz == pytest.approx(1.0, rel=0.25) and found.shot_rate_hz == pytest.approx(0.4, rel=0.3)
+    assert found.leak_rate_hz == pytest.approx(1.0, rel=0.25) and found.shot_noise_rate_hz == pytest.approx(
+        0.4, rel=0.3
+    )
     np.testing.assert_allclose(found.centre_px or (), (-1.5, -2.0), atol=0.7)
     assert found.picture_share == pytest.approx(26 / 34, rel=0.05)
     assert [(x, y) for x, y, _ in found.hot_pixels or ()] == [(2, 3)]
@@ -144,13 +153,13 @@ def test_calibration_finds_what_made_the_recordings():
 
 
 def test_calibration_tells_a_camera_that_calls_falling_light_1():
-    recordings = film(strokes(12, seed=1), flipped=True, negative=False, leak_rate_hz=1.0)
+    recordings = record(strokes(12, seed=1), flipped=True, negative=False, leak_rate_hz=1.0)
     found, _ = calibrate(recordings, ["ab"[n % 2] for n in range(12)], strokes(20, seed=2), SampleOptions())
     assert (found.flipped, found.negative) == (True, False)
 
 
 def test_what_the_user_sets_wins_and_two_recordings_are_enough():
-    recordings = film(strokes(2, seed=1), threshold=0.3)
+    recordings = record(strokes(2, seed=1), threshold=0.3)
     given = {"threshold": 0.7, "centre_px": (1.0, 1.0), "negative": False, "leak_rate_hz": 0.0}
     found, _ = calibrate(recordings, ["a", "b"], strokes(6), SampleOptions(**given))
     assert {name: getattr(found, name) for name in given} == given
@@ -160,16 +169,16 @@ def test_what_the_user_sets_wins_and_two_recordings_are_enough():
 def test_wrong_input_is_named():
     asked = strokes(2)
     with pytest.raises(ValueError, match="needs pictures; use condition 'picture'"):
-        film(Conditions(("", "")))
+        record(Conditions(("", "")))
     with pytest.raises(ValueError, match="2 conditions, 2 pictures and 1 seeds"):
-        film(asked, [0])
+        record(asked, [0])
     assert asked.images is not None
     with pytest.raises(ValueError, match=r"pictures must be \[N, S, S, 3\] uint8"):
-        film(Conditions(("",), asked.images[:1, :20]))
+        record(Conditions(("",), asked.images[:1, :20]))
     with pytest.raises(ValueError, match="sensor_size"):
-        film(asked, size=(0, 3))
-    with pytest.raises(DataError, match="generator 'filmed_pictures', row 1: sensor: more than max_events"):
-        film(conditions_of([np.zeros((SIDE, SIDE)), asked.images[0, ..., 0]]), max_events=200, leak_rate_hz=0.0)
+        record(asked, size=(0, 3))
+    with pytest.raises(DataError, match="generator 'picture_simulator', row 1: sensor: more than max_events"):
+        record(conditions_of([np.zeros((SIDE, SIDE)), asked.images[0, ..., 0]]), max_events=200, leak_rate_hz=0.0)
     assert issubclass(EventBudgetError, DataError)
     for wrong in ({"path_us": (0,), "path_px": ((0, 0),)}, {"path_us": (0, 5)}, {"threshold": 0}, {"black": 1}):
         with pytest.raises(ValueError):
@@ -178,15 +187,15 @@ def test_wrong_input_is_named():
         SampleOptions(path_us=(0, 5, 5), path_px=((0, 0),) * 3)
     with pytest.raises(DataError, match="no recording has events"):
         calibrate([], [], asked, SampleOptions())
-    other = film(asked.take(np.array([0])), size=(40, 34))
+    other = record(asked.take(np.array([0])), size=(40, 34))
     with pytest.raises(DataError, match="sensors differ in size"):
-        calibrate(film(asked) + other, ["a", "b", "a"], asked, SampleOptions())
+        calibrate(record(asked) + other, ["a", "b", "a"], asked, SampleOptions())
 
 
 def test_larger_sensors_keep_the_frames_of_a_block_only(monkeypatch):
-    (whole,) = film(strokes(1), size=(60, 50))
-    monkeypatch.setattr(filmed_pictures, "BLOCK_VALUES", 60 * 50 * 3)
-    assert same(film(strokes(1), size=(60, 50))[0], whole)
+    (whole,) = record(strokes(1), size=(60, 50))
+    monkeypatch.setattr(picture_simulator, "BLOCK_VALUES", 60 * 50 * 3)
+    assert same(record(strokes(1), size=(60, 50))[0], whole)
 
 
 @pytest.mark.skipif(not (REAL / "nmnist").is_dir(), reason="no real recordings beside this checkout")

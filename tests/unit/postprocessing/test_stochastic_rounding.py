@@ -1,10 +1,10 @@
-"""Dithering: whole counts whose expectation is the image."""
+"""Stochastic rounding: whole counts whose expectation is the image."""
 
 import numpy as np
 import pytest
 
 from ctlev_core.encodings import event_histogram
-from ctlev_core.postprocessing.stochastic_rounding import dither_counts
+from ctlev_core.postprocessing.stochastic_rounding import round_stochastically
 
 RANDOM = np.random.default_rng(0)
 SEEDS = range(400)
@@ -16,7 +16,7 @@ def grey(values):
 
 def test_counts_are_right_on_average_and_never_off_by_one():
     image = grey(RANDOM.integers(0, 256, (8, 8)))
-    counts = dither_counts(np.stack([image] * 400), np.array([100]), polarity=False, seeds=SEEDS)[:, 0]
+    counts = round_stochastically(np.stack([image] * 400), np.array([100]), polarity=False, seeds=SEEDS)[:, 0]
     expected = image[..., 0] * (100 / image[..., 0].sum())
     # The mean of 400 Bernoulli draws: five standard deviations of at most 0.5 / 20.
     np.testing.assert_allclose(counts.mean(axis=0), expected, atol=0.125)
@@ -27,13 +27,13 @@ def test_counts_are_right_on_average_and_never_off_by_one():
 
 def test_sparse_noise_stays_as_dense():
     image = grey(np.full((64, 64), 12))
-    counts = dither_counts(image[None], np.array([700]), polarity=False, seeds=[0])
+    counts = round_stochastically(image[None], np.array([700]), polarity=False, seeds=[0])
     assert counts.sum() == pytest.approx(700, abs=5 * np.sqrt(700)) and counts.max() == 1
 
 
 def test_the_number_of_events_is_that_of_a_real_window():
     images = np.stack([grey(200 * RANDOM.integers(0, 2, (32, 32)))] * 40)
-    counts = dither_counts(images, np.array([200, 2000]), polarity=False, seeds=range(40))
+    counts = round_stochastically(images, np.array([200, 2000]), polarity=False, seeds=range(40))
     sums = counts.sum(axis=(1, 2, 3), dtype=np.int64)
     near = [np.abs(sums - total) < 5 * np.sqrt(total) for total in (200, 2000)]
     assert np.logical_xor(*near).all() and near[0].any() and near[1].any()
@@ -42,19 +42,19 @@ def test_the_number_of_events_is_that_of_a_real_window():
 def test_polarities_keep_their_channels_and_black_stays_black():
     image = np.zeros((1, 6, 6, 3), np.uint8)
     image[0, :3, :, 0], image[0, 3:, :, 2], image[..., 1] = 90, 200, 77
-    counts = dither_counts(image, np.array([300]), polarity=True, seeds=[1])
+    counts = round_stochastically(image, np.array([300]), polarity=True, seeds=[1])
     assert counts[0, 0, :3].all() and counts[0, 1, 3:].all()
     assert not counts[0, 0, 3:].any() and not counts[0, 1, :3].any()
     rendered = event_histogram.render_image(counts, event_histogram.Options())
     assert not rendered[..., 1].any()
-    assert not dither_counts(np.zeros_like(image), np.array([300]), polarity=True, seeds=[1]).any()
+    assert not round_stochastically(np.zeros_like(image), np.array([300]), polarity=True, seeds=[1]).any()
 
 
 def test_a_row_depends_on_its_own_seed_alone():
     images = grey(RANDOM.integers(0, 256, (5, 8, 8)))
-    together = dither_counts(images, np.array([50, 60]), polarity=False, seeds=[3, 1, 4, 1, 5])
+    together = round_stochastically(images, np.array([50, 60]), polarity=False, seeds=[3, 1, 4, 1, 5])
     for row, seed in enumerate([3, 1, 4, 1, 5]):
-        alone = dither_counts(images[row : row + 1], np.array([50, 60]), polarity=False, seeds=[seed])
+        alone = round_stochastically(images[row : row + 1], np.array([50, 60]), polarity=False, seeds=[seed])
         np.testing.assert_array_equal(alone[0], together[row])
 
 
@@ -69,4 +69,4 @@ def test_a_row_depends_on_its_own_seed_alone():
 )
 def test_what_does_not_fit_is_refused(frames, num_events, seeds, message):
     with pytest.raises(ValueError, match=message):
-        dither_counts(frames, np.array(num_events), polarity=False, seeds=seeds)
+        round_stochastically(frames, np.array(num_events), polarity=False, seeds=seeds)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.labels.body_views import from_new_side
-from ctlev_core.labels.moments import body_motions, equally_different_window, motion_around, nearest_pair
+from ctlev_core.labels.label_windows import body_motions, equally_different_window, motion_around, nearest_pair
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_body_motions
 

@@ -1,4 +1,4 @@
-"""The gate for generated images, on images that are plainly right or wrong."""
+"""The quality filter for generated images, on images that are plainly right or wrong."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core import plugins
-from ctlev_core.postprocessing.rejection import find_causes, fit_gate, sample_until_accepted, seed_of_try
+from ctlev_core.postprocessing.quality_filter import (
+    find_causes,
+    fit_quality_filter,
+    sample_until_accepted,
+    seed_of_attempt,
+)
 from data_contracts.errors import DataError
 
 
@@ -24,13 +29,13 @@ def event_frames(count: int, seed: int = 0, *, polarity: bool = True, share: flo
 @pytest.mark.parametrize("polarity", [True, False])
 def test_real_frames_pass_and_gross_failures_do_not(polarity):
     real = event_frames(200, polarity=polarity)
-    gate = fit_gate(real[::2], polarity=polarity)
-    assert find_causes(real[1::2], gate) == [""] * 100
+    quality_filter = fit_quality_filter(real[::2], polarity=polarity)
+    assert find_causes(real[1::2], quality_filter) == [""] * 100
     black, white = np.zeros_like(real[:1]), np.full_like(real[:1], 255)
     noise = np.random.default_rng(0).integers(0, 256, real[:1].shape, np.uint8)
     one_pixel = black.copy()
     one_pixel[0, 5, 5] = (255, 0, 255) if polarity else 255
-    causes = find_causes(np.concatenate([black, white, noise, one_pixel]), gate)
+    causes = find_causes(np.concatenate([black, white, noise, one_pixel]), quality_filter)
     assert all(causes)
     assert causes[0].startswith("empty: active_share 0, expected ") and causes[3].startswith("empty")
     assert causes[1].startswith("too many active pixels")
@@ -38,19 +43,19 @@ def test_real_frames_pass_and_gross_failures_do_not(polarity):
 
 def test_a_saturated_scene_and_wrong_colours_are_named():
     real = event_frames(100)
-    gate = fit_gate(real, polarity=True)
+    quality_filter = fit_quality_filter(real, polarity=True)
     yellow = real[:1].copy()
     yellow[..., 1] = yellow[..., 0]
-    assert find_causes(yellow, gate)[0].startswith("not the colours of event images: off_palette")
+    assert find_causes(yellow, quality_filter)[0].startswith("not the colours of event images: off_palette")
     saturated = (real[:1] > 0) * np.uint8(255)
-    assert find_causes(saturated, gate)[0].startswith("saturated: bright_share 1, expected 0 to 0.")
-    assert find_causes(np.minimum(real[:1], 27), gate)[0].startswith("too dark: brightness")
+    assert find_causes(saturated, quality_filter)[0].startswith("saturated: bright_share 1, expected 0 to 0.")
+    assert find_causes(np.minimum(real[:1], 27), quality_filter)[0].startswith("too dark: brightness")
 
 
 def test_a_faint_cast_of_green_passes():
     real = event_frames(100)
     cast = np.maximum(real, np.array([0, 3, 0], np.uint8))
-    assert find_causes(cast, fit_gate(real, polarity=True)) == [""] * 100
+    assert find_causes(cast, fit_quality_filter(real, polarity=True)) == [""] * 100
 
 
 @settings(deadline=None, max_examples=20)
@@ -58,12 +63,12 @@ def test_a_faint_cast_of_green_passes():
 def test_frames_a_gate_was_fitted_to_pass_it(share, seed, polarity):
     """Up to 2 % of them lie outside the central 98 %; the widening takes them in unless one is very odd."""
     real = event_frames(20, seed, polarity=polarity, share=share)
-    assert find_causes(real, fit_gate(real, polarity=polarity)) == [""] * 20
+    assert find_causes(real, fit_quality_filter(real, polarity=polarity)) == [""] * 20
 
 
 def test_refused_rows_are_sampled_again_from_seeds_of_their_own():
     real = event_frames(50)
-    gate = fit_gate(real, polarity=True)
+    quality_filter = fit_quality_filter(real, polarity=True)
     calls = []
 
     def sample(rows, seeds):
@@ -75,23 +80,23 @@ def test_refused_rows_are_sampled_again_from_seeds_of_their_own():
         return np.stack(frames)
 
     seeds = [1, 3, 5, 7, 11]
-    made = sample_until_accepted(sample, seeds, gate, max_tries=30)
+    made = sample_until_accepted(sample, seeds, quality_filter, max_attempts=30)
     assert calls[0] == ([0, 1, 2, 3, 4], seeds) and calls[1][0] == [0, 3, 4]
-    assert made.num_tries[1:4] == [1, 1, 30] and made.seeds[1:3] == [3, 5]
+    assert made.num_attempts[1:4] == [1, 1, 30] and made.seeds[1:3] == [3, 5]
     assert made.causes[:3] == ["", "", ""] and made.causes[3].startswith("empty") and made.causes[4] == ""
-    for row, (seed, tries) in enumerate(zip(made.seeds, made.num_tries, strict=True)):
-        assert seed == seed_of_try(seeds[row], tries - 1)
+    for row, (seed, tries) in enumerate(zip(made.seeds, made.num_attempts, strict=True)):
+        assert seed == seed_of_attempt(seeds[row], tries - 1)
     np.testing.assert_array_equal(made.frames[[0, 1, 2, 4]], real[[0, 1, 2, 4]])
     assert not made.frames[3].any()
     # A row alone comes out as it does among others.
-    alone = sample_until_accepted(lambda rows, seeds: sample(rows + 4, seeds), [11], gate, max_tries=30)
+    alone = sample_until_accepted(lambda rows, seeds: sample(rows + 4, seeds), [11], quality_filter, max_attempts=30)
     np.testing.assert_array_equal(alone.frames[0], made.frames[4])
-    assert alone.seeds == [made.seeds[4]] and alone.num_tries == [made.num_tries[4]]
+    assert alone.seeds == [made.seeds[4]] and alone.num_attempts == [made.num_attempts[4]]
 
 
 def test_seeds_of_tries_differ():
-    seeds = {seed_of_try(seed, number) for seed in range(50) for number in range(20)}
-    assert len(seeds) == 1000 and seed_of_try(7, 0) == 7
+    seeds = {seed_of_attempt(seed, number) for seed in range(50) for number in range(20)}
+    assert len(seeds) == 1000 and seed_of_attempt(7, 0) == 7
 
 
 @pytest.mark.parametrize(
@@ -105,12 +110,12 @@ def test_seeds_of_tries_differ():
 )
 def test_what_no_gate_can_be_fitted_to_is_refused(frames, error):
     with pytest.raises(error):
-        fit_gate(frames, polarity=True)
+        fit_quality_filter(frames, polarity=True)
 
 
 def test_wrong_calls_are_refused():
-    gate = fit_gate(event_frames(3), polarity=True)
+    quality_filter = fit_quality_filter(event_frames(3), polarity=True)
     with pytest.raises(ValueError, match="at least one try"):
-        sample_until_accepted(lambda rows, seeds: event_frames(len(rows)), [1], gate, max_tries=0)
+        sample_until_accepted(lambda rows, seeds: event_frames(len(rows)), [1], quality_filter, max_attempts=0)
     with pytest.raises(ValueError, match="0 rows"):
-        sample_until_accepted(lambda rows, seeds: event_frames(len(rows)), [], gate, max_tries=1)
+        sample_until_accepted(lambda rows, seeds: event_frames(len(rows)), [], quality_filter, max_attempts=1)

@@ -1,4 +1,4 @@
-"""Priors are ordinary diffusers folders: what is written loads again, also in diffusers itself."""
+"""Base models are ordinary diffusers folders: what is written loads again, also in diffusers itself."""
 
 import json
 import shutil
@@ -8,18 +8,18 @@ import pytest
 import torch
 from diffusers.pipelines.controlnet.pipeline_controlnet import StableDiffusionControlNetPipeline
 from diffusers.pipelines.stable_diffusion.pipeline_stable_diffusion import StableDiffusionPipeline
-from tiny_prior import SIDE, make_prior, shared_prior
+from tiny_base_model import SIDE, make_base_model, shared_base_model
 from tiny_stable_diffusion import make_models, tiny_changes, write_folder
 
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_prior, save_prior
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_PRIOR, check_prior_folder
+from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_base_model, save_base_model
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, check_base_model_folder
 from data_contracts.errors import DataError
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("prior") / "tiny"
-    save_prior(shared_prior(), path)
+    path = tmp_path_factory.mktemp("base_model") / "tiny"
+    save_base_model(shared_base_model(), path)
     return path
 
 
@@ -30,7 +30,7 @@ def broken(folder, tmp_path):
 
 
 def test_round_trip_keeps_every_weight(folder):
-    saved, loaded = shared_prior(), load_prior(folder)
+    saved, loaded = shared_base_model(), load_base_model(folder)
     for name in ("unet", "controlnet", "text_encoder", "vae"):
         before, after = getattr(saved, name).state_dict(), getattr(loaded, name).state_dict()
         assert before.keys() == after.keys()
@@ -43,17 +43,17 @@ def test_round_trip_keeps_every_weight(folder):
 
 
 def test_half_precision_is_written_for_networks_but_not_for_the_code(tmp_path):
-    prior = make_prior()
-    before = prior.unet.conv_in.weight.clone()
-    save_prior(prior, tmp_path / "half", torch.float16)
-    assert torch.equal(prior.unet.conv_in.weight, before)
-    loaded = load_prior(tmp_path / "half")
+    base_model = make_base_model()
+    before = base_model.unet.conv_in.weight.clone()
+    save_base_model(base_model, tmp_path / "half", torch.float16)
+    assert torch.equal(base_model.unet.conv_in.weight, before)
+    loaded = load_base_model(tmp_path / "half")
     assert torch.equal(loaded.unet.conv_in.weight, before.half().float())
-    assert torch.equal(loaded.vae.analysis, prior.vae.analysis)
+    assert torch.equal(loaded.vae.analysis, base_model.vae.analysis)
 
 
 def test_diffusers_loads_the_folder(folder):
-    pipeline = StableDiffusionControlNetPipeline.from_pretrained(folder, vae=load_prior(folder).vae)
+    pipeline = StableDiffusionControlNetPipeline.from_pretrained(folder, vae=load_base_model(folder).vae)
     pipeline.set_progress_bar_config(disable=True)
     image = pipeline(
         "a photo of a cup", image=torch.zeros(1, 3, SIDE, SIDE), num_inference_steps=2, output_type="np"
@@ -62,9 +62,9 @@ def test_diffusers_loads_the_folder(folder):
 
 
 def test_text_checkpoint_is_a_stable_diffusion_folder(folder, tmp_path):
-    save_prior(load_prior(folder, with_controlnet=False), tmp_path / "text")
+    save_base_model(load_base_model(folder, with_controlnet=False), tmp_path / "text")
     assert not (tmp_path / "text" / "controlnet").exists()
-    pipeline = StableDiffusionPipeline.from_pretrained(tmp_path / "text", vae=load_prior(folder).vae)
+    pipeline = StableDiffusionPipeline.from_pretrained(tmp_path / "text", vae=load_base_model(folder).vae)
     assert pipeline.unet.config.in_channels == 48
 
 
@@ -74,43 +74,43 @@ def test_stable_diffusion_layout_loads(tmp_path):
     config = json.loads((tmp_path / "sd-controlnet" / "config.json").read_text())
     config["controlnet_conditioning_channel_order"] = "bgr"
     (tmp_path / "sd-controlnet" / "config.json").write_text(json.dumps(config))
-    plain = load_prior(path)
+    plain = load_base_model(path)
     assert plain.controlnet is None and not plain.reversed_condition
-    prior = load_prior(path, controlnet=tmp_path / "sd-controlnet")
-    assert prior.scaling_factor == 0.25 and prior.reversed_condition
-    assert prior.image_size == (32, 32)
+    base_model = load_base_model(path, controlnet=tmp_path / "sd-controlnet")
+    assert base_model.scaling_factor == 0.25 and base_model.reversed_condition
+    assert base_model.image_size == (32, 32)
 
 
 def test_missing_parts_are_named(broken, tmp_path):
-    with pytest.raises(DataError, match="nowhere: the prior must be a diffusers folder"):
-        load_prior(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="nowhere: the base model must be a diffusers folder"):
+        load_base_model(tmp_path / "nowhere")
     with pytest.raises(DataError, match="nowhere: the ControlNet must be"):
-        load_prior(broken, controlnet=tmp_path / "nowhere")
+        load_base_model(broken, controlnet=tmp_path / "nowhere")
     shutil.rmtree(broken / "tokenizer")
     with pytest.raises(DataError, match="missing: tokenizer; found: controlnet, scheduler"):
-        load_prior(broken)
+        load_base_model(broken)
 
 
 def test_missing_controlnet_is_named_before_training(broken):
-    check_prior_folder(broken, needs_controlnet=True)
+    check_base_model_folder(broken, needs_controlnet=True)
     shutil.rmtree(broken / "controlnet")
     with pytest.raises(DataError, match="no subfolder 'controlnet'"):
-        check_prior_folder(broken, needs_controlnet=True)
+        check_base_model_folder(broken, needs_controlnet=True)
 
 
-def test_bundled_prior_loads_and_is_small():
-    check_prior_folder(BUNDLED_PRIOR, needs_controlnet=True)
-    prior = load_prior()
-    assert prior.image_size == (64, 64) and prior.controlnet is not None
-    assert sum(path.stat().st_size for path in BUNDLED_PRIOR.rglob("*")) < 25e6
-    words = prior.tokenizer.tokenize("A photo of a moving human, a street light")
+def test_bundled_base_model_loads_and_is_small():
+    check_base_model_folder(BUNDLED_BASE_MODEL, needs_controlnet=True)
+    base_model = load_base_model()
+    assert base_model.image_size == (64, 64) and base_model.controlnet is not None
+    assert sum(path.stat().st_size for path in BUNDLED_BASE_MODEL.rglob("*")) < 25e6
+    words = base_model.tokenizer.tokenize("A photo of a moving human, a street light")
     assert "human</w>" in words and "street</w>" in words
 
 
-def test_written_folder_does_not_tell_where_the_prior_was(tmp_path):
-    shutil.copytree(BUNDLED_PRIOR, tmp_path / "elsewhere")
-    save_prior(load_prior(), tmp_path / "first")
-    save_prior(load_prior(tmp_path / "elsewhere"), tmp_path / "second")
+def test_written_folder_does_not_tell_where_the_base_model_was(tmp_path):
+    shutil.copytree(BUNDLED_BASE_MODEL, tmp_path / "elsewhere")
+    save_base_model(load_base_model(), tmp_path / "first")
+    save_base_model(load_base_model(tmp_path / "elsewhere"), tmp_path / "second")
     for file in (tmp_path / "first").rglob("*"):
         if file.is_file():
             again = tmp_path / "second" / file.relative_to(tmp_path / "first")

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.events.windows import spread
-from ctlev_core.scoring.memorisation import CLOSEST_PAIRS, CopyCheck, check_copies, small_pictures
+from ctlev_core.scoring.memorisation import CLOSEST_PAIRS, MemorisationCheck, check_memorisation, small_pictures
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
 from data_contracts.errors import DataError
@@ -25,16 +25,17 @@ PICTURES = "small pictures"
 
 
 @stage(version=1, schema=tables.SCORES)
-def copy_check(
+def memorisation(
     out: Output,
     frames: Manifest,
     generated: Manifest,
     extractor: Manifest | None,
     *,
     downstream: DownstreamChoice | None,
-    setting: str,
+    subject: str,
 ) -> pa.Table:
-    """Rows of the task `copies`, one group for small pictures and, with a feature extractor, one for its features.
+    """Rows of the task `memorisation`, one group for small pictures and, with a feature extractor, one for its
+    features.
 
     Other real frames are the training frames against those of other recordings; where all training frames are of one
     recording, the test frames. The closest pairs lie beside the table.
@@ -46,7 +47,8 @@ def copy_check(
     other = other[spread(len(other), MAX_OTHER_FRAMES)]
     if not len(learnt) or not len(made) or not len(other):
         raise DataError(
-            f"copies: needs training, other real and generated frames, got {len(learnt)}, {len(other)} and {len(made)}"
+            f"memorisation: needs training, other real and generated frames, got {len(learnt)}, {len(other)} "
+            f"and {len(made)}"
         )
     ways: dict[str, Callable[[np.ndarray], np.ndarray]] = {PICTURES: small_pictures}
     if extractor is not None and downstream is not None:
@@ -55,7 +57,7 @@ def copy_check(
     scores: list[dict[str, Any]] = []
     pairs: list[dict[str, Any]] = []
     for name, features_of in ways.items():
-        found = check_copies(
+        found = check_memorisation(
             features_of(np.asarray(generated.array("frames")[made])),
             features_of(np.asarray(frames.array("frames")[learnt])),
             features_of(np.asarray(frames.array("frames")[other])),
@@ -63,13 +65,13 @@ def copy_check(
             real_recordings=recordings[other],
         )
         digest = extractor.ref.digest if extractor is not None and name != PICTURES else ""
-        same = {"setting": setting, "group": name, "num_train": len(learnt), "model_digest": digest}
+        same = {"subject": subject, "group": name, "num_train": len(learnt), "model_digest": digest}
         scores += _scores(found, same | {"data_digest": generated.ref.digest})
         for of_made, of_learnt, distance in found.closest(NUM_PAIRS):
             rows = int(made[of_made]), int(learnt[of_learnt])
             pairs.append(
                 {
-                    "setting": setting,
+                    "subject": subject,
                     "features": name,
                     "generated_id": generated.table["sample_id"][rows[0]].as_py(),
                     "training_id": frames.table["sample_id"][rows[1]].as_py(),
@@ -83,7 +85,7 @@ def copy_check(
     return pa.Table.from_pylist(scores, schema=tables.SCORES.arrow())
 
 
-def _scores(found: CopyCheck, same: dict[str, Any]) -> list[dict[str, Any]]:
+def _scores(found: MemorisationCheck, same: dict[str, Any]) -> list[dict[str, Any]]:
     values = {
         "close_share": (found.close_share, found.low, found.high),
         "duplicates": (float(found.num_duplicates), np.nan, np.nan),
@@ -91,7 +93,7 @@ def _scores(found: CopyCheck, same: dict[str, Any]) -> list[dict[str, Any]]:
     }
     return [
         {
-            "task": "copies",
+            "task": "memorisation",
             "seed": 0,
             "metric": metric,
             "value": value,

@@ -1,25 +1,25 @@
-"""The prior of the text route knows what things are called."""
+"""The base model of the text route knows what things are called."""
 
 import numpy as np
 import pytest
 import torch
 
 from ctlev_core.diffusion.denoising import NoiseSchedule, generator_for
-from ctlev_core.diffusion.pretrained.loading import load_prior
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_PRIOR, BUNDLED_PRIOR
+from ctlev_core.diffusion.pretrained.loading import load_base_model
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, BUNDLED_OBJECT_MODEL
 from ctlev_core.diffusion.pretraining import picture_styles, procedural_images
 from ctlev_core.diffusion.pretraining.pretraining import Row, make_batch
 from ctlev_core.generators import stable_diffusion
 from ctlev_core.studio.object_drawing import draw_object
 from ctlev_core.studio.objects import NAMES, OBJECTS
 
-LINES = picture_styles.Diet(styles={"lines": 1.0})
+LINES = picture_styles.DataMixture(styles={"lines": 1.0})
 NOUNS = tuple(NAMES)
 
 
 @pytest.fixture(scope="module")
-def prior():
-    return load_prior(BUNDLED_OBJECT_PRIOR)
+def base_model():
+    return load_base_model(BUNDLED_OBJECT_MODEL)
 
 
 def drawings(seed):
@@ -33,40 +33,40 @@ def drawings(seed):
     return rows
 
 
-def errors(prior, pictures, captions, timestep):
+def errors(base_model, pictures, captions, timestep):
     """Squared error of each picture's latents as the U-Net finds them under noise."""
     batch = make_batch(
-        prior, [Row(picture, caption, None) for picture, caption in zip(pictures, captions, strict=True)]
+        base_model, [Row(picture, caption, None) for picture, caption in zip(pictures, captions, strict=True)]
     )
     noise = torch.randn(batch.latents.shape, generator=generator_for(7))
     timesteps = torch.full((len(pictures),), timestep)
-    noisy, latents = NoiseSchedule(prior.scheduler_config).noised(batch.latents, noise, timesteps)
+    noisy, latents = NoiseSchedule(base_model.scheduler_config).noised(batch.latents, noise, timesteps)
     with torch.no_grad():
-        found = prior.unet(noisy, timesteps, encoder_hidden_states=batch.embeddings).sample
+        found = base_model.unet(noisy, timesteps, encoder_hidden_states=batch.embeddings).sample
     return (found - latents).square().mean(dim=(1, 2, 3)).numpy()
 
 
-def test_the_text_route_starts_from_it_and_it_is_small(prior):
-    assert stable_diffusion.prior_folders(stable_diffusion.Options()) == [BUNDLED_OBJECT_PRIOR]
-    assert prior.controlnet is None and prior.image_size == (64, 64)
-    sizes = [path.stat().st_size for place in (BUNDLED_PRIOR, BUNDLED_OBJECT_PRIOR) for path in place.rglob("*")]
+def test_the_text_route_starts_from_it_and_it_is_small(base_model):
+    assert stable_diffusion.base_model_folders(stable_diffusion.Options()) == [BUNDLED_OBJECT_MODEL]
+    assert base_model.controlnet is None and base_model.image_size == (64, 64)
+    sizes = [path.stat().st_size for place in (BUNDLED_BASE_MODEL, BUNDLED_OBJECT_MODEL) for path in place.rglob("*")]
     assert sum(sizes) < 40e6
 
 
 @pytest.mark.parametrize("timestep", [500, 650, 999])
-def test_own_names_help_and_others_do_not(prior, timestep):
+def test_own_names_help_and_others_do_not(base_model, timestep):
     """Of 48 drawings: far fewer could have smaller errors with another's name if names said nothing."""
     pictures = drawings(3)
-    own = errors(prior, pictures, [f"A photo of {noun}" for noun in 2 * NOUNS], timestep)
-    other = errors(prior, pictures, [f"A photo of {noun}" for noun in 2 * (NOUNS[5:] + NOUNS[:5])], timestep)
+    own = errors(base_model, pictures, [f"A photo of {noun}" for noun in 2 * NOUNS], timestep)
+    other = errors(base_model, pictures, [f"A photo of {noun}" for noun in 2 * (NOUNS[5:] + NOUNS[:5])], timestep)
     assert other.mean() > 1.02 * own.mean()
     assert (own < other).mean() > 0.75
 
 
-def test_all_names_of_a_thing_are_known(prior):
+def test_all_names_of_a_thing_are_known(base_model):
     pictures = drawings(4)
-    own = errors(prior, pictures, [f"A photo of {NAMES[noun][-1]}" for noun in 2 * NOUNS], 650)
-    other = errors(prior, pictures, [f"A photo of {NAMES[noun][-1]}" for noun in 2 * (NOUNS[5:] + NOUNS[:5])], 650)
+    own = errors(base_model, pictures, [f"A photo of {NAMES[noun][-1]}" for noun in 2 * NOUNS], 650)
+    other = errors(base_model, pictures, [f"A photo of {NAMES[noun][-1]}" for noun in 2 * (NOUNS[5:] + NOUNS[:5])], 650)
     assert (own < other).mean() > 0.65
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctlev_core.scoring import memorisation
-from ctlev_core.scoring.memorisation import check_copies, nearest_rows, small_pictures
+from ctlev_core.scoring.memorisation import check_memorisation, nearest_rows, small_pictures
 
 
 def slow_nearest(rows, references, row_groups=None, reference_groups=None):
@@ -74,7 +74,7 @@ def recordings(count, per_recording=10):
 def test_a_generator_that_does_not_copy_has_1_percent_of_close_frames():
     rng = np.random.default_rng(1)
     training, generated = rng.standard_normal((3000, 4)), rng.standard_normal((3000, 4))
-    found = check_copies(
+    found = check_memorisation(
         generated, training, training, training_recordings=recordings(3000), real_recordings=recordings(3000)
     )
     # Tolerance: four standard deviations of a binomial share of 3,000, of both sets.
@@ -87,7 +87,7 @@ def test_copies_are_found_and_shown():
     training, generated = rng.standard_normal((400, 8)), rng.standard_normal((300, 8))
     generated[40:100] = training[100:160]
     generated[100:130] = training[200:230] + 1e-3
-    found = check_copies(
+    found = check_memorisation(
         generated, training, training, training_recordings=recordings(400), real_recordings=recordings(400)
     )
     assert found.num_duplicates == 60
@@ -101,7 +101,7 @@ def test_copies_are_found_and_shown():
 def test_closest_pairs_show_a_training_frame_once():
     training = np.arange(6.0)[:, None] * 100
     generated = np.concatenate([np.full((5, 1), 1.0), [[203.0]]])
-    found = check_copies(
+    found = check_memorisation(
         generated, training, training, training_recordings=list("abcdef"), real_recordings=list("abcdef")
     )
     assert found.closest(4) == [(0, 0, 1.0), (5, 2, 3.0)]
@@ -110,7 +110,7 @@ def test_closest_pairs_show_a_training_frame_once():
 def test_a_real_frame_is_not_compared_with_its_own_recording():
     """Ten equal frames a recording, recordings 1 apart: 0 within, 1 across."""
     training = np.repeat(np.arange(5.0), 10)[:, None]
-    found = check_copies(
+    found = check_memorisation(
         training, training, training, training_recordings=recordings(50), real_recordings=recordings(50)
     )
     assert (found.real_distances == 1).all() and found.threshold == 1
@@ -119,12 +119,12 @@ def test_a_real_frame_is_not_compared_with_its_own_recording():
 
 def test_constant_frames_and_single_rows():
     constant = np.ones((6, 3))
-    found = check_copies(
+    found = check_memorisation(
         constant, constant, constant, training_recordings=list("aabbcc"), real_recordings=list("aabbcc")
     )
     # Real frames of other recordings are as equal: no frame is nearer than those, and duplicates are counted apart.
     assert found.close_share == 0 and found.num_duplicates == 6 and np.isnan(found.ratio)
-    single = check_copies(
+    single = check_memorisation(
         np.zeros((1, 3)), np.ones((1, 3)), np.ones((1, 3)) * 2, training_recordings=["a"], real_recordings=["b"]
     )
     assert (
@@ -138,7 +138,7 @@ def test_wrong_features_are_refused():
     bad[2, 1] = np.nan
 
     def check(generated, training):
-        check_copies(generated, training, good, training_recordings=list("abcd"), real_recordings=list("abcd"))
+        check_memorisation(generated, training, good, training_recordings=list("abcd"), real_recordings=list("abcd"))
 
     with pytest.raises(ValueError, match="first is row 2"):
         check(bad, good)
@@ -149,9 +149,9 @@ def test_wrong_features_are_refused():
     with pytest.raises(ValueError, match="0"):
         check(good[:0], good)
     with pytest.raises(ValueError, match="row 0 has no reference of another group"):
-        check_copies(good, good, good, training_recordings=["a"] * 4, real_recordings=["a"] * 4)
+        check_memorisation(good, good, good, training_recordings=["a"] * 4, real_recordings=["a"] * 4)
     with pytest.raises(ValueError, match=r"groups must be \[4\]"):
-        check_copies(good, good, good, training_recordings=["a"], real_recordings=["a"] * 4)
+        check_memorisation(good, good, good, training_recordings=["a"], real_recordings=["a"] * 4)
 
 
 def test_small_pictures_forgive_a_shift():

@@ -2,7 +2,7 @@
 
 What is refused follows from real training frames: for each number below the range of their central 98 %, its odds
 widened on either side by a factor, so that a real frame practically always passes and only gross failures are refused.
-A gate that is any narrower would choose which images are liked, and make scores of the generator better than it is.
+A filter that is any narrower would choose which images are liked, and make scores of the generator better than it is.
 
     active_share    pixels whose largest channel is at least 26 of 255
     brightness      mean of the largest channel, over 255
@@ -11,7 +11,7 @@ A gate that is any narrower would choose which images are liked, and make scores
                     largest and smallest channel, over the sum of the largest. Real frames have 0; what a decoder adds
                     is let pass up to `MAX_OFF_PALETTE`
 
-A refused row is sampled again with a seed that follows from its own (`seed_of_try`), so that every row can still be
+A refused row is sampled again with a seed that follows from its own (`seed_of_attempt`), so that every row can still be
 made again alone, whatever happened to the others.
 """
 
@@ -37,7 +37,7 @@ _CAUSES = {
 
 
 @dataclass(frozen=True)
-class ImageGate:
+class QualityFilter:
     """The range that each number of an image must lie in, both ends included."""
 
     polarity: bool
@@ -45,23 +45,23 @@ class ImageGate:
 
 
 @dataclass(frozen=True, eq=False)
-class GatedImages:
+class FilteredImages:
     """Images that passed, or did not in the tries they had.
 
     Attributes:
         frames: [N, H, W, 3] uint8, the last try of each row.
         seeds: the seed each was made from.
-        num_tries: how often each was sampled.
+        num_attempts: how often each was sampled.
         causes: why the last try was refused; empty for those that passed.
     """
 
     frames: np.ndarray
     seeds: list[int]
-    num_tries: list[int]
+    num_attempts: list[int]
     causes: list[str]
 
 
-def fit_gate(frames: np.ndarray, *, polarity: bool) -> ImageGate:
+def fit_quality_filter(frames: np.ndarray, *, polarity: bool) -> QualityFilter:
     """The ranges of real training frames.
 
     Args:
@@ -73,7 +73,7 @@ def fit_gate(frames: np.ndarray, *, polarity: bool) -> ImageGate:
     """
     numbers = measure_images(frames, polarity=polarity)
     if not len(frames) or not numbers["active_share"].any():
-        raise DataError(f"a gate needs real frames that are not black, got {len(frames)} frames")
+        raise DataError(f"a quality filter needs real frames that are not black, got {len(frames)} frames")
     ranges = {}
     for name, values in numbers.items():
         low, high = np.quantile(values, [0.01, 0.99])
@@ -81,7 +81,7 @@ def fit_gate(frames: np.ndarray, *, polarity: bool) -> ImageGate:
     ranges["off_palette"] = (0.0, max(MAX_OFF_PALETTE, ranges["off_palette"][1]))
     # Too few bright pixels are no failure while the image as a whole is bright enough.
     ranges["bright_share"] = (0.0, ranges["bright_share"][1])
-    return ImageGate(polarity, ranges)
+    return QualityFilter(polarity, ranges)
 
 
 def measure_images(frames: np.ndarray, *, polarity: bool) -> dict[str, np.ndarray]:
@@ -107,12 +107,12 @@ def _scale_odds(share: float, factor: float) -> float:
     return share * factor / (1 - share + share * factor)
 
 
-def find_causes(frames: np.ndarray, gate: ImageGate) -> list[str]:
+def find_causes(frames: np.ndarray, quality_filter: QualityFilter) -> list[str]:
     """Why each image [N, H, W, 3] uint8 is refused: the first number that is out of its range; empty = it passes."""
-    numbers = measure_images(frames, polarity=gate.polarity)
+    numbers = measure_images(frames, polarity=quality_filter.polarity)
     causes = [""] * len(frames)
     for row in range(len(frames)):
-        for name, (low, high) in gate.ranges.items():
+        for name, (low, high) in quality_filter.ranges.items():
             value = numbers[name][row]
             if not low <= value <= high:
                 cause = _CAUSES[name][int(value > high)]
@@ -121,42 +121,46 @@ def find_causes(frames: np.ndarray, gate: ImageGate) -> list[str]:
     return causes
 
 
-def seed_of_try(seed: int, number: int) -> int:
+def seed_of_attempt(seed: int, number: int) -> int:
     """The seed of a row's first try (0) is its own; those of later ones follow from it. 32 bits."""
     return seed if number == 0 else int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
 def sample_until_accepted(
-    sample: Callable[[np.ndarray, Sequence[int]], np.ndarray], seeds: Sequence[int], gate: ImageGate, *, max_tries: int
-) -> GatedImages:
-    """Sample every row, and again those that the gate refuses.
+    sample: Callable[[np.ndarray, Sequence[int]], np.ndarray],
+    seeds: Sequence[int],
+    quality_filter: QualityFilter,
+    *,
+    max_attempts: int,
+) -> FilteredImages:
+    """Sample every row, and again those that the quality filter rejects.
 
     Args:
         sample: frames [n, H, W, 3] uint8 of the rows with these numbers [n] and these n seeds; a frame depends on its
             row and seed alone.
         seeds: of each row, N >= 1.
-        gate: from `fit_gate`.
-        max_tries: of a row, at least 1; then its last frame is kept, with the cause.
+        quality_filter: from `fit_quality_filter`.
+        max_attempts: of a row, at least 1; then its last frame is kept, with the cause.
     Raises:
         ValueError: no row, or no try is allowed.
     """
-    if max_tries < 1 or not len(seeds):
-        raise ValueError(f"expected rows and at least one try, got {len(seeds)} rows and {max_tries} tries")
+    if max_attempts < 1 or not len(seeds):
+        raise ValueError(f"expected rows and at least one try, got {len(seeds)} rows and {max_attempts} tries")
     used = list(seeds)
-    num_tries, causes = [0] * len(used), [""] * len(used)
+    num_attempts, causes = [0] * len(used), [""] * len(used)
     frames: np.ndarray | None = None
     rows = list(range(len(used)))
-    for number in range(max_tries):
+    for number in range(max_attempts):
         for row in rows:
-            used[row], num_tries[row] = seed_of_try(seeds[row], number), number + 1
+            used[row], num_attempts[row] = seed_of_attempt(seeds[row], number), number + 1
         made = sample(np.array(rows), [used[row] for row in rows])
         if frames is None:
             frames = np.array(made)
         else:
             frames[rows] = made
-        for row, cause in zip(rows, find_causes(made, gate), strict=True):
+        for row, cause in zip(rows, find_causes(made, quality_filter), strict=True):
             causes[row] = cause
         rows = [row for row in rows if causes[row]]
         if not rows:
             break
-    return GatedImages(np.asarray(frames), used, num_tries, causes)
+    return FilteredImages(np.asarray(frames), used, num_attempts, causes)

@@ -17,13 +17,13 @@ _CAPTION = (
 )
 
 
-def copy_sections(frames: Manifest, generated: Sequence[Manifest], copies: Sequence[Manifest]) -> list[Section]:
+def memorisation_sections(frames: Manifest, generated: Sequence[Manifest], copies: Sequence[Manifest]) -> list[Section]:
     """One table for all generators, and the closest pairs of the first of them.
 
     Args:
         frames: with the training frames.
         generated: frames of each generator.
-        copies: what `tasks.copy_check` found for each.
+        copies: what `tasks.memorisation` found for each.
     """
     rows = [row for manifest in copies for row in manifest.table.to_pylist()]
     if not rows:
@@ -38,18 +38,18 @@ def copy_sections(frames: Manifest, generated: Sequence[Manifest], copies: Seque
         ]
         names = [f"{pair['distance'] / pair['threshold']:.2f}" if pair["threshold"] else "0" for pair in shown]
         caption = "The pairs that lie closest; above each its distance over that of the closest 1 % of real frames."
-        sections.append(ImageGrid(f"Closest pairs: {shown[0]['setting']}, {features}", images, names, caption))
+        sections.append(ImageGrid(f"Closest pairs: {shown[0]['subject']}, {features}", images, names, caption))
     return sections
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> Table:
     """Generators down, what was compared and how across."""
-    cells = {(row["setting"], row["group"], row["metric"]): row for row in rows}
+    cells = {(row["subject"], row["group"], row["metric"]): row for row in rows}
     columns = list(dict.fromkeys((row["group"], row["metric"]) for row in rows))
     body: list[list[str]] = []
-    for setting in dict.fromkeys(row["setting"] for row in rows):
-        found = [cells.get((setting, *column)) for column in columns]
-        body.append([setting, *("" if cell is None else _text(cell) for cell in found)])
+    for subject in dict.fromkeys(row["subject"] for row in rows):
+        found = [cells.get((subject, *column)) for column in columns]
+        body.append([subject, *("" if cell is None else _text(cell) for cell in found)])
     return Table(
         "Does it copy?", ["frames", *(f"{metric}, {group}" for group, metric in columns)], body, caption=_CAPTION
     )
