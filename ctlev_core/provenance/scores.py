@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -67,7 +68,10 @@ def trace_lineage(scores: Sequence[tuple[str, pa.Table]], records: Sequence[Reco
             "training_digests": [one.digest for one in learnt],
             "checkpoint_digests": sorted({one.digest for set_ in learnt for one in _of(records, set_, "finetune")}),
             "recordings_digests": sorted({one.digest for one in _of(records, record, "ingest")}),
-            "config_digest": digest_of(sorted([one.stage, sorted(options_of(one).items())] for one in origin)),
+            # By text: an option can be a number in one stage and null in another.
+            "config_digest": digest_of(
+                sorted(json.dumps([one.stage, options_of(one)], sort_keys=True) for one in origin)
+            ),
             "code_digest": digest_of(versions_of(origin)),
         }
         columns = {name: table[name] for name in table.column_names}

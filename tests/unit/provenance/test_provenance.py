@@ -111,6 +111,20 @@ def test_missing_records_and_inputs_are_named(store):
         records_of(store)
 
 
+def test_an_option_that_is_null_in_one_of_two_runs_of_a_stage_is_traced(store):
+    scores = pa.concat_tables([score_rows(5.0)])
+    digests = []
+    for rate in (None, 0.5, 0.25):
+        records = records_of(store)
+        twice = [replace(one, arguments={"a": 1, "rate": rate}) for one in records if one.key == "0a"]
+        twice += [replace(one, key="0z", arguments={"a": 1, "rate": 0.5}) for one in records if one.key == "0a"]
+        others = [replace(one, upstream=one.upstream | {"0z": "x"}) for one in records if one.key == "0b"]
+        rest = [one for one in records if one.key not in ("0a", "0b")]
+        table = trace_lineage([("0f", scores)], [*rest, *others, *twice])
+        digests.append(table["config_digest"][0].as_py())
+    assert len(set(digests)) == 3
+
+
 def test_costs_are_added_up_by_stage_the_dearest_first(store):
     found = records_of(store)
     table = cost_table(found)
