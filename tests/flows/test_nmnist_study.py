@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flow_scripts import artefacts, run_script
+from flow_scripts import artefacts, plan_script, run_script
 
 DIGITS = ("zero", "one", "seven")
 SMALL = """
@@ -99,11 +99,11 @@ def test_the_study_runs_and_tells_every_row(data, tmp_path):
 
 
 def test_other_recordings_may_be_tested(data, tmp_path):
-    finished = run_script(
+    finished = plan_script(
         "full_experiment", *asked(data, "--set", f"paths.test={data / 'apart'}", "--dry-run"), home=tmp_path
     )
     assert finished.status == 0, finished.errors
-    plain = run_script("full_experiment", *asked(data, "--dry-run"), home=tmp_path)
+    plain = plan_script("full_experiment", *asked(data, "--dry-run"), home=tmp_path)
     trained = [label for label in plain.plan if label.startswith("pretrain")]
     assert trained and all(plain.plan[label] == finished.plan[label] for label in trained)
     assert plain.plan.keys() == finished.plan.keys() and plain.plan != finished.plan
@@ -122,6 +122,6 @@ def test_other_recordings_may_be_tested(data, tmp_path):
     ],
 )
 def test_what_is_missing_is_said_before_anything_runs(data, tmp_path, change, message):
-    finished = run_script("full_experiment", *asked(data, "--set", change), home=tmp_path)
+    finished = plan_script("full_experiment", *asked(data, "--set", change), home=tmp_path)
     assert finished.status == 2 and message in finished.errors
     assert not (tmp_path / "artefacts").exists()
