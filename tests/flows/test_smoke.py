@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import sqlite3
-import statistics
 import subprocess
 import sys
 import time
@@ -168,8 +167,10 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
     for _ in range(3):  # interleaved, because the machine's speed drifts
         cached = seconds([*again, "--home", str(smoke_home)], cwd=smoke_home, env=environment)
         differences.append(cached - seconds(bare, cwd=smoke_home, env=environment | quiet))
+        if sum(difference < 5 for difference in differences) == 2:
+            break  # which is the median, whatever the third is
     assert digests(smoke_home) == before
-    assert statistics.median(differences) < 5, differences
+    assert sorted(differences)[1] < 5, differences
     # Prefect's record of the last of them.
     query = """
         SELECT artifact.data FROM artifact JOIN flow_run ON flow_run.id = artifact.flow_run_id
