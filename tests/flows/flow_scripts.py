@@ -13,10 +13,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from data_contracts.manifest import Manifest, ManifestRef, read_manifest
+from tasks.stage import in_one_run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REAL_RECORDINGS = REPOSITORY.parent / "shared" / "real" / "events"
@@ -73,15 +75,31 @@ def plan_script(name: str, *arguments: str, home: Path) -> Finished:
 
     Scripts take seconds to start; a few tests start them for the same.
     """
+    return _here(name, arguments, home)
+
+
+def run_script_here(name: str, *arguments: str, home: Path) -> Finished:
+    """Run a flow script to its end in this process, its stages one after the other and not as tasks of Prefect.
+
+    For what is the same however a script is run: what its stages make of data and options.
+    """
+    with pytest.MonkeyPatch.context() as patch, in_one_run():
+        patch.setattr("tasks.stage._run_as_task", lambda stage, label, key, arguments: stage.run(key, arguments)[0])
+        return _here(name, arguments, home, connected=contextlib.nullcontext, with_plan=lambda flow, *_: flow.fn)
+
+
+def _here(name: str, arguments: tuple[str, ...], home: Path, **patches: Any) -> Finished:
     home.mkdir(parents=True, exist_ok=True)
     output, errors = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CTLEV_HOME", str(home))
-        from flows import local_server  # here, because flows take the home from the environment
-
         patch.setattr(sys, "argv", [f"{name}.py", "--home", str(home), *arguments])
+        from flows import command_line, local_server, settings  # here, because flows take the home from these
+
+        patch.setattr(settings, "HOME", home)
         patch.setattr(local_server, "start", lambda home: None)
-        patch.setattr(local_server, "connected", _not_reached)
+        patch.setattr(local_server, "connected", patches.get("connected", _not_reached))
+        patch.setattr(command_line, "with_plan", patches.get("with_plan"))
         with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors), pytest.raises(SystemExit) as end:
             runpy.run_path(str(REPOSITORY / "flows" / f"{name}.py"), run_name="__main__")
     return Finished(int(end.value.code or 0), output.getvalue(), errors.getvalue())

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from flow_scripts import digests, plan_script, run_script
+from flow_scripts import digests, plan_script, run_script, run_script_here
 
 from data_contracts.events import Events
 
@@ -101,7 +101,7 @@ def test_unknown_extension_and_truncated_file(tmp_path):
     make_recording(root / "b" / "two.raw")
     content = (root / "b" / "two.raw").read_bytes()
     (root / "b" / "two.raw").write_bytes(content[:-3])
-    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}", run=run_script)
+    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}", run=run_script_here)
     assert "two.raw" in line
 
 
@@ -139,7 +139,7 @@ def test_events_that_break_their_promises(tmp_path, column, change, expected):
 
     values = pq.read_table(root / "b" / "two.parquet")[column].to_numpy()
     parquet_recording(root / "b" / "two.parquet", **{column: change(values)})
-    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}", run=run_script)
+    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}", run=run_script_here)
     assert expected in line and "two" in line
 
 
