@@ -1,11 +1,11 @@
-"""The study on real recordings, from pictures to its page, on files that this test writes: as a user would run it."""
+"""The study on real recordings, from pictures to its page, on files that this test writes."""
 
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from flow_scripts import artefacts, plan_script, run_script
+from flow_scripts import artefacts, plan_script, run_script_here
 
 DIGITS = ("zero", "one", "seven")
 SMALL = """
@@ -80,7 +80,7 @@ def asked(data, *further):
 
 
 def test_the_study_runs_and_tells_every_row(data, tmp_path):
-    finished = run_script("full_experiment", *asked(data), home=tmp_path)
+    finished = run_script_here("full_experiment", *asked(data), home=tmp_path)
     assert finished.status == 0, finished.errors
     (base,) = artefacts(tmp_path, "pretrain_prior")
     assert (base.ref.path / "prior" / "unet").is_dir(), "one base model for all draws and generators"

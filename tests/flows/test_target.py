@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from flow_scripts import artefacts, digests, plan_script, run_script
+from flow_scripts import artefacts, digests, plan_script, run_script_here
 from test_object_datasets import CLASSES, n_caltech101, n_imagenet, only
 
 from ctlev_core.generators import stable_diffusion
@@ -34,7 +34,7 @@ def made(tmp_path_factory):
     alone = plan_script("full_experiment", "--preset", "n_imagenet", *options, "--dry-run", home=folder / "home")
     assert alone.status == 0, alone.errors
     options += ["--set", target, "--set", "metrics=[{name: zero_shot}]"]
-    finished = run_script("full_experiment", "--preset", "n_imagenet", *options, home=folder / "home")
+    finished = run_script_here("full_experiment", "--preset", "n_imagenet", *options, home=folder / "home")
     assert finished.status == 0, finished.errors
     return folder / "home", alone.plan
 
