@@ -147,7 +147,7 @@ def test_what_was_computed_stays(smoke_home, tmp_path):
     home = shutil.copytree(smoke_home, tmp_path / "home")
     before = digests(home)
     refused(home, "--set", "generator.options.batch_size=0", preset="smoke")
-    line, _ = refused(home, "--set", "encoding.options.image_size=[48,48]", preset="smoke")
+    line, _ = refused(home, "--set", "encoding.options.image_size=[48,48]", preset="smoke", run=run_script_here)
     assert "the size this prior was trained on" in line
     assert before.items() <= digests(home).items()
     assert not list((home / "tmp").iterdir())
