@@ -25,11 +25,11 @@ def server(home: Path) -> Iterator[str]:
         from flows import local_server
 
         local_server.start(home)
-    try:
         with local_server.connected():
             from prefect.settings import PREFECT_API_URL
 
             url = PREFECT_API_URL.value()
+    try:
         yield url
     finally:
         local_server.stop()

@@ -35,7 +35,9 @@ def test_a_folder_that_holds_something_else_is_refused_before_anything_is_sample
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "thesis.txt").write_text("years of work")
-    finished = plan_script("synthesize", "--preset", "smoke", "--set", f"export_folder={folder}", home=tmp_path / "home")
+    finished = plan_script(
+        "synthesize", "--preset", "smoke", "--set", f"export_folder={folder}", home=tmp_path / "home"
+    )
     assert finished.status == 2
     (line,) = [line for line in finished.errors.splitlines() if line.startswith("error: ")]
     assert str(folder) in line

@@ -269,9 +269,7 @@ def test_killed_runs_end_in_the_same_digests(smoke_home, tmp_path):
     """`kill -9` at random moments, then a rerun: nothing half-written, every digest as in the undisturbed run."""
     random = np.random.default_rng(20261121)
     for _ in range(4):
-        process = script(
-            "full_experiment", "--preset", "smoke", home=tmp_path, own_server=True, start_new_session=True
-        )
+        process = script("full_experiment", "--preset", "smoke", home=tmp_path, own_server=True, start_new_session=True)
         try:
             process.wait(timeout=float(random.uniform(8, 35)))
         except subprocess.TimeoutExpired:
