@@ -34,7 +34,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
-from scipy.stats import t as student
 
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from ctlev_core.statistics.paired_differences import NUM_RESAMPLES, Difference
@@ -423,6 +422,8 @@ def _interval(
 
 
 def _quantile(freedom: float) -> float:
+    from scipy.stats import t as student  # here, because a cached run needs no scipy
+
     return float(student.ppf(_LEVEL, freedom)) if math.isfinite(freedom) else _NORMAL
 
 

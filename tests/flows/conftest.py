@@ -1,14 +1,50 @@
-"""A finished smoke run for the tests of the flows."""
+"""What the tests of the flows share: a Prefect server and a finished smoke run."""
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import functools
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
+import flow_scripts
 import pytest
 from flow_scripts import run_script
+
+
+@contextlib.contextmanager
+def server(home: Path) -> Iterator[str]:
+    """The API of a Prefect server as scripts start it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PREFECT_HOME", str(home / "prefect"))
+        patch.setenv("PREFECT_LOGGING_LEVEL", "CRITICAL")
+        patch.delenv("PREFECT_API_URL", raising=False)
+        from flows import local_server
+
+        local_server.start(home)
+        with local_server.connected():
+            from prefect.settings import PREFECT_API_URL
+
+            url = PREFECT_API_URL.value()
+    try:
+        yield url
+    finally:
+        local_server.stop()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A server for all scripts, from the first one on."""
+    with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
+
+        def start() -> str:
+            return stack.enter_context(server(tmp_path_factory.mktemp("server")))
+
+        patch.setattr(flow_scripts, "shared_server", functools.cache(start))
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -23,7 +59,7 @@ def smoke_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (run.parent / "finished_smoke_run.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not run.exists():
-            finished = run_script("full_experiment", "--preset", "smoke", home=own)
+            finished = run_script("full_experiment", "--preset", "smoke", home=own, own_server=True)
             assert finished.status == 0, finished.errors
             (own / "first_run.txt").write_text(finished.output)
             shutil.copytree(own, run.with_name("unfinished_copy"), symlinks=True)

@@ -5,14 +5,14 @@ import time
 
 import numpy as np
 import pytest
-from flow_scripts import digests, run_script
+from flow_scripts import digests, plan_script, run_script, run_script_here
 
 from data_contracts.events import Events
 
 
-def refused(home, *arguments, preset="folder"):
+def refused(home, *arguments, preset="folder", run=plan_script, **how):
     started = time.monotonic()
-    finished = run_script("full_experiment", "--preset", preset, *arguments, home=home)
+    finished = run("full_experiment", "--preset", preset, *arguments, home=home, **how)
     assert finished.status == 2, finished.errors
     (line,) = [line for line in finished.errors.splitlines() if line.startswith("error: ")]
     assert "Traceback" not in finished.errors
@@ -55,7 +55,7 @@ def test_wrong_command_line(tmp_path, arguments, expected):
 
 
 def test_wrong_option_stops_a_real_run_too(tmp_path):
-    line, _ = refused(tmp_path, "--set", "num_synthetic=-5", preset="smoke")
+    line, _ = refused(tmp_path, "--set", "num_synthetic=-5", preset="smoke", run=run_script, own_server=True)
     assert "option 'num_synthetic': input should be greater than 0, got -5" in line
     assert not (tmp_path / "artefacts").exists()
 
@@ -101,7 +101,7 @@ def test_unknown_extension_and_truncated_file(tmp_path):
     make_recording(root / "b" / "two.raw")
     content = (root / "b" / "two.raw").read_bytes()
     (root / "b" / "two.raw").write_bytes(content[:-3])
-    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}")
+    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}", run=run_script_here)
     assert "two.raw" in line
 
 
@@ -139,7 +139,7 @@ def test_events_that_break_their_promises(tmp_path, column, change, expected):
 
     values = pq.read_table(root / "b" / "two.parquet")[column].to_numpy()
     parquet_recording(root / "b" / "two.parquet", **{column: change(values)})
-    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}")
+    line, _ = refused(tmp_path / "home", "--set", f"dataset.options.root={root}", run=run_script_here)
     assert expected in line and "two" in line
 
 
@@ -147,7 +147,7 @@ def test_what_was_computed_stays(smoke_home, tmp_path):
     home = shutil.copytree(smoke_home, tmp_path / "home")
     before = digests(home)
     refused(home, "--set", "generator.options.batch_size=0", preset="smoke")
-    line, _ = refused(home, "--set", "encoding.options.image_size=[48,48]", preset="smoke")
+    line, _ = refused(home, "--set", "encoding.options.image_size=[48,48]", preset="smoke", run=run_script_here)
     assert "the size this base model was trained on" in line
     assert before.items() <= digests(home).items()
     assert not list((home / "tmp").iterdir())

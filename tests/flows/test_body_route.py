@@ -2,7 +2,7 @@
 
 import pyarrow.parquet as pq
 import pytest
-from flow_scripts import artefacts, run_script
+from flow_scripts import artefacts, run_script_here
 
 SMALL = (
     "windows.max_windows=1",
@@ -19,7 +19,7 @@ def run(preset, home, num_label_only, *settings):
     counts = f"num_train_recordings: 4, num_test_recordings: 4, num_condition_recordings: {num_label_only}"
     asked = (f"dataset.options={{{counts}, joint_set: smpl}}", *settings, *SMALL)
     options = [word for setting in asked for word in ("--set", setting)]
-    finished = run_script("full_experiment", "--preset", preset, *options, home=home, timeout=550)
+    finished = run_script_here("full_experiment", "--preset", preset, *options, home=home)
     assert finished.status == 0, finished.errors
     scores = pq.read_table(home / "reports" / preset / "scores.parquet").to_pylist()
     return (home / "reports" / f"{preset}.html").read_text(), scores

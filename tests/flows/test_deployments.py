@@ -197,6 +197,7 @@ def ended(service, runs):
     return sorted((service.api(f"flow_runs/{run}") for run in runs), key=lambda run: run["start_time"] or "")
 
 
+@pytest.mark.slow
 def test_a_schedule_becomes_a_run(service, tmp_path):
     deployment = service.api("deployments/name/prepare-dataset/default")["id"]
     (made,) = schedule_once(service, deployment, tmp_path, after_s=86_400)

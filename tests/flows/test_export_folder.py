@@ -5,7 +5,7 @@ import re
 import cv2
 import numpy as np
 import pandas as pd
-from flow_scripts import artefacts, run_script
+from flow_scripts import artefacts, plan_script, run_script
 
 from ctlev_core.export.event_dataset import EventDataset
 
@@ -35,7 +35,9 @@ def test_a_folder_that_holds_something_else_is_refused_before_anything_is_sample
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "thesis.txt").write_text("years of work")
-    finished = run_script("synthesize", "--preset", "smoke", "--set", f"export_folder={folder}", home=tmp_path / "home")
+    finished = plan_script(
+        "synthesize", "--preset", "smoke", "--set", f"export_folder={folder}", home=tmp_path / "home"
+    )
     assert finished.status == 2
     (line,) = [line for line in finished.errors.splitlines() if line.startswith("error: ")]
     assert str(folder) in line

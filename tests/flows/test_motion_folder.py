@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from flow_scripts import run_script
+from flow_scripts import run_script_here
 
 from data_contracts.manifest import ManifestRef, read_manifest
 
@@ -28,7 +28,7 @@ def test_prepare_dataset(condition, tmp_path):
         f"num_synthetic={4 * len(CLASSES)}",
     )
     options = [word for setting in settings for word in ("--set", setting)]
-    finished = run_script("prepare_dataset", "--preset", "amass", *options, home=tmp_path)
+    finished = run_script_here("prepare_dataset", "--preset", "amass", *options, home=tmp_path)
     assert finished.status == 0, finished.errors
     (folder,) = (tmp_path / "artefacts" / "condition_samples").iterdir()
     conditions = read_manifest(ManifestRef(key=folder.name, path=folder))

@@ -1,4 +1,4 @@
-"""The presets of the object datasets on tiny trees in their published layouts, as a user would run them."""
+"""The presets of the object datasets on tiny trees in their published layouts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from flow_scripts import run_script
+from flow_scripts import run_script_here
 
 from data_contracts.manifest import ManifestRef, read_manifest
 
@@ -61,7 +61,7 @@ def test_prepare_dataset(write, classes, names, tmp_path):
     root.mkdir()
     write(root)
     arguments = ("--preset", write.__name__, "--set", f"dataset.options.root={root}", *SMALL)
-    finished = run_script("prepare_dataset", *arguments, home=home)
+    finished = run_script_here("prepare_dataset", *arguments, home=home)
     assert finished.status == 0, finished.errors
     frames = only(home, "encode")
     assert frames.array("frames").shape == (8, 64, 64, 3)

@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 import scipy.sparse
-from flow_scripts import run_script
+from flow_scripts import run_script_here
 
 from ctlev_core.body.layer import BUNDLED_BODY
 from ctlev_core.geometry.joint_sets import SMPL_PARENTS
@@ -78,7 +78,7 @@ def test_prepare_dataset(preset, write, condition, tmp_path):
         body = smpl(tmp_path / "basicModel_neutral_lbs_10_207_0_v1.0.0.pkl")
         settings = (*settings, f"condition.options={{body: {body}}}")
     options = [word for setting in settings for word in ("--set", setting)]
-    finished = run_script("prepare_dataset", "--preset", preset, *options, home=home)
+    finished = run_script_here("prepare_dataset", "--preset", preset, *options, home=home)
     assert finished.status == 0, finished.errors
     (folder,) = (home / "artefacts" / "condition_samples").iterdir()
     conditions = read_manifest(ManifestRef(key=folder.name, path=folder))

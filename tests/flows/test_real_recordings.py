@@ -1,7 +1,7 @@
 """The text route on real recordings: the published counts, and the whole chain."""
 
 import pytest
-from flow_scripts import REAL_RECORDINGS, run_script
+from flow_scripts import REAL_RECORDINGS, run_script_here
 
 from data_contracts.manifest import ManifestRef, read_manifest
 
@@ -26,7 +26,7 @@ def finished_home(tmp_path_factory, request):
     if not REAL_RECORDINGS.is_dir():
         pytest.skip("the real recordings are not beside this checkout")
     home = tmp_path_factory.mktemp("folder")
-    finished = run_script(
+    finished = run_script_here(
         "full_experiment", "--preset", "folder", "--set", f"dataset.options.root={REAL_RECORDINGS}", *SMALL, home=home
     )
     assert finished.status == 0, finished.errors

@@ -208,7 +208,7 @@ def test_pruning_keeps_what_the_versions_that_are_kept_refer_to(home, make_versi
 @pytest.mark.slow
 def test_a_script_killed_before_it_publishes_goes_on_with_its_version(home):
     arguments = ["--preset", "smoke", *(part for option in OPTIONS for part in ("--set", option))]
-    process = script("regenerate", *arguments, home=home)
+    process = script("regenerate", *arguments, home=home, own_server=True)
     deadline = time.monotonic() + 300
     while len(digests(home, ("sample",))) < 2 and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.02)
@@ -216,7 +216,7 @@ def test_a_script_killed_before_it_publishes_goes_on_with_its_version(home):
     process.communicate()
     sampled = digests(home, ("sample",))
     assert len(sampled) == 2 and json.loads((folder_of(home) / "claimed.json").read_text())["number"] == 2
-    finished = run_script("regenerate", *arguments, home=home)
+    finished = run_script("regenerate", *arguments, home=home, own_server=True)
     assert finished.status == 0, finished.errors
     assert "version 2 of smoke is published" in finished.output
     latest = read_latest(folder_of(home))

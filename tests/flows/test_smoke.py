@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import sqlite3
-import statistics
 import subprocess
 import sys
 import time
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from flow_scripts import REPOSITORY, artefacts, digests, run_script, script
+from flow_scripts import REPOSITORY, artefacts, digests, plan_script, run_script, script
 
 from ctlev_core.events.files import read_events_file
 from ctlev_core.labels.body_views import smpl_joints
@@ -168,8 +167,10 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
     for _ in range(3):  # interleaved, because the machine's speed drifts
         cached = seconds([*again, "--home", str(smoke_home)], cwd=smoke_home, env=environment)
         differences.append(cached - seconds(bare, cwd=smoke_home, env=environment | quiet))
+        if sum(difference < 5 for difference in differences) == 2:
+            break  # which is the median, whatever the third is
     assert digests(smoke_home) == before
-    assert statistics.median(differences) < 5, differences
+    assert sorted(differences)[1] < 5, differences
     # Prefect's record of the last of them.
     query = """
         SELECT artifact.data FROM artifact JOIN flow_run ON flow_run.id = artifact.flow_run_id
@@ -243,9 +244,9 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
     ],
 )
 def test_changing_an_option_reruns_exactly_what_depends_on_it(smoke_home, override, changed):
-    base = run_script("full_experiment", "--preset", "smoke", "--dry-run", home=smoke_home).plan
+    base = plan_script("full_experiment", "--preset", "smoke", "--dry-run", home=smoke_home).plan
     assert base and {state for state, _ in base.values()} == {"cached"}
-    plan = run_script("full_experiment", "--preset", "smoke", "--set", override, "--dry-run", home=smoke_home).plan
+    plan = plan_script("full_experiment", "--preset", "smoke", "--set", override, "--dry-run", home=smoke_home).plan
     assert plan.keys() == base.keys() or override.startswith("name")
     for label, (state, key) in plan.items():
         expected = any(part in label for part in changed)
@@ -268,7 +269,7 @@ def test_killed_runs_end_in_the_same_digests(smoke_home, tmp_path):
     """`kill -9` at random moments, then a rerun: nothing half-written, every digest as in the undisturbed run."""
     random = np.random.default_rng(20261121)
     for _ in range(4):
-        process = script("full_experiment", "--preset", "smoke", home=tmp_path, start_new_session=True)
+        process = script("full_experiment", "--preset", "smoke", home=tmp_path, own_server=True, start_new_session=True)
         try:
             process.wait(timeout=float(random.uniform(8, 35)))
         except subprocess.TimeoutExpired:
@@ -276,7 +277,7 @@ def test_killed_runs_end_in_the_same_digests(smoke_home, tmp_path):
         process.communicate()
         for manifest in (tmp_path / "artefacts").glob(f"*/*/{MANIFEST_FILE}"):
             read_manifest(ManifestRef(key=manifest.parent.name, path=manifest.parent), full=True)
-    finished = run_script("full_experiment", "--preset", "smoke", home=tmp_path)
+    finished = run_script("full_experiment", "--preset", "smoke", home=tmp_path, own_server=True)
     assert finished.status == 0, finished.errors
     assert digests(tmp_path, DETERMINISTIC) == {
         name: digest
@@ -288,7 +289,7 @@ def test_killed_runs_end_in_the_same_digests(smoke_home, tmp_path):
 
 
 def test_private_server_dies_with_a_killed_script(tmp_path):
-    process = script("full_experiment", "--preset", "smoke", home=tmp_path)
+    process = script("full_experiment", "--preset", "smoke", home=tmp_path, own_server=True)
     deadline = time.monotonic() + 60
     children = []
     while not children and time.monotonic() < deadline:

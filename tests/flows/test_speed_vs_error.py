@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from flow_scripts import artefacts, run_script
+from flow_scripts import artefacts, plan_script, run_script
 
 from ctlev_core.downstream import classifier
 from ctlev_core.generators import controlnet
@@ -121,10 +121,10 @@ def test_distances_are_those_of_the_pooled_seeds(measured, rows):
 
 
 def test_another_line_is_all_that_is_sampled_again(measured):
-    base = run_script("speed_vs_error", *OPTIONS, "--dry-run", home=measured).plan
+    base = plan_script("speed_vs_error", *OPTIONS, "--dry-run", home=measured).plan
     assert {state for state, _ in base.values()} == {"cached"}
     line = ["--set", "lines.DDIM={options: {scheduler: ddim}, steps: [4]}"]
-    plan = run_script("speed_vs_error", *OPTIONS, *line, "--dry-run", home=measured).plan
+    plan = plan_script("speed_vs_error", *OPTIONS, *line, "--dry-run", home=measured).plan
     assert {label for label, (state, _) in plan.items() if state == "to run"} == {
         "sample_timed: DDIM, 4 steps, seed 0",
         "sample_timed: DDIM, 4 steps, seed 1",
@@ -144,7 +144,7 @@ def test_another_line_is_all_that_is_sampled_again(measured):
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_runs(tmp_path, setting, message):
-    finished = run_script("speed_vs_error", "--preset", "smoke", "--set", setting, home=tmp_path)
+    finished = plan_script("speed_vs_error", "--preset", "smoke", "--set", setting, home=tmp_path)
     assert finished.status == 2
     assert finished.errors.startswith("error: ")
     assert any(part in finished.errors for part in message.split("|")), finished.errors

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from flow_scripts import artefacts, digests, run_script
+from flow_scripts import artefacts, digests, plan_script, run_script_here
 from test_object_datasets import CLASSES, n_caltech101, n_imagenet, only
 
 from ctlev_core.generators import stable_diffusion
@@ -29,12 +29,12 @@ def made(tmp_path_factory):
         (folder / write.__name__).mkdir()
         write(folder / write.__name__)
     target = f"target={{name: n_caltech101, options: {{root: {folder / 'n_caltech101'}}}}}"
-    asked = [f"dataset.options.root={folder / 'n_imagenet'}", "settings=[real, synthetic]", *TINY]
+    asked = [f"dataset.options.root={folder / 'n_imagenet'}", "training_sets=[real, synthetic]", *TINY]
     options = [argument for change in asked for argument in ("--set", change)]
-    alone = run_script("full_experiment", "--preset", "n_imagenet", *options, "--dry-run", home=folder / "home")
+    alone = plan_script("full_experiment", "--preset", "n_imagenet", *options, "--dry-run", home=folder / "home")
     assert alone.status == 0, alone.errors
     options += ["--set", target, "--set", "metrics=[{name: zero_shot}]"]
-    finished = run_script("full_experiment", "--preset", "n_imagenet", *options, home=folder / "home")
+    finished = run_script_here("full_experiment", "--preset", "n_imagenet", *options, home=folder / "home")
     assert finished.status == 0, finished.errors
     return folder / "home", alone.plan
 

@@ -153,6 +153,7 @@ def test_a_grid_that_loses_the_fingers_is_refused():
         procedural.build_body(voxel_m=0.05)
 
 
+@pytest.mark.slow
 def test_the_finer_mesh_has_the_same_shape():
     pytest.importorskip("skimage")
     fine = procedural.build_body(voxel_m=0.018)

@@ -280,7 +280,7 @@ def test_memory_of_a_chunked_read_does_not_grow_with_the_file(name, tmp_path):
     code = f"""
         import re
         from pathlib import Path
-        from ctlev_core import event_files
+        from ctlev_core.events import files as event_files
         peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
         folder = Path({str(tmp_path)!r})
         try:

@@ -131,7 +131,8 @@ def test_names_of_recordings_do_not_matter_and_mixed_sets_are_a_half():
     assert mixed.low < 0.5 < mixed.high
 
 
-def test_equal_seeds_give_equal_results_with_any_number_of_threads():
+def test_equal_seeds_give_equal_results_with_any_number_of_threads(monkeypatch):
+    monkeypatch.setattr("ctlev_core.realism.two_sample_network.NUM_STEPS", 20)
     first, second = bars(45, 0, isolated=1), bars(45, 1)
     before = torch.get_num_threads()
     try:

@@ -85,6 +85,7 @@ def test_hot_pixels(frames):
     assert calibration.options.shot_noise_rate_hz == pytest.approx(0.2 * (1 - 0.75 * 0.3), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_read_out_at_fixed_times(frames):
     events = events_of(frames, threshold=0.01, threshold_minimum=0.01)
     t = events.t // 1000 * 1000

@@ -66,8 +66,8 @@ def test_without_a_spread_between_draws_that_of_trainings_is_covered():
 @pytest.mark.parametrize(
     "spread",
     [
-        {"generator": 0.03, "seed": 0.03},
-        {"draw": 0.05, "generator": 0.02, "seed": 0.02},
+        pytest.param({"generator": 0.03, "seed": 0.03}, marks=pytest.mark.slow),
+        pytest.param({"draw": 0.05, "generator": 0.02, "seed": 0.02}, marks=pytest.mark.slow),
         {"draw": 0.015, "generator": 0.02, "seed": 0.03},
     ],
     ids=["trainings vary", "draws vary", "both vary"],
