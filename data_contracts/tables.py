@@ -303,6 +303,40 @@ SPEED_VS_ERROR = TableSchema(
         Column("num_samples", pa.int64(), "images, or values, it was measured on", minimum=1),
     ),
 )
+CHAIN_FRAMES = TableSchema(
+    "chain_frames",
+    1,
+    "sample_id",
+    (
+        Column("sample_id", pa.string(), "the recorded frame; row i of the array `frames` is row i of this table"),
+        _RECORDING,
+        Column("seed", pa.int64(), "seed of this row alone", minimum=0),
+    ),
+)
+REALISM_CHAIN = TableSchema(
+    "realism_chain",
+    1,
+    None,
+    (
+        Column(
+            "link",
+            pa.string(),
+            "what recorded frames went through last",
+            choices=("recorded", "autoencoder", "values", "counts", "denoised", "sampled"),
+        ),
+        Column("amount", pa.int32(), "time step of the noise, or steps of sampling; 0 = neither", minimum=0),
+        Column("evaluations", pa.int32(), "of the network, an image", minimum=0),
+        Column("metric", pa.string(), "`c2st`, or a number of `ctlev_core.realism.summary`, mean over recordings"),
+        Column("value", pa.float64(), "of these frames; missing where it could not be measured", nullable=True),
+        Column("low", pa.float64(), "lower end of its 95 % interval", nullable=True),
+        Column("high", pa.float64(), "upper end", nullable=True),
+        Column("difference", pa.float64(), "from the recorded frames, by recording; not of `c2st`", nullable=True),
+        Column("difference_low", pa.float64(), "lower end of its 95 % interval", nullable=True),
+        Column("difference_high", pa.float64(), "upper end", nullable=True),
+        Column("num_samples", pa.int64(), "frames", minimum=0),
+        Column("note", pa.string(), "why there is no value, or what it has to be read with"),
+    ),
+)
 _ALL = (
     RECORDINGS,
     PARTS,
@@ -320,6 +354,8 @@ _ALL = (
     REPORT,
     TIMED_SAMPLES,
     SPEED_VS_ERROR,
+    CHAIN_FRAMES,
+    REALISM_CHAIN,
 )
 TABLES = {schema.name: schema for schema in _ALL}
 

@@ -25,6 +25,7 @@ from flows import export_events as of_export_events
 from flows import full_experiment as of_full_experiment
 from flows import prepare_dataset as of_prepare_dataset
 from flows import pretrain as of_pretrain
+from flows import realism_chain as of_realism_chain
 from flows import regenerate as of_regenerate
 from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
@@ -32,6 +33,7 @@ from flows import train_generator as of_train_generator
 from flows.command_line import PRESETS, check_home, load_experiment, load_preset, publish_plan, use_cores
 from flows.settings import HOME, flow
 from flows.studies import load_study
+from tasks.chain_report import publish_chain_report
 from tasks.contact_sheet import publish_contact_sheet
 from tasks.export_events import publish_events
 from tasks.speed_report import publish_speed_report
@@ -98,6 +100,9 @@ compare = of_compare.compare
 export_events = _deployable(of_export_events.export_streams, publish=publish_events)
 speed_vs_error = _deployable(
     of_speed_vs_error.speed_vs_error, load=of_speed_vs_error.load_speed_vs_error, publish=publish_speed_report
+)
+realism_chain = _deployable(
+    of_realism_chain.realism_chain, load=of_realism_chain.load_realism_chain, publish=publish_chain_report
 )
 pretrain = _deployable(
     of_pretrain.pretrain,

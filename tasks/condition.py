@@ -27,6 +27,7 @@ from ctlev_core.labels.sources import (
     sensor_size_of,
 )
 from ctlev_core.plugins import Plugin
+from ctlev_core.realism.two_sample import choose_rows
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.arrays import ArrayWriter
@@ -56,6 +57,30 @@ def condition_frames(
     """Render the condition of every training frame; rows join the frames on `sample_id`."""
     rows = rows_of_frames(recordings, frames, frames.rows_where(split="train"))
     return _render(out, rows.source_ids, rows, condition, recordings, frames, encoding, seed)
+
+
+@stage(version=1, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
+def condition_some_frames(
+    out: Output,
+    recordings: Manifest,
+    frames: Manifest,
+    *,
+    condition: ConditionChoice,
+    encoding: EncodingChoice,
+    split: str,
+    count: int,
+    seed: int,
+) -> pa.Table:
+    """Render the conditions of at most `count` frames of a split, held out ones too; rows join on `sample_id`.
+
+    Raises:
+        DataError: the split has no frame.
+    """
+    rows = frames.rows_where(split=split)
+    if not len(rows):
+        raise DataError(f"{frames.ref.path}: expected frames of split {split!r}, got none")
+    chosen = rows_of_frames(recordings, frames, rows[choose_rows(len(rows), count, seed)])
+    return _render(out, chosen.source_ids, chosen, condition, recordings, frames, encoding, seed)
 
 
 @stage(version=8, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))

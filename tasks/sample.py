@@ -19,17 +19,15 @@ from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling.shards import SHARD
 from ctlev_core.events import files as event_files
-from ctlev_core.events.image_grid import check_whole_counts
 from ctlev_core.events.windows import spread, window_around
 from ctlev_core.labels.sources import sensor_size_of
 from ctlev_core.postprocessing.quality_filter import (
-    FilteredImages,
     QualityFilter,
     find_causes,
     fit_quality_filter,
     sample_until_accepted,
 )
-from ctlev_core.postprocessing.stochastic_rounding import round_stochastically
+from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
@@ -69,8 +67,7 @@ def sample(
     training frames, each frame becomes the rendering of event counts that it is the expectation of.
     """
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
-    if rounding is not None:
-        _check_rounding(frames)
+    num_events = None if rounding is None else training_counts(frames)
     folder = checkpoint.ref.path / "checkpoint"
 
     def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
@@ -89,7 +86,10 @@ def sample(
                 quality_filter,
                 max_attempts=max_attempts,
             )
-            written.append(made.frames if rounding is None else _rounded(made, frames, rounding))
+            if rounding is None or num_events is None:
+                written.append(made.frames)
+            else:
+                written.append(round_frames(made.frames, num_events, plugins.load_options(rounding), made.seeds))
             told.add(made.seeds, made.num_attempts, made.causes)
     return _table(conditions, plugin, checkpoint.ref.digest, told)
 
@@ -111,26 +111,6 @@ class SampleLog(NamedTuple):
 def _chunk_rows(frames: Manifest) -> int:
     """Rows that are sampled before their frames are written: whole shards, so that batches are what they were."""
     return max(BLOCK_BYTES // math.prod(frames.array("frames").shape[1:]) // SHARD, 1) * SHARD
-
-
-def _check_rounding(frames: Manifest) -> None:
-    """Raise `DataError` where the counts of image pixels are not known."""
-    check_whole_counts(frames.array("histograms").shape, frames.array("frames").shape, "stochastic_rounding")
-    if not all(frames.column("num_events")):
-        raise DataError(
-            f"{frames.ref.path}: stochastic_rounding needs event counts, and there are windows without any, as "
-            "finished event images are; set stochastic_rounding=false"
-        )
-
-
-def _rounded(made: FilteredImages, frames: Manifest, encoding: EncodingChoice) -> np.ndarray:
-    """The frames as renderings of whole event counts, as many as some window of training has."""
-    encoder = plugins.load_options(encoding)
-    learnt = frames.rows_where(split="train")
-    histograms = frames.array("histograms")
-    num_events = np.array([histograms[row].sum(dtype=np.int64) for row in learnt])
-    counts = round_stochastically(made.frames, num_events, polarity=encoder.options.polarity, seeds=made.seeds)
-    return encoder.module.render_image(counts, encoder.options)
 
 
 def quality_filter_of(frames: Manifest) -> QualityFilter:

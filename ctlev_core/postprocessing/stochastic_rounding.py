@@ -12,6 +12,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ctlev_core.events.image_grid import check_whole_counts
+from ctlev_core.plugins import Plugin
+from data_contracts.errors import DataError
+from data_contracts.manifest import Manifest
+
 
 def round_stochastically(
     frames: np.ndarray, num_events: np.ndarray, *, polarity: bool, seeds: Sequence[int]
@@ -47,3 +52,34 @@ def round_stochastically(
         expected = values * (rng.choice(num_events) / total)
         counts[row] = np.minimum(expected + rng.random(expected.shape), 65535).transpose(2, 0, 1)
     return counts
+
+
+def training_counts(frames: Manifest) -> np.ndarray:
+    """Events [R] in the image of each training window, which `round_stochastically` draws from.
+
+    Args:
+        frames: recorded, with their histograms.
+    Raises:
+        DataError: the event counts of their pixels are not known.
+    """
+    histograms = frames.array("histograms")
+    check_whole_counts(histograms.shape, frames.array("frames").shape, "stochastic_rounding")
+    if not all(frames.column("num_events")):
+        raise DataError(
+            f"{frames.ref.path}: stochastic_rounding needs event counts, and there are windows without any, as "
+            "finished event images are; set stochastic_rounding=false"
+        )
+    return np.array([histograms[row].sum(dtype=np.int64) for row in frames.rows_where(split="train")])
+
+
+def round_frames(frames: np.ndarray, num_events: np.ndarray, encoder: Plugin, seeds: Sequence[int]) -> np.ndarray:
+    """Images [N, H, W, 3] uint8 as renderings of whole event counts, likewise.
+
+    Args:
+        frames: [N, H, W, 3] uint8.
+        num_events: [R] events in each of R >= 1 real windows.
+        encoder: an event histogram, that of the real windows.
+        seeds: N seeds; a row depends on its own alone.
+    """
+    counts = round_stochastically(frames, num_events, polarity=encoder.options.polarity, seeds=seeds)
+    return encoder.module.render_image(counts, encoder.options)

@@ -17,6 +17,7 @@ from flow_scripts import REPOSITORY, digests
 from data_contracts.published import published_folder, read_latest, read_versions
 from flows import deployments
 from flows.command_line import load_experiment
+from flows.realism_chain import load_realism_chain
 from flows.regenerate import load_regeneration
 from flows.speed_vs_error import load_speed_vs_error
 from flows.studies import load_study
@@ -42,6 +43,7 @@ def test_defaults_are_presets_that_load():
     loaders = {
         "full_experiment": load_study,
         "speed_vs_error": load_speed_vs_error,
+        "realism_chain": load_realism_chain,
         "synthesize": load_synthesis,
         "regenerate": load_regeneration,
         "evaluate": load_experiment,

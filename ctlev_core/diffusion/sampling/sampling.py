@@ -81,29 +81,10 @@ def sample_latents(
     shape = (base_model.unet.config.in_channels, side, side)
     state = torch.stack([torch.randn(shape, generator=stream) for stream in streams]).to(device)
     state = state * scheduler.init_noise_sigma
-    embeddings = embeddings.to(device, dtype)
-    conditions = None if conditions is None else conditions.to(device, dtype)
-    # What guided steps take: every row without its prompt, then with it.
-    both, twice = embeddings, conditions
-    if options.guidance_scale > 1:
-        both = torch.cat([empty_embedding.to(embeddings).expand_as(embeddings), embeddings])
-        twice = None if conditions is None else torch.cat([conditions, conditions])
     further = {"generator": streams} if options.scheduler in STOCHASTIC else {}
-    controlnet = (
-        None if base_model.controlnet is None else EveryKthStep(base_model.controlnet, options.controlnet_every)
-    )
-    denoiser = Denoiser(base_model.unet, controlnet)
-    with cached_condition_embedding(base_model.controlnet, conditions):
+    with guided_predictions(base_model, embeddings, empty_embedding, conditions, options) as predict:
         for timestep in scheduler.timesteps:
-            noisy = scheduler.scale_model_input(state, timestep).to(dtype)
-            if _is_guided(timestep, scheduler.config.num_train_timesteps, options):
-                timesteps = timestep.expand(2 * len(noisy)).to(device)
-                predicted = denoiser.predict(torch.cat([noisy, noisy]), timesteps, both, twice).float()
-                plain, prompted = predicted.chunk(2)
-                predicted = plain + options.guidance_scale * (prompted - plain)
-            else:
-                timesteps = timestep.expand(len(noisy)).to(device)
-                predicted = denoiser.predict(noisy, timesteps, embeddings, conditions).float()
+            predicted = predict(scheduler.scale_model_input(state, timestep), timestep)
             state = scheduler.step(predicted, timestep, state, **further).prev_sample
     if not bool(torch.isfinite(state).all()):
         raise FloatingPointError(
@@ -111,6 +92,55 @@ def sample_latents(
             "float16 overflows beyond 65504, bfloat16 and float32 do not"
         )
     return state
+
+
+@contextmanager
+def guided_predictions(
+    base_model: PretrainedModel,
+    embeddings: Tensor,
+    empty_embedding: Tensor,
+    conditions: Tensor | None,
+    options: SamplingOptions,
+) -> Iterator[Callable[[Tensor, Tensor], Tensor]]:
+    """Within the context a function of (noisy latents [B, C, h, w], time step) to the prediction, with guidance.
+
+    It takes the latents in any precision and gives float32; the time step is one integer for all rows.
+
+    Args:
+        base_model: networks in any precision.
+        embeddings: [B, L, D] of the prompts.
+        empty_embedding: [1, L, D], for guidance.
+        conditions: [B, 3, H, W] in [0, 1], or None.
+        options: guidance, and how often the ControlNet is evaluated.
+    """
+    device, dtype = base_model.unet.device, base_model.unet.dtype
+    embeddings = embeddings.to(device, dtype)
+    conditions = None if conditions is None else conditions.to(device, dtype)
+    # What guided steps take: every row without its prompt, then with it.
+    both, twice = embeddings, conditions
+    if options.guidance_scale > 1:
+        both = torch.cat([empty_embedding.to(embeddings).expand_as(embeddings), embeddings])
+        twice = None if conditions is None else torch.cat([conditions, conditions])
+    controlnet = (
+        None if base_model.controlnet is None else EveryKthStep(base_model.controlnet, options.controlnet_every)
+    )
+    denoiser, num_timesteps = (
+        Denoiser(base_model.unet, controlnet),
+        base_model.scheduler_config.get("num_train_timesteps", 1000),
+    )
+
+    def predict(noisy: Tensor, timestep: Tensor) -> Tensor:
+        noisy = noisy.to(dtype)
+        if not _is_guided(timestep, num_timesteps, options):
+            timesteps = timestep.expand(len(noisy)).to(device)
+            return denoiser.predict(noisy, timesteps, embeddings, conditions).float()
+        timesteps = timestep.expand(2 * len(noisy)).to(device)
+        predicted = denoiser.predict(torch.cat([noisy, noisy]), timesteps, both, twice).float()
+        plain, prompted = predicted.chunk(2)
+        return plain + options.guidance_scale * (prompted - plain)
+
+    with cached_condition_embedding(base_model.controlnet, conditions):
+        yield predict
 
 
 def _is_guided(timestep: Tensor, num_timesteps: int, options: SamplingOptions) -> bool:

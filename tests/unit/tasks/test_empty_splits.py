@@ -5,10 +5,11 @@ import pyarrow as pa
 import pytest
 
 from data_contracts import tables
-from data_contracts.config import DownstreamChoice, MetricChoice
+from data_contracts.config import ConditionChoice, DownstreamChoice, EncodingChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 from data_contracts.manifest import label_columns, read_manifest, write_manifest
+from tasks.condition import condition_some_frames
 from tasks.evaluate import score_distance, score_model
 from tasks.stage import Output
 
@@ -50,4 +51,13 @@ def test_an_empty_set_of_frames_is_compared_with_nothing(tmp_path, splits, named
         score_distance.function(
             Output(tmp_path, tmp_path), extractor, real, other, downstream=DownstreamChoice(name="classifier"),
             distances=[MetricChoice(name="frechet")], subject="synthetic", split="test", seed=0,
+        )  # fmt: skip
+
+
+def test_conditions_of_an_empty_split_are_refused(tmp_path):
+    data = frame_set(tmp_path / "real", "train")
+    with pytest.raises(DataError, match=r"real: expected frames of split 'test', got none"):
+        condition_some_frames.function(
+            Output(tmp_path, tmp_path), None, data, condition=ConditionChoice(name="text"),
+            encoding=EncodingChoice(name="event_histogram"), split="test", count=5, seed=0,
         )  # fmt: skip

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from ctlev_core import plugins
 from ctlev_core.encodings import event_histogram
 from ctlev_core.plugins import PluginError
-from ctlev_core.postprocessing.quality_filter import FilteredImages
+from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
 from data_contracts.errors import DataError
@@ -22,7 +22,6 @@ from flows.command_line import PRESETS, load_preset
 from flows.full_experiment import full_experiment
 from flows.inputs import check_inputs
 from tasks.evaluate import _groups_by_origin, _others
-from tasks.sample import _check_rounding, _rounded
 from tasks.stage import Output, call_flow, planning
 from tasks.subset import take_label_consistent, take_share
 
@@ -155,10 +154,10 @@ def test_rounded_frames_show_whole_counts():
     encoding = EncodingChoice(name="event_histogram", options={"polarity": False})
     options = event_histogram.Options(polarity=False)
     real = event_histogram.render_image(counts, options)
-    frames = SimpleNamespace(array=lambda name: counts, rows_where=lambda split: np.arange(20))
+    num_events = counts.sum(axis=(1, 2, 3), dtype=np.int64)
     # A decoder that is unsure where an event is spreads it over two pixels.
     blurred = ((real.astype(int) + np.roll(real, 1, axis=1)) // 2).astype(np.uint8)
-    rounded = _rounded(FilteredImages(blurred, list(range(20)), [1] * 20, [""] * 20), frames, encoding)
+    rounded = round_frames(blurred, num_events, plugins.load_options(encoding), range(20))
 
     def active_share(images):
         return (images > 0).mean()
@@ -197,10 +196,10 @@ def test_frames_without_whole_counts_are_refused_before_they_are_sampled():
     ref = SimpleNamespace(path="frames")
     manifest = SimpleNamespace(array=arrays.__getitem__, column=lambda name: [3, 0], ref=ref)
     with pytest.raises(DataError, match="stochastic_rounding needs whole counts"):
-        _check_rounding(manifest)
+        training_counts(manifest)
     arrays["frames"] = np.zeros((2, 24, 24, 3), np.uint8)
     with pytest.raises(DataError, match="stochastic_rounding needs event counts"):
-        _check_rounding(manifest)
+        training_counts(manifest)
 
 
 def test_groups_by_origin_part_the_test_rows():

@@ -1,0 +1,146 @@
+"""Where a generator loses realism: recorded frames after each of its parts, against what they were."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+
+from ctlev_core import plugins
+from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
+from ctlev_core.realism.chain import RECORDED, measure_processed, measure_recorded, summarise_recordings
+from ctlev_core.realism.two_sample import choose_rows
+from ctlev_core.seeds import sample_seeds
+from data_contracts import tables
+from data_contracts.config import EncodingChoice, SamplingChoice
+from data_contracts.manifest import Manifest, conditions_of
+from data_contracts.realism_chain import Link
+from tasks.stage import Output, stage
+
+if TYPE_CHECKING:  # torch, which most plans do without
+    from ctlev_core.realism.chain_frames import Rounding
+
+
+@stage(version=1, schema=tables.CHAIN_FRAMES)
+def chain_frames(
+    out: Output,
+    checkpoint: Manifest,
+    frames: Manifest,
+    conditions: Manifest,
+    *,
+    sampling: SamplingChoice,
+    link: Link,
+    rounding: EncodingChoice | None,
+    seed: int,
+) -> pa.Table:
+    """What recorded frames become in one part of the generator.
+
+    Args:
+        out: of the stage.
+        checkpoint: the fine-tuned generator.
+        frames: recorded ones.
+        conditions: of those of them that are sent through; rows join on `sample_id`.
+        sampling: the generator's sampling options; with `link` of kind `sampled` their steps are the link's.
+        link: the part.
+        rounding: the encoding whose levels sampled frames are rounded to, if any.
+        seed: of all noise.
+    """
+    rows = _rows(frames, conditions)
+    seeds = sample_seeds(seed, len(rows))
+    with out.open_array("frames") as written:
+        for made in _send(out, checkpoint, frames, conditions, rows, sampling, link, rounding, seeds):
+            written.append(made)
+    return pa.table(
+        {
+            "sample_id": conditions.table["sample_id"],
+            "recording_id": frames.table["recording_id"].take(rows),
+            "seed": pa.array(seeds, pa.int64()),
+        }
+    )
+
+
+def _send(
+    out: Output,
+    checkpoint: Manifest,
+    frames: Manifest,
+    conditions: Manifest,
+    rows: np.ndarray,
+    sampling: SamplingChoice,
+    link: Link,
+    rounding: EncodingChoice | None,
+    seeds: list[int],
+) -> Iterator[np.ndarray]:
+    """Batches of frames after the part."""
+    from ctlev_core.diffusion.sampling.devices import device_names
+    from ctlev_core.diffusion.sampling.sampling import load_for_sampling
+    from ctlev_core.realism.chain_frames import Parts, send_through
+
+    plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
+    folder, round_frames = checkpoint.ref.path / "checkpoint", _rounding(frames, rounding)
+    if link.kind == "sampled":
+        made = plugin.module.sample(folder, asked, plugin.options, seeds=seeds, work=out.work)
+        yield made if round_frames is None else round_frames(made, seeds)
+        return
+    device = device_names(plugin.options.device)[0]
+    base_model = load_for_sampling(folder, plugin.options, device, asked.images is not None)
+    recorded = np.asarray(frames.array("frames")[rows])
+    yield from send_through(link, recorded, asked, Parts(base_model, plugin.options, round_frames), seeds)
+
+
+def _rounding(frames: Manifest, encoding: EncodingChoice | None) -> Rounding | None:
+    """To whole counts, as many as training windows have."""
+    if encoding is None:
+        return None
+    num_events, encoder = training_counts(frames), plugins.load_options(encoding)
+    return lambda made, seeds: round_frames(made, num_events, encoder, seeds)
+
+
+@stage(version=1, schema=tables.REALISM_CHAIN)
+def chain_realism(
+    out: Output, frames: Manifest, conditions: Manifest, processed: list[Manifest], *, links: list[Link], seed: int
+) -> pa.Table:
+    """How real frames look after each part of the generator, the recorded ones themselves first.
+
+    Args:
+        out: of the stage.
+        frames: recorded ones.
+        conditions: of those of them that were sent through.
+        processed: what they became, one artefact a link.
+        links: the parts.
+        seed: of halvings, networks, resampling, and of the frames behind the floor.
+    """
+    rows = _rows(frames, conditions)
+    recorded, groups = np.asarray(frames.array("frames")[rows]), _recordings(frames, rows)
+    split = frames.column("split")[int(rows[0])]
+    several = frames.rows_where(split=split)
+    several = several[choose_rows(len(several), 2 * len(rows), seed)]
+    halved = np.asarray(frames.array("frames")[several])
+    found = measure_recorded(recorded, groups, halved, _recordings(frames, several), seed)
+    table = [{"link": RECORDED, "amount": 0, "evaluations": 0} | one.row() for one in found]
+    summaries = summarise_recordings(recorded, groups)
+    for link, made in zip(links, processed, strict=True):
+        same = {"link": link.kind, "amount": link.amount, "evaluations": _evaluations(link)}
+        found = measure_processed(np.asarray(made.array("frames")), recorded, groups, summaries, seed)
+        table += [same | one.row() for one in found]
+    return pa.Table.from_pylist(table, schema=tables.REALISM_CHAIN.arrow())
+
+
+def _evaluations(link: Link) -> int:
+    """Of the network, an image; guided steps count once."""
+    if link.kind == "denoised":
+        from ctlev_core.diffusion.sampling.partial_denoising import denoising_times
+
+        return len(denoising_times(link.amount, link.max_evaluations))
+    return link.amount
+
+
+def _rows(frames: Manifest, conditions: Manifest) -> np.ndarray:
+    """The recorded frame of each condition."""
+    row_of = {name: row for row, name in enumerate(frames.column("sample_id"))}
+    return np.array([row_of[name] for name in conditions.column("sample_id")], np.int64)
+
+
+def _recordings(frames: Manifest, rows: np.ndarray) -> list[str]:
+    return frames.table["recording_id"].take(rows).to_pylist()
