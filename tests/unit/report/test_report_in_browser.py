@@ -116,7 +116,7 @@ def test_dark_mode_turns_ink_and_page_round(page, tmp_path):
     def brightness(colour: str) -> float:
         return sum(int(number) for number in re.findall(r"\d+", colour)[:3]) / 3
 
-    light, _ = in_browser(page, tmp_path, "--blink-training_sets=preferredColorScheme=1")
-    dark, _ = in_browser(page, tmp_path, "--blink-training_sets=preferredColorScheme=0")
+    light, _ = in_browser(page, tmp_path, "--blink-settings=preferredColorScheme=1")
+    dark, _ = in_browser(page, tmp_path, "--blink-settings=preferredColorScheme=0")
     assert brightness(light["desk"]["paper"]) > 200 > 100 > brightness(light["desk"]["ink"])
     assert brightness(dark["desk"]["paper"]) < 60 < 180 < brightness(dark["desk"]["ink"])
