@@ -244,7 +244,7 @@ class GeneratorOfNames(Generator, Protocol):
 
 
 class EventGenerator(Protocol):
-    """Simulates events instead of frames, and learns nothing; its events are encoded as the real ones are."""
+    """Simulates events instead of frames, and learns nothing; its events are encoded as the recorded ones are."""
 
     VERSION: int
     Options: type[Frozen]

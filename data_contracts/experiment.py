@@ -22,14 +22,14 @@ from data_contracts.event_export import EventExport
 from data_contracts.training_sets import (
     LABEL_CONSISTENT,
     ORACLE,
-    REAL,
+    RECORDED,
     SOURCES,
     SYNTHETIC,
     TrainingSet,
     TrainingSource,
 )
 
-TrainedOn = Literal["real", "synthetic", "real+synthetic"]
+TrainedOn = Literal["recorded", "synthetic", "recorded+synthetic"]
 LabelOrder = Literal["random", "in_time"]
 View = Literal["labelled", "new"]
 NAME_PATTERN = r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$"
@@ -55,7 +55,7 @@ class Baseline(Frozen):
 
 
 class Oracle(Frozen):
-    """Other real recordings to train on: of the very poses, say, that synthetic frames are sampled from."""
+    """Other recordings to train on: of the very poses, say, that synthetic frames are sampled from."""
 
     dataset: DatasetChoice = Field(description="its training recordings are used; it needs a test recording too")
     windows: Windows | None = Field(None, description="how they are cut; None = as those of the experiment")
@@ -64,11 +64,11 @@ class Oracle(Frozen):
 class Experiment(Frozen):
     """One experiment: data, generator, how much to sample, and what to train and score with it.
 
-    `baselines` are rows of the tables: a baseline `X` adds the training sets `X` and `real+X` beside `synthetic` and
-    `real+synthetic`, where those are asked for; `oracle` adds `oracle` and `real+oracle`, `scaling`,
+    `baselines` are rows of the tables: a baseline `X` adds the training sets `X` and `recorded+X` beside `synthetic`
+    and `recorded+synthetic`, where those are asked for; `oracle` adds `oracle` and `recorded+oracle`, `scaling`,
     `keep_fraction` and `mixtures` the training sets named in their descriptions. `sampling` are the generator's
-    `SampleOptions`. `feature_extractor` is the classifier, trained on real frames, in whose features real and synthetic
-    frames are compared; None leaves the comparison out.
+    `SampleOptions`. `feature_extractor` is the classifier, trained on recorded frames, in whose features recorded and
+    synthetic frames are compared; None leaves the comparison out.
     """
 
     name: str = Field(pattern=NAME_PATTERN, description="names the experiment and its report")
@@ -81,7 +81,7 @@ class Experiment(Frozen):
     target: DatasetChoice | None = Field(
         None,
         description="another dataset that the generator learns nothing of, such as classes it has never seen: its "
-        "labels are sampled, its training recordings are the training set `real`, its test recordings are tested",
+        "labels are sampled, its training recordings are the training set `recorded`, its test recordings are tested",
     )
     temporal_order: bool = Field(
         False, description="labels to sample from follow one another in time; else classes in turn and at random"
@@ -107,7 +107,7 @@ class Experiment(Frozen):
     )
     stochastic_rounding: bool = Field(
         False,
-        description="sampled frames become, by stochastic rounding, renderings of whole event counts, as real ones "
+        description="sampled frames become, by stochastic rounding, renderings of whole event counts, as recorded ones "
         "are; of event histograms only",
     )
     num_generators: int = Field(
@@ -117,26 +117,27 @@ class Experiment(Frozen):
         "baseline; the downstream seeds take turns with them",
     )
     oracle: Oracle | None = Field(
-        None, description="real recordings of the sampled poses: the most that synthetic frames can give"
+        None, description="recordings of the sampled poses: the most that synthetic frames can give"
     )
     scaling: tuple[float, ...] = Field(
         (),
-        description="train on real frames and these shares of the synthetic ones too, as training sets `real+S@SHARE`",
+        description="train on recorded frames and these shares of the synthetic ones too, as training sets "
+        "`recorded+S@SHARE`",
     )
     keep_fraction: float | None = Field(
         None,
         gt=0,
         lt=1,
-        description="train also on this share of the synthetic frames, those whose labels a model trained on real "
-        "frames finds best: training sets `label_consistent` and `real+label_consistent`",
+        description="train also on this share of the synthetic frames, those whose labels a model trained on recorded "
+        "frames finds best: training sets `label_consistent` and `recorded+label_consistent`",
     )
     baselines: dict[str, Baseline] = Field(default_factory=dict, description="other generators, by a name of each")
     mixtures: tuple[str, ...] = Field(
         (),
-        description="further training sets, of frames of several generators, such as `real+synthetic+event_gan`",
+        description="further training sets, of frames of several generators, such as `recorded+synthetic+event_gan`",
     )
     downstream: DownstreamChoice
-    training_sets: tuple[TrainedOn, ...] = Field(("real", "synthetic", "real+synthetic"), min_length=1)
+    training_sets: tuple[TrainedOn, ...] = Field(("recorded", "synthetic", "recorded+synthetic"), min_length=1)
     downstream_seeds: tuple[int, ...] = Field((0,), min_length=1, description="one training per training set and seed")
     metrics: tuple[MetricChoice, ...] = Field(min_length=1)
     feature_extractor: DownstreamChoice | None = None
@@ -191,7 +192,7 @@ class Experiment(Frozen):
 
     @model_validator(mode="after")
     def _parts_are_known(self) -> Experiment:
-        known = {REAL, *self.generator_names, *([ORACLE] if self.oracle else [])}
+        known = {RECORDED, *self.generator_names, *([ORACLE] if self.oracle else [])}
         for mixture in self.mixtures:
             parts = mixture.split("+")
             if len(parts) < 2 or len(set(parts)) < len(parts) or not set(parts) <= known:
@@ -237,5 +238,5 @@ class Experiment(Frozen):
         asked = [TrainingSet.parse(name) for name in self.training_sets]
         found = [training_set.with_generator(name) for training_set in asked for name in makers]
         shares = [TrainingSource(SYNTHETIC, share) for share in sorted(self.scaling)]
-        found += [TrainingSet((TrainingSource(REAL), source)) for source in shares]
+        found += [TrainingSet((TrainingSource(RECORDED), source)) for source in shares]
         return list(dict.fromkeys([*found, *map(TrainingSet.parse, self.mixtures)]))

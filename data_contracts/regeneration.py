@@ -11,21 +11,22 @@ from data_contracts.experiment import Experiment
 class Gates(Frozen):
     """What a new version must keep to become the latest; null = not asked.
 
-    Preset `pose` has a distance of 1.5 and a label error of 1.1 times that of real frames, and none refused.
+    Preset `pose` has a distance of 1.5 and a label error of 1.1 times that of recorded frames, and none refused.
     """
 
     max_distance_ratio: float | None = Field(
         default=3.0,
         gt=0,
-        description="Frechet distance to the real training frames, over that of as many held-out real frames",
+        description="Frechet distance to the recorded training frames, over that of as many held-out recorded frames",
     )
     max_label_error_ratio: float | None = Field(
         default=1.5,
         gt=0,
-        description="error in the first metric, of the model trained on real frames, over that on held-out real frames",
+        description="error in the first metric, of the model trained on recorded frames, over that on held-out "
+        "recorded frames",
     )
     max_memorised_share: float | None = Field(
-        default=0.05, ge=0, le=1, description="frames nearer to a training frame than 1 % of real frames are"
+        default=0.05, ge=0, le=1, description="frames nearer to a training frame than 1 % of recorded frames are"
     )
     max_rejected_share: float | None = Field(
         default=0.05, ge=0, le=1, description="frames that are no event images after `max_attempts`"
@@ -34,11 +35,12 @@ class Gates(Frozen):
         default=None,
         ge=0,
         le=1,
-        description="area under the ROC curve of a network that tells the frames from held-out real ones; 0.5 = cannot",
+        description="area under the ROC curve of a network that tells the frames from held-out recorded ones; 0.5 = "
+        "cannot",
     )
     max_realism_distances: dict[str, float] | None = Field(
         default=None,
-        description="by name, distances of the report's table of realism from the real training frames, such as "
+        description="by name, distances of the report's table of realism from the recorded training frames, such as "
         "isolated_pixel_share or value_js_bits",
     )
 

@@ -34,6 +34,8 @@ RENAMED_VALUES = {
     "dpm++_sde": "dpmpp_sde",
     "even": "linspace",
     "filmed_pictures": "picture_simulator",
+    "real": "recorded",
+    "real+synthetic": "recorded+synthetic",
     "prior_over_training": "base_model_over_training",
     "small_prior": "small",
 }

@@ -84,7 +84,7 @@ class SpeedVsErrorOptions(Frozen):
     reference: SamplerLine
     converged: SamplerLine
     lines: dict[str, SamplerLine] = Field(min_length=1)
-    label_errors: bool = Field(True, description="also ask the model trained on real frames for the labels it sees")
+    label_errors: bool = Field(True, description="also ask the model trained on recorded frames for the labels it sees")
     exact_score: ExactScoreOptions | None = None
     precision: PrecisionOptions | None = None
 

@@ -1,7 +1,7 @@
 """What a downstream model is trained on, and what a score is of: types for the names that tables hold.
 
-A training set is written `real+synthetic@0.25`: sources joined by +, each with the share of its frames where that is
-not all of them. A row of scores that is of no training set is of the labels of generated frames: `label agreement of
+A training set is written `recorded+synthetic@0.25`: sources joined by +, each with the share of its frames where that
+is not all of them. A row of scores that is of no training set is of the labels of generated frames: `label agreement of
 NAME`.
 """
 
@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 
-REAL, SYNTHETIC, ORACLE, LABEL_CONSISTENT = "real", "synthetic", "oracle", "label_consistent"
-SOURCES = (REAL, SYNTHETIC, ORACLE, LABEL_CONSISTENT)
+RECORDED, SYNTHETIC, ORACLE, LABEL_CONSISTENT = "recorded", "synthetic", "oracle", "label_consistent"
+SOURCES = (RECORDED, SYNTHETIC, ORACLE, LABEL_CONSISTENT)
 """Sources that are not a baseline's name."""
 
 _SOURCE = re.compile(r"([A-Za-z0-9_-]+)(?:@([0-9.]+(?:e-?\d+)?))?")
@@ -57,7 +57,7 @@ class TrainingSet:
         for part in text.split("+"):
             found = _SOURCE.fullmatch(part)
             if found is None:
-                raise ValueError(f"expected sources joined by +, such as real+synthetic@0.25, got {text!r}")
+                raise ValueError(f"expected sources joined by +, such as recorded+synthetic@0.25, got {text!r}")
             sources.append(TrainingSource(found[1], float(found[2] or 1)))
         return cls(tuple(sources))
 
@@ -88,7 +88,8 @@ class TrainingSet:
 
 @dataclass(frozen=True)
 class LabelAgreement:
-    """The subject of scores of a model trained on real frames, on generated frames with the labels they were made from.
+    """The subject of scores of a model trained on recorded frames, on generated frames with the labels they were made
+    from.
 
     Attributes:
         generator: whose frames.

@@ -1,4 +1,4 @@
-"""Train downstream models on real, synthetic and mixed data, and score them on held-out real frames."""
+"""Train downstream models on recorded, synthetic and mixed data, and score them on held-out recorded frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from data_contracts.manifest import ManifestRef
 from data_contracts.training_sets import (
     LABEL_CONSISTENT,
     ORACLE,
-    REAL,
+    RECORDED,
     SYNTHETIC,
     LabelAgreement,
     TrainingSet,
@@ -80,8 +80,8 @@ def _train_and_score(
     label = f"{experiment.downstream.name} on {training_set}, seed {seed}"
     model = train_downstream(frames, downstream=experiment.downstream, seed=seed, label=label)
     tested = [(dataset.tested_frames, "test", str(training_set), [dataset.poses])]
-    if training_set == TrainingSet.of(REAL):
-        # Do the synthetic frames show what their labels say? The real row is the best they can do, labels of other
+    if training_set == TrainingSet.of(RECORDED):
+        # Do the synthetic frames show what their labels say? The recorded row is the best they can do, labels of other
         # frames the worst.
         for name, sets in generated.items():
             made = _of_seed(experiment, sets, seed)
@@ -109,7 +109,7 @@ def _frames_of(
     experiment: Experiment, dataset: PreparedDataset, generated: Generated, source: TrainingSource, seed: int
 ) -> ManifestRef:
     """The training frames of a source."""
-    if source.name == REAL:
+    if source.name == RECORDED:
         return dataset.tested_frames
     if source.name == ORACLE and dataset.more_frames is not None:
         return dataset.more_frames
@@ -137,12 +137,12 @@ def _of_seed(experiment: Experiment, sets: list[ManifestRef], seed: int) -> Mani
 def _distances(
     experiment: Experiment, feature_extractor: DownstreamChoice, dataset: PreparedDataset, generated: Generated
 ) -> tuple[ManifestRef, list[ManifestRef]]:
-    """The feature extractor, and how far held-out real and generated frames are from the real training frames."""
+    """The feature extractor, and how far held-out and generated frames are from the training frames."""
     extractor = train_downstream(
         [dataset.frames], downstream=feature_extractor, seed=experiment.seed, label="feature extractor"
     )
     frames = dataset.tested_frames
-    compared = [(frames, "test", "held-out real", 0)]
+    compared = [(frames, "test", "held-out recorded", 0)]
     compared += [(made, "train", name, number) for name, sets in generated.items() for number, made in enumerate(sets)]
     scores = [
         score_distance(

@@ -17,7 +17,7 @@ from tasks.ingest import ingest
 
 class PreparedDataset(Frozen):
     """Manifests of a dataset ready for training and sampling; `poses` are the recordings whose labels are sampled,
-    `more_frames` other real frames to train on, `target_frames` those of another dataset to train and test on.
+    `more_frames` other recorded frames to train on, `target_frames` those of another dataset to train and test on.
     """
 
     recordings: ManifestRef
@@ -31,7 +31,7 @@ class PreparedDataset(Frozen):
 
     @property
     def tested_frames(self) -> ManifestRef:
-        """What downstream models are trained on as `real`, and tested on."""
+        """What downstream models are trained on as `recorded`, and tested on."""
         return self.target_frames or self.frames
 
 
@@ -71,13 +71,13 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
 
 
 def _more_frames(experiment: Experiment) -> ManifestRef | None:
-    """Other real recordings to train on, where the experiment names some."""
+    """Other recordings to train on, where the experiment names some."""
     more = experiment.oracle
     if more is None:
         return None
-    recordings = ingest(dataset=more.dataset, label=f"{more.dataset.name}, more real recordings")
+    recordings = ingest(dataset=more.dataset, label=f"{more.dataset.name}, more recordings")
     windows = more.windows or experiment.windows
-    return encode(recordings, encoding=experiment.encoding, windows=windows, label="more real recordings")
+    return encode(recordings, encoding=experiment.encoding, windows=windows, label="more recordings")
 
 
 def condition_training_frames(

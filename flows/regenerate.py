@@ -109,7 +109,7 @@ def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: Mani
 
 
 def _score_likeness(regeneration: Regeneration, dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
-    """How far from real frames, where features can be learnt, and how near to single ones."""
+    """How far from recorded frames, where features can be learnt, and how near to single ones."""
     frames = dataset.frames
     downstream, extractor, scores = regeneration.feature_extractor, None, []
     if downstream is not None:
@@ -122,18 +122,18 @@ def _score_likeness(regeneration: Regeneration, dataset: PreparedDataset, synthe
                 synthetic,
                 downstream=downstream,
                 distances=distances,
-                label="beside real",
+                label="beside recorded",
             )
         )
     return [*scores, memorisation(frames, synthetic, extractor, downstream=downstream, subject=NAME, label=NAME)]
 
 
 def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
-    """How well a model trained on real frames does on held-out real ones, and finds the labels of these."""
+    """How well a model trained on recorded frames does on held-out recorded ones, and finds the labels of these."""
     frames, downstream, seed = dataset.tested_frames, regeneration.downstream, regeneration.downstream_seeds[0]
-    model = train_downstream([frames], downstream=downstream, seed=seed, label=f"{downstream.name} on real")
+    model = train_downstream([frames], downstream=downstream, seed=seed, label=f"{downstream.name} on recorded")
     scored = [
-        (frames, "test", "real", [dataset.poses]),
+        (frames, "test", "recorded", [dataset.poses]),
         (synthetic, "train", str(LabelAgreement(NAME)), []),
     ]
     return [
@@ -154,7 +154,7 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
 
 
 def _score_realism(dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
-    """Statistics of the version's frames beside those of real ones, and whether a network tells them apart."""
+    """Statistics of the version's frames beside those of recorded ones, and whether a network tells them apart."""
     return [realism(None, dataset.tested_frames, [synthetic], None, names=[NAME], label=NAME)]
 
 

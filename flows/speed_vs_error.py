@@ -185,11 +185,11 @@ def _errors(
     settings: list[SamplerSetting],
     runs: list[list[ManifestRef]],
 ) -> ManifestRef:
-    """Errors of all settings; with label errors by the model that `evaluate` trains on real frames."""
+    """Errors of all settings; with label errors by the model that `evaluate` trains on recorded frames."""
     experiment, model = measured.experiment, None
     if measured.options.label_errors:
         seed = experiment.downstream_seeds[0]
-        label = f"{experiment.downstream.name} on real, seed {seed}"
+        label = f"{experiment.downstream.name} on recorded, seed {seed}"
         model = train_downstream([dataset.tested_frames], downstream=experiment.downstream, seed=seed, label=label)
     return sampling_errors(
         extractor,

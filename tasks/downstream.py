@@ -1,4 +1,4 @@
-"""Train a downstream model on real frames, synthetic frames, or both."""
+"""Train a downstream model on recorded frames, synthetic frames, or both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Score downstream models on held-out real frames, and synthetic frames against real ones."""
+"""Score downstream models on held-out recorded frames, and synthetic frames against recorded ones."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def score_model(
 ) -> pa.Table:
     """Every metric on one split, for all rows and for each class, with an interval over recordings.
 
-    Classes that real training frames show, those that only the label-only recordings of `poses` have, and those
+    Classes that recorded training frames show, those that only the label-only recordings of `poses` have, and those
     that neither has are groups of their own: what synthetic data adds is in the second. So are subjects of whom there
     is nothing to learn from, beside others, and each of a few subjects (`ctlev_core.scoring.subsets`). Beside the table
     lie the scores of the single samples, from which two models can be compared in pairs. The subject of
@@ -272,13 +272,13 @@ def score_distance(
     split: str,
     seed: int,
 ) -> pa.Table:
-    """Distances between the features of real training frames and of another set of frames.
+    """Distances between the features of recorded training frames and of another set of frames.
 
-    A score is named after the classifier trained on real events whose features are compared, or as a ready-made
+    A score is named after the classifier trained on recorded events whose features are compared, or as a ready-made
     extractor asks: `fid` is that of the verified network alone. Values depend on the number of samples: compare rows of
-    equal `num_samples` only, and read them against the row of held-out real frames. Intervals come from halves by
+    equal `num_samples` only, and read them against the row of held-out recorded frames. Intervals come from halves by
     recording, for a bootstrap is biased. `seed` is that of the generator. Beside the scores lies the table
-    `distance_estimates`: the number of features, and what real training frames score against one another.
+    `distance_estimates`: the number of features, and what recorded training frames score against one another.
     """
     plugin = plugins.load_options(downstream)
     folder = extractor.ref.path / "model"

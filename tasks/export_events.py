@@ -29,7 +29,7 @@ from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef
 from tasks.stage import Output, stage
 
 MAX_WINDOWS = 64
-"""Real windows that times are learnt from, evenly spread over those of the training split."""
+"""Recorded windows that times are learnt from, evenly spread over those of the training split."""
 BLOCK_ROWS = 64
 READ_EVENTS = 1 << 20
 _COUNT_STREAM, _TIME_STREAM = 1, 2
@@ -94,7 +94,7 @@ def _learn(frames: Manifest, recordings: Manifest, plugin: plugins.Plugin) -> tu
     if not num_events[rows].all():
         raise DataError(
             f"{frames.ref.path}: row {rows[int(np.argmin(num_events[rows]))]} comes from a finished event image; "
-            "events can be drawn only where the real windows have events"
+            "events can be drawn only where the recorded windows have events"
         )
     histograms = frames.array("histograms")
     check_whole_counts(histograms.shape, frames.array("frames").shape, "export of events")

@@ -18,8 +18,8 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 MAX_OTHER_FRAMES = 5_000
-"""Of more other real, or generated, frames so many, evenly spread. Training frames are never left out: any of them may
-have been copied."""
+"""Of more other recorded, or generated, frames so many, evenly spread. Training frames are never left out: any of them
+may have been copied."""
 NUM_PAIRS = 10
 PICTURES = "small pictures"
 
@@ -37,8 +37,8 @@ def memorisation(
     """Rows of the task `memorisation`, one group for small pictures and, with a feature extractor, one for its
     features.
 
-    Other real frames are the training frames against those of other recordings; where all training frames are of one
-    recording, the test frames. The closest pairs lie beside the table.
+    Other recorded frames are the training frames against those of other recordings; where all training frames are of
+    one recording, the test frames. The closest pairs lie beside the table.
     """
     learnt, made = frames.rows_where(split="train"), generated.rows_where(split="train")
     made = made[spread(len(made), MAX_OTHER_FRAMES)]
@@ -47,7 +47,7 @@ def memorisation(
     other = other[spread(len(other), MAX_OTHER_FRAMES)]
     if not len(learnt) or not len(made) or not len(other):
         raise DataError(
-            f"memorisation: needs training, other real and generated frames, got {len(learnt)}, {len(other)} "
+            f"memorisation: needs training, other recorded and generated frames, got {len(learnt)}, {len(other)} "
             f"and {len(made)}"
         )
     ways: dict[str, Callable[[np.ndarray], np.ndarray]] = {PICTURES: small_pictures}

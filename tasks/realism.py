@@ -38,7 +38,7 @@ def realism(
     *,
     names: Sequence[str],
 ) -> pa.Table:
-    """Events of the test split beside those of the training split, and generated beside real training frames.
+    """Events of the test split beside those of the training split, and generated beside recorded training frames.
 
     `recordings` are those behind `frames`; None leaves events out. `reference` are other recordings that those of the
     training split are compared with, `names` those of the generators behind `generated`.
@@ -47,10 +47,10 @@ def realism(
     other recordings as a reference, `reference`. Settings: the two sets, `A against B` for their distances and
     `A against A` for the floor. Distributions lie beside the table.
 
-    How well a network tells frames apart is the metric `c2st`: generated from real training frames (`NAME against
-    real`) and from real test frames (`NAME against test`); its floors are the halves of either (`real against real`,
-    `test against test`) and test from training frames (`test against real`). Where there are too few frames there is no
-    such row; the table `two_sample_tests`, which lies beside, says why.
+    How well a network tells frames apart is the metric `c2st`: generated from recorded training frames (`NAME against
+    recorded`) and from recorded test frames (`NAME against test`); its floors are the halves of either (`recorded
+    against recorded`, `test against test`) and test from training frames (`test against recorded`). Where there are too
+    few frames there is no such row; the table `two_sample_tests`, which lies beside, says why.
     """
     found, tests = [], []
     if recordings is not None:
@@ -59,14 +59,14 @@ def realism(
         if reference is not None:
             found.append(_compare("reference", "reference", "train", _summarise_whole(reference), learnt, recordings))
     real = _summarise_frames(frames)
-    recorded = {"real": _read_frames(frames, "train"), "test": _read_frames(frames, "test")}
+    recorded = {"recorded": _read_frames(frames, "train"), "test": _read_frames(frames, "test")}
     floors = {
         **{f"{name} against {name}": two_sample.compare_halves(*of_split) for name, of_split in recorded.items()},
-        "test against real": _tell_apart("test", recorded["test"], "real", recorded["real"]),
+        "test against recorded": _tell_apart("test", recorded["test"], "recorded", recorded["recorded"]),
     }
     groups = ["frames", *(f"frames of {name}" for name in names[1:])]
     for group, name, made in zip(groups, names, generated, strict=True):
-        found.append(_compare(group, "real", name, real, _summarise_frames(made), made))
+        found.append(_compare(group, "recorded", name, real, _summarise_frames(made), made))
         own = {
             f"{name} against {other}": _tell_apart(name, _read_made_frames(made, others[1]), other, others)
             for other, others in recorded.items()

@@ -77,7 +77,7 @@ def report(
     """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, `provenance.json` and `summary.json`.
 
     `generated` are the frames of each generator: first the experiment's own, called `synthetic`, then the baselines; of
-    several sets of one name the first is shown. `oracle` are other real frames of the moments asked for, `target`
+    several sets of one name the first is shown. `oracle` are other recorded frames of the moments asked for, `target`
     those of another dataset that was tested on, `nearest` what of the training set is most like its classes.
     """
     if target is None:  # whose recordings are others
@@ -96,7 +96,7 @@ def report(
             *_roles("score of", [_score_name(manifest) for manifest in scores], scores),
             ("realism", realism.ref.path),
             *_roles("memorisation of", generator_names, memorisation),
-            *([] if oracle is None else [("more real frames", oracle.ref.path)]),
+            *([] if oracle is None else [("more recorded frames", oracle.ref.path)]),
             *([] if target is None else [("target frames", target.ref.path)]),
             *([] if nearest is None else [("nearest seen classes", nearest.ref.path)]),
         ]
@@ -183,14 +183,14 @@ def _figures(
 def _verdict(rows: list[Row], training_sets: Sequence[str], names: list[str], paired: PairedScores) -> str:
     metric = _first_metric(rows)
     own, *others = names
-    beside = {other: paired.difference(f"real+{other}", f"real+{own}", metric) for other in others}
-    gain = paired.difference("real", "real+oracle", metric)
-    trainings = [paired.of(training_set, metric) for training_set in ("real", f"real+{own}", "real+oracle")]
+    beside = {other: paired.difference(f"recorded+{other}", f"recorded+{own}", metric) for other in others}
+    gain = paired.difference("recorded", "recorded+oracle", metric)
+    trainings = [paired.of(training_set, metric) for training_set in ("recorded", f"recorded+{own}", "recorded+oracle")]
     start, reached, most = trainings
     oracle = None
     if gain is not None and start is not None and reached is not None and most is not None:
         oracle = gain, share_of_gain(start, reached, most)
-    added, instead = (paired.difference("real", training_set, metric) for training_set in (f"real+{own}", own))
+    added, instead = (paired.difference("recorded", training_set, metric) for training_set in (f"recorded+{own}", own))
     return verdict(rows, training_sets, added, beside, oracle, instead)
 
 

@@ -1,4 +1,4 @@
-"""Score a version of synthetic data beside held-out real frames."""
+"""Score a version of synthetic data beside held-out recorded frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ def score_beside_real(
     downstream: DownstreamChoice,
     distances: list[MetricChoice],
 ) -> pa.Table:
-    """Distances of held-out real and of generated frames to the real training frames, in a classifier's features.
+    """Distances of held-out recorded and of generated frames to the recorded training frames, in a classifier's
+    features.
 
     Equally many of either, evenly spread, because a Frechet distance grows as frames get fewer: only so is their ratio
     what generating costs. It says nothing of single frames, and has no interval.

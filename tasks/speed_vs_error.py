@@ -96,9 +96,9 @@ def sampling_errors(
     Args:
         out: of the stage.
         extractor: the model in whose features frames are compared.
-        frames: with the held-out real frames, split `test`.
+        frames: with the held-out recorded frames, split `test`.
         conditions: what was asked for.
-        model: a downstream model trained on real frames, which says whether samples show their labels; or None.
+        model: a downstream model trained on recorded frames, which says whether samples show their labels; or None.
         reference: timed samples of the reference, one a seed.
         converged: timed samples of the probability-flow equation's solution, of some of the seeds.
         runs: timed samples of every setting and seed, the seeds of a setting together.

@@ -32,7 +32,7 @@ def take_label_consistent(
     metric: MetricChoice,
     share: float,
 ) -> pa.Table:
-    """The share of each class whose labels a model trained on real frames finds best.
+    """The share of each class whose labels a model trained on recorded frames finds best.
 
     It chooses within classes, so that the mixture of classes, and with it what is easy, stays as it was. Rows that the
     metric has no score for are left out first.

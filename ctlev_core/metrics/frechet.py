@@ -4,8 +4,9 @@ The features come from the caller, who has to name the extractor beside the scor
 extractors do not compare, and only Inception's may be called FID. Values of sets of different sizes do not compare
 either; `fd_infinity` and `kid` do. How sure a value is says `ctlev_core.statistics.feature_distances`.
 
-Instead of the real training frames, a file may be the reference: mean and covariance of features of a published set, as
-pytorch-fid writes them. It does not say which extractor they are from, nor of how many images: that has to be known.
+Instead of the recorded training frames, a file may be the reference: mean and covariance of features of a published
+set, as pytorch-fid writes them. It does not say which extractor they are from, nor of how many images: that has to be
+known.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Options(Frozen):
     """The reference."""
 
     statistics: str = Field(
-        default="", description=".npz file with mu and sigma of the reference; empty = the real training frames"
+        default="", description=".npz file with mu and sigma of the reference; empty = the recorded training frames"
     )
 
     @field_serializer("statistics", when_used="json")

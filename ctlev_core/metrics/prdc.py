@@ -1,7 +1,7 @@
 """Precision, recall, density and coverage of features; see `ctlev_core.scoring.prdc` for what they are.
 
-They tell apart what one distance mixes: images unlike any real one (precision, density) and real ones that nothing
-resembles (recall, coverage). They depend on the sizes of both sets.
+They tell apart what one distance mixes: images unlike any recorded one (precision, density) and recorded ones that
+nothing resembles (recall, coverage). They depend on the sizes of both sets.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def place_events(
             latest possible start its events start.
         uniforms: [2, E] float64, 0 .. 1 without 1, for the gap before each event and for its polarity.
         gaps: [G] float64, times between two events of a real pixel, in windows, pixel after pixel.
-        patterns: [P + 1] int64, where the gaps of each real pixel start.
+        patterns: [P + 1] int64, where the gaps of each recorded pixel start.
         ranges: [M, 2] int64, the patterns to draw from for 2, 3, ... M + 1 or more events; none is empty.
         keep_polarity: probability that an event has the polarity of the one before, where both are left.
         duration_us: of the window.

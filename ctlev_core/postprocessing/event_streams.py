@@ -1,6 +1,6 @@
-"""From counts to event streams: time stamps inside a window, drawn so that they look like those of real windows.
+"""From counts to event streams: time stamps inside a window, drawn so that they look like those of recorded windows.
 
-A histogram says how often a pixel fired, not when. What real windows say about that is fitted (`fit_times`):
+A histogram says how often a pixel fired, not when. What recorded windows say about that is fitted (`fit_times`):
 
     gaps          times between the events of a pixel, in windows: those of a real pixel with as many events
     starts        where in the window a pixel's events start, between the earliest and the latest possible: 0 .. 1. Of
@@ -10,8 +10,8 @@ A histogram says how often a pixel fired, not when. What real windows say about 
     durations     of windows with about as many events
 
 The three ways to spread the events of a pixel, from the simplest: `uniform`, each on its own anywhere in the window;
-`paced`, with real gaps from a start of its own; `field`, with real gaps from starts that a smooth field gives. Which
-way an edge moves is not in an image: neighbours share a time, but which side of an edge was first is made up.
+`paced`, with recorded gaps from a start of its own; `field`, with recorded gaps from starts that a smooth field gives.
+Which way an edge moves is not in an image: neighbours share a time, but which side of an edge was first is made up.
 
 An image without polarity gives events that are all positive, as the event sets without polarity have them: the counts
 say nothing else, and a drawn polarity would look like a measured one.
@@ -35,9 +35,9 @@ Spread = Literal["uniform", "paced", "field"]
 
 LAGS_PX = (1, 2, 4, 8)
 MAX_PIXELS = 1 << 16
-"""Real pixels whose gaps are kept, evenly spread."""
+"""Recorded pixels whose gaps are kept, evenly spread."""
 LEAST_PIXELS = 16
-"""Gaps are drawn from at least so many real pixels, also of other numbers of events where there are too few."""
+"""Gaps are drawn from at least so many recorded pixels, also of other numbers of events where there are too few."""
 NUM_LIKE = 16
 """A duration is that of one of so many windows with the most similar numbers of events."""
 LONGEST_LENGTH_PX = 32.0
@@ -45,12 +45,12 @@ LONGEST_LENGTH_PX = 32.0
 
 @dataclass(frozen=True, eq=False)
 class TimeModel:
-    """How R real windows spread their events; see the head of this file.
+    """How R recorded windows spread their events; see the head of this file.
 
     Attributes:
         num_events: [R] int64, ascending.
         durations_us: [R] int64, of the same windows, from the first to the last event.
-        gaps: [G] float64, in windows, of P real pixels with two events or more, by number of events.
+        gaps: [G] float64, in windows, of P recorded pixels with two events or more, by number of events.
         patterns: [P + 1] int64, where the gaps of each of them start.
         ranges: [M, 2] int64, which of them pixels with 2, 3, ... M + 1 or more events draw from.
         length_px: of the field of starts.
@@ -69,7 +69,7 @@ class TimeModel:
 
 
 def fit_times(windows: Iterable[Events]) -> TimeModel:
-    """Learn gaps, starts, polarities and durations from real windows.
+    """Learn gaps, starts, polarities and durations from recorded windows.
 
     Args:
         windows: the events of one window each; those without two events at different times say nothing.
@@ -78,7 +78,7 @@ def fit_times(windows: Iterable[Events]) -> TimeModel:
     """
     found = [_measure(window) for window in windows if len(window) and window.t[-1] > window.t[0]]
     if not found:
-        raise DataError("times cannot be learnt: no real window has two events at different times")
+        raise DataError("times cannot be learnt: no recorded window has two events at different times")
     gaps = _gaps_by_size([pixel for of in found for pixel in of.gaps])
     correlations = [_rank_correlation([of.neighbours[lag] for of in found]) for lag in range(len(LAGS_PX))]
     length_px, scatter = _fit_field(np.array(correlations))
@@ -118,7 +118,7 @@ def sample_streams(
 
 
 def sample_duration_us(num_events: int, model: TimeModel, rng: np.random.Generator) -> int:
-    """The duration of one of the `NUM_LIKE` real windows whose numbers of events are closest, as ratios."""
+    """The duration of one of the `NUM_LIKE` recorded windows whose numbers of events are closest, as ratios."""
     ratios = np.abs(np.log(model.num_events / max(num_events, 1)))
     closest = np.argsort(ratios, kind="stable")[:NUM_LIKE]
     # All that are as close as the last of them: windows of equal numbers of events are all alike.

@@ -1,17 +1,17 @@
 """From event images back to counts: the inverse of the event histogram's rendering, as far as there is one.
 
 An image holds v = min(255, floor(255 count / full scale)). Two things are lost: the full scale, and the counts of
-saturated pixels. Both are found again from what real windows say (`fit_counts`):
+saturated pixels. Both are found again from what recorded windows say (`fit_counts`):
 
-* Full scale. The values of a real image lie on the levels floor(255 k / scale), k = 0, 1, 2, ..., which few scales
-  explain. Of those the one is taken under which the counts are most probable, given how often real windows of such a
-  scale have each count. The values of a generated image scatter around levels: of a grid of scales, each blurred by
+* Full scale. The values of a recorded image lie on the levels floor(255 k / scale), k = 0, 1, 2, ..., which few scales
+  explain. Of those the one is taken under which the counts are most probable, given how often recorded windows of such
+  a scale have each count. The values of a generated image scatter around levels: of a grid of scales, each blurred by
   decoders of several widths, the one is taken under which the values and the number of events are most probable, and
   for each value the most probable count. So faint values become events only where levels lie that close.
-* Saturated pixels. Their counts are drawn from the real ones, as multiples of the full scale. With `three_sigma` the
-  full scale follows from all counts, so they are then changed, event by event, until it does.
+* Saturated pixels. Their counts are drawn from the recorded ones, as multiples of the full scale. With `three_sigma`
+  the full scale follows from all counts, so they are then changed, event by event, until it does.
 
-Rendered again, the counts give a real image exactly. For a generated image there are in general no counts that do;
+Rendered again, the counts give a recorded image exactly. For a generated image there are in general no counts that do;
 `CountEstimate` says how far it moved. Exactness ends where full scales are above 255: with `three_sigma` isolated
 events are then black.
 """
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ctlev_core.encodings.event_histogram import Options
 
 MAX_WINDOWS = 256
-"""Real windows learnt from, evenly spread."""
+"""Recorded windows learnt from, evenly spread."""
 MAX_SCALES = 256
 BLURS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0)
 """Standard deviations of the decoders tried, grey levels."""
@@ -40,11 +40,11 @@ FAINT = 26
 """Values below do not decide about the scale: what a decoder makes of the many black pixels would outweigh the rest."""
 NUM_QUANTILES = 257
 LEAST_DEVIATION = 0.1
-"""Of the logarithm of the number of events: where all real windows have equally many, images may still have others."""
+"""Of the logarithm of the number of events: where recorded windows have equally many, images may have others."""
 BANDWIDTH = 0.1
-"""Of the smoothing over full scales, natural logarithm: real windows within 10 % lend one another their counts."""
+"""Of the smoothing over full scales, natural logarithm: recorded windows within 10 % lend one another their counts."""
 _FLOOR = 1e-9
-"""Probability of a count, or value, that no real window has, so that one such pixel does not decide alone."""
+"""Probability of a count, or value, that no recorded window has, so that one such pixel does not decide alone."""
 _CHANCE = 0.05
 """Levels that random values would fit with more probability than this say nothing."""
 _MAX_RANGES = 1 << 14
@@ -54,17 +54,17 @@ _NUM_DRAWS = 1 << 10
 
 @dataclass(frozen=True, eq=False)
 class CountModel:
-    """What real windows say about the counts behind an image.
+    """What recorded windows say about the counts behind an image.
 
     Attributes:
         options: of the event histogram.
-        full_scales: [R] float64, of R real windows: the count that became 255; 1 where it was less.
+        full_scales: [R] float64, of R recorded windows: the count that became 255; 1 where it was less.
         count_shares: [R, 256] float64, cells with each count over all cells of the window; larger ones in the last.
         grid: [G] float64, ascending: full scales that generated images may have.
         log_probabilities: [G, B, 256] float64, of each value at each of these scales, after each of B blurs, among the
             values that are not faint; 0 for those that are.
         counts: [G, B, 256] float32, the most probable count of each value there, that of saturated cells on average.
-        log_num_events: mean and standard deviation of the logarithm of the number of events of real windows.
+        log_num_events: mean and standard deviation of the logarithm of the number of events of recorded windows.
         excess: [Q] float64, ascending: quantiles of count / full scale of saturated cells, at least 1.
     """
 
@@ -97,10 +97,10 @@ class CountEstimate:
 
 
 def fit_counts(histograms: np.ndarray, options: Options) -> CountModel:
-    """Learn full scales, counts and saturated counts from real windows.
+    """Learn full scales, counts and saturated counts from recorded windows.
 
     Args:
-        histograms: [N, C, H, W] uint16, counts of real windows as the event histogram encodes them.
+        histograms: [N, C, H, W] uint16, counts of recorded windows as the event histogram encodes them.
         options: of the event histogram.
     Raises:
         DataError: no window has an event.
@@ -112,7 +112,7 @@ def fit_counts(histograms: np.ndarray, options: Options) -> CountModel:
     values = encoding.render_image(counts, options)[..., 0]  # checks shape and dtype
     counts = counts[counts.any(axis=(1, 2, 3))]
     if len(counts) == 0:
-        raise DataError(f"counts cannot be learnt: none of {len(values)} real windows has an event")
+        raise DataError(f"counts cannot be learnt: none of {len(values)} recorded windows has an event")
     scales = np.maximum(encoding.full_scales(counts, options), 1.0)
     shares = np.stack([np.bincount(np.minimum(row, 255).reshape(-1), minlength=256) for row in counts])
     shares = shares / counts[0].size
@@ -175,7 +175,7 @@ def _grid(scales: np.ndarray, options: Options) -> np.ndarray:
 
 
 def _shares_at(scale: float, scales: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Share of cells [256] with each count at a full scale: mean of the real windows, those of like scale most."""
+    """Share of cells [256] with each count at a full scale: mean of the recorded windows, those of like scale most."""
     distances = np.log(scales / scale) ** 2 / (2 * BANDWIDTH**2)
     weights = np.exp(distances.min() - distances)
     return weights @ shares / weights.sum() + _FLOOR

@@ -1,15 +1,16 @@
 """Refuse generated images that cannot be event images: empty, saturated, or of other colours.
 
-What is refused follows from real training frames: for each number below the range of their central 98 %, its odds
-widened on either side by a factor, so that a real frame practically always passes and only gross failures are refused.
-A filter that is any narrower would choose which images are liked, and make scores of the generator better than it is.
+What is refused follows from recorded training frames: for each number below the range of their central 98 %, its odds
+widened on either side by a factor, so that a recorded frame practically always passes and only gross failures are
+refused. A filter that is any narrower would choose which images are liked, and make scores of the generator better than
+it is.
 
     active_share    pixels whose largest channel is at least 26 of 255
     brightness      mean of the largest channel, over 255
     bright_share    active pixels at 250 or more, over active pixels
     off_palette     with polarity: sum of green, over the sum of the largest channel; without: sum of the difference of
-                    largest and smallest channel, over the sum of the largest. Real frames have 0; what a decoder adds
-                    is let pass up to `MAX_OFF_PALETTE`
+                    largest and smallest channel, over the sum of the largest. Recorded frames have 0; what a decoder
+                    adds is let pass up to `MAX_OFF_PALETTE`
 
 A refused row is sampled again with a seed that follows from its own (`seed_of_attempt`), so that every row can still be
 made again alone, whatever happened to the others.
@@ -62,7 +63,7 @@ class FilteredImages:
 
 
 def fit_quality_filter(frames: np.ndarray, *, polarity: bool) -> QualityFilter:
-    """The ranges of real training frames.
+    """The ranges of recorded training frames.
 
     Args:
         frames: [N, H, W, 3] uint8, N >= 1.
@@ -73,7 +74,7 @@ def fit_quality_filter(frames: np.ndarray, *, polarity: bool) -> QualityFilter:
     """
     numbers = measure_images(frames, polarity=polarity)
     if not len(frames) or not numbers["active_share"].any():
-        raise DataError(f"a quality filter needs real frames that are not black, got {len(frames)} frames")
+        raise DataError(f"a quality filter needs recorded frames that are not black, got {len(frames)} frames")
     ranges = {}
     for name, values in numbers.items():
         low, high = np.quantile(values, [0.01, 0.99])

@@ -1,9 +1,9 @@
 """Whole event counts from the grey values of a sampled image, by stochastic rounding.
 
-A decoder spreads what it is unsure of: where every other real window has one event it gives half of one, and such
-values no real image has. Stochastic rounding keeps the expected count of each pixel, so that sparse noise stays as
+A decoder spreads what it is unsure of: where every other recorded window has one event it gives half of one, and such
+values no recorded image has. Stochastic rounding keeps the expected count of each pixel, so that sparse noise stays as
 dense as it was; the most probable count, which `ctlev_core.postprocessing.image_counts` finds, would remove it. The
-number of events is that of a real window drawn at random: normalised images say nothing about it.
+number of events is that of a recorded window drawn at random: normalised images say nothing about it.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ def round_stochastically(
     Args:
         frames: [N, H, W, 3] uint8; with polarity red = positive and blue = negative (green is not looked at), without
             the mean of the channels counts.
-        num_events: [R] events in each of R >= 1 real windows.
+        num_events: [R] events in each of R >= 1 recorded windows.
         polarity: of the event histogram.
         seeds: N seeds; a row depends on its own alone.
     Returns:
         [N, C, H, W] uint16, two channels with polarity. A black image stays without events.
     Raises:
-        ValueError: another shape or dtype, another number of seeds, or no real window.
+        ValueError: another shape or dtype, another number of seeds, or no recorded window.
     """
     if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
         raise ValueError(f"frames must be [N, H, W, 3] uint8, got {frames.shape} {frames.dtype}")
     if len(seeds) != len(frames) or not len(num_events):
         raise ValueError(
-            f"expected one seed a frame and real windows, got {len(seeds)} seeds for {len(frames)} frames and "
+            f"expected one seed a frame and recorded windows, got {len(seeds)} seeds for {len(frames)} frames and "
             f"{len(num_events)} windows"
         )
     channels = 2 if polarity else 1
@@ -77,8 +77,8 @@ def round_frames(frames: np.ndarray, num_events: np.ndarray, encoder: Plugin, se
 
     Args:
         frames: [N, H, W, 3] uint8.
-        num_events: [R] events in each of R >= 1 real windows.
-        encoder: an event histogram, that of the real windows.
+        num_events: [R] events in each of R >= 1 recorded windows.
+        encoder: an event histogram, that of the recorded windows.
         seeds: N seeds; a row depends on its own alone.
     """
     counts = round_stochastically(frames, num_events, polarity=encoder.options.polarity, seeds=seeds)

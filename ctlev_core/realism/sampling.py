@@ -1,4 +1,4 @@
-"""How real sampled frames look: a two-sample test against held-out real frames, active and isolated pixels."""
+"""How real sampled frames look: a two-sample test against held-out recorded frames, active and isolated pixels."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ STATISTICS = ("active_pixel_share", "isolated_pixel_share")
 def realism_of_samples(
     frames: np.ndarray, groups: Sequence[str], real: np.ndarray, recordings: Sequence[str]
 ) -> list[Measurement]:
-    """`c2st` against held-out real frames, and statistics of the samples.
+    """`c2st` against held-out recorded frames, and statistics of the samples.
 
     Args:
         frames: [N, H, W, 3] uint8, samples of one subject.
         groups: [N] condition of each.
-        real: [M, H, W, 3] uint8, held-out real frames.
+        real: [M, H, W, 3] uint8, held-out recorded frames.
         recordings: [M] recording of each.
     Returns:
         What there are enough frames for: nothing with fewer than `MIN_FRAMES` samples.
@@ -32,7 +32,7 @@ def realism_of_samples(
 
 
 def realism_of_real(real: np.ndarray, recordings: Sequence[str]) -> list[Measurement]:
-    """The same of the held-out real frames: `c2st` between their halves, and their statistics."""
+    """The same of the held-out recorded frames: `c2st` between their halves, and their statistics."""
     told = compare_halves(real, np.array(recordings, str))
     return _measured(C2ST + OF_HALVES, told) + _statistics(HELD_OUT, real, recordings)
 

@@ -11,9 +11,9 @@ from data_contracts.errors import DataError
 from data_contracts.published import GateCheck
 from data_contracts.regeneration import Gates
 
-HELD_OUT = "held-out real"
+HELD_OUT = "held-out recorded"
 SYNTHETIC = "synthetic"
-REAL = "real"
+RECORDED = "recorded"
 
 
 def check_gates(
@@ -24,7 +24,7 @@ def check_gates(
     Args:
         gates: thresholds; those that are None are left out.
         scores: rows of the table `scores`: distances of `HELD_OUT` and `SYNTHETIC` frames, of equally many; scores of
-            the model trained on real frames, subject `REAL`, and of that model on the version's frames; copies;
+            the model trained on recorded frames, subject `REAL`, and of that model on the version's frames; copies;
             realism.
         task: of that model; its first score decides.
         labels_of: subject of its scores on the version's frames.
@@ -35,10 +35,10 @@ def check_gates(
     checks: list[GateCheck] = []
     if gates.max_distance_ratio is not None:
         floor, value = (_find(scores, "distance", subject, ("fd_event_", "fid")) for subject in (HELD_OUT, SYNTHETIC))
-        score = "Frechet distance to the real training frames"
+        score = "Frechet distance to the recorded training frames"
         checks.append(_check("max_distance_ratio", score, value["value"], gates.max_distance_ratio * floor["value"]))
     if gates.max_label_error_ratio is not None:
-        floor, value = (_find(scores, task, subject) for subject in (REAL, labels_of))
+        floor, value = (_find(scores, task, subject) for subject in (RECORDED, labels_of))
         score = f"error of labels, {value['metric']}"
         checks.append(
             _check("max_label_error_ratio", score, _error(value), gates.max_label_error_ratio * _error(floor))
@@ -48,7 +48,7 @@ def check_gates(
         shares = [row["value"] for row in copies if row["metric"] == "close_share"]
         if not shares:
             raise DataError("gate max_memorised_share: nothing was searched for copies")
-        # Where many real frames are alike the threshold of `close_share` is 0, which no distance is below.
+        # Where many recorded frames are alike the threshold of `close_share` is 0, which no distance is below.
         shares += [row["value"] / row["num_samples"] for row in copies if row["metric"] == "duplicates"]
         checks.append(_check("max_memorised_share", "share of copies", max(shares), gates.max_memorised_share))
     if gates.max_rejected_share is not None:
@@ -65,16 +65,17 @@ def _check_realism(gates: Gates, scores: Sequence[dict[str, Any]]) -> list[GateC
         value = found.get((f"{SYNTHETIC} against test", C2ST))
         if value is None:
             raise DataError(
-                f"gate max_c2st: needs {MIN_FRAMES} frames of the version and as many held-out real ones, of several "
+                f"gate max_c2st: needs {MIN_FRAMES} frames of the version and as many held-out recorded ones, of "
+                "several "
                 "recordings"
             )
-        score = "area under the ROC curve, told from held-out real frames"
+        score = "area under the ROC curve, told from held-out recorded frames"
         checks.append(_check("max_c2st", score, value, gates.max_c2st))
-    known = {name: value for (subject, name), value in found.items() if subject == f"{SYNTHETIC} against real"}
+    known = {name: value for (subject, name), value in found.items() if subject == f"{SYNTHETIC} against recorded"}
     for name, limit in (gates.max_realism_distances or {}).items():
         if name not in known:
             raise DataError(f"gate max_realism_distances: expected names of {', '.join(sorted(known))}; got {name!r}")
-        checks.append(_check("max_realism_distances", f"{name} against real", known[name], limit))
+        checks.append(_check("max_realism_distances", f"{name} against recorded", known[name], limit))
     return checks
 
 

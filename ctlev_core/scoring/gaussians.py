@@ -49,7 +49,7 @@ class GaussianFactor:
 
 
 def check_features(features: np.ndarray, name: str, *, least_rows: int = 2, first_row: int = 0) -> np.ndarray:
-    """The features themselves, of any real dtype.
+    """The features themselves, of any recorded dtype.
 
     Raises:
         ValueError: not real [N, D], fewer rows than `least_rows`, or a value is not finite; names the first such row,

@@ -1,10 +1,11 @@
-"""Does a generator copy? How near its frames lie to training frames, against how near other real frames lie to them.
+"""Does a generator copy? How near its frames lie to training frames, against how near other recorded frames lie to
+them.
 
-Other real frames are those of other recordings: a frame beside another of the same recording resembles it without being
-copied. A generated frame is called close where it is nearer to a training frame than the closest 1 % of the other real
-frames are to theirs; of a generator that does not copy, about 1 % are. Frames are compared in features of a network, or
-as small blurred pictures (`small_pictures`), by Euclidean distance. Both see copies that are mirrored or shifted badly,
-and neither says why a frame is close: look at the closest pairs.
+Other recorded frames are those of other recordings: a frame beside another of the same recording resembles it without
+being copied. A generated frame is called close where it is nearer to a training frame than the closest 1 % of the other
+recorded frames are to theirs; of a generator that does not copy, about 1 % are. Frames are compared in features of a
+network, or as small blurred pictures (`small_pictures`), by Euclidean distance. Both see copies that are mirrored or
+shifted badly, and neither says why a frame is close: look at the closest pairs.
 
 Sources: Somepalli et al., Diffusion Art or Digital Forgery?, CVPR 2023 (nearest neighbours and their figure); Meehan,
 Chaudhuri & Dasgupta, A Non-Parametric Test to Detect Data-Copying in Generative Models, AISTATS 2020 (generated to
@@ -34,7 +35,7 @@ CLOSEST_PAIRS = TableSchema(
         Column("generated_row", pa.int64(), "row of the generated frame", minimum=0),
         Column("training_row", pa.int64(), "row of the training frame", minimum=0),
         Column("distance", pa.float64(), "Euclidean, in the features", minimum=0),
-        Column("threshold", pa.float64(), "the distance that 1 % of other real frames lie below", minimum=0),
+        Column("threshold", pa.float64(), "the distance that 1 % of other recorded frames lie below", minimum=0),
     ),
 )
 
@@ -47,16 +48,16 @@ _ROUNDING = 4 * float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True, eq=False)
 class MemorisationCheck:
-    """Distances of N generated and M other real frames to their nearest training frames.
+    """Distances of N generated and M other recorded frames to their nearest training frames.
 
     Attributes:
         distances: [N] float64, generated to nearest training frame.
         nearest: [N] int64, that training frame; the first where several are equally near.
-        real_distances: [M] float64, other real to nearest training frame of another recording.
+        real_distances: [M] float64, other recorded to nearest training frame of another recording.
         threshold: quantile `NEAR_QUANTILE` of `real_distances`.
         close_share: share of generated frames nearer than the threshold.
-        low: lower end of the 95 % interval of `close_share`, under resampling of the frames and of the real recordings.
-        high: upper end. Both NaN where there are fewer than two real recordings, or generated frames.
+        low: lower end of the 95 % interval of `close_share`, under resampling of the frames and of the recordings.
+        high: upper end. Both NaN where there are fewer than two recordings, or generated frames.
         num_duplicates: generated frames equal to a training frame in all features.
         ratio: median of `distances` / median of `real_distances`; NaN where the latter is 0.
     """
@@ -95,18 +96,19 @@ def check_memorisation(
 ) -> MemorisationCheck:
     """Compare generated with training frames; see the head of this file.
 
-    With fewer than 100 other real frames the threshold is hardly more than the smallest of their distances.
+    With fewer than 100 other recorded frames the threshold is hardly more than the smallest of their distances.
 
     Args:
         generated: [N, D] features, N >= 1.
         training: [T, D] features of the frames the generator learnt from, T >= 1.
-        real: [M, D] features of other real frames, M >= 1; the training frames themselves may be given again.
+        real: [M, D] features of other recorded frames, M >= 1; the training frames themselves may be given again.
         training_recordings: [T] recording of each training frame.
-        real_recordings: [M] recording of each other real frame; it is not compared with training frames of the same.
+        real_recordings: [M] recording of each other recorded frame; it is not compared with training frames of the
+            same.
         seed: of the resampling.
     Raises:
         ValueError: shapes do not fit, a set is empty, a value is not finite (names the row), or all training frames are
-            of one recording and so is a real frame.
+            of one recording and so is a recorded frame.
     """
     distances, nearest = nearest_rows(generated, training)
     real_distances, _ = nearest_rows(real, training, row_groups=real_recordings, reference_groups=training_recordings)
@@ -234,7 +236,7 @@ def _nearest_of(row: np.ndarray, references: np.ndarray, chosen: np.ndarray) -> 
 
 
 def _interval(distances: np.ndarray, real: np.ndarray, recordings: np.ndarray, seed: int) -> tuple[float, float]:
-    """Percentiles of the share of close frames over replicates of both sets; whole recordings of the real one."""
+    """Percentiles of the share of close frames over replicates of both sets; whole recordings of the recorded one."""
     _, group = np.unique(recordings, return_inverse=True)
     if group.max(initial=0) == 0 or len(distances) < 2:
         return float("nan"), float("nan")

@@ -28,12 +28,12 @@ def origin_groups(class_names: Sequence[str], real: Collection[str], sampled: Co
 
     Args:
         class_names: [N].
-        real: classes of the real training frames.
+        real: classes of the recorded training frames.
         sampled: classes that synthetic frames were asked for.
     """
     seen = set(real)
     parts = {
-        "classes with real training frames": seen,
+        "classes with recorded training frames": seen,
         "classes with synthetic frames only": set(sampled) - seen,
         "classes without training frames": set(class_names) - seen - set(sampled),
     }
@@ -50,7 +50,7 @@ def subject_groups(subjects: Sequence[str], recordings: Sequence[str], learnt: C
     Args:
         subjects: [N].
         recordings: [N].
-        learnt: subjects of the real training frames, and of the poses that synthetic frames were asked for.
+        learnt: subjects of the recorded training frames, and of the poses that synthetic frames were asked for.
     """
     present = sorted(set(subjects))
     parts = {

@@ -1,4 +1,4 @@
-"""How sure is a distance between two sets of features, and how far apart are two halves of the real one?
+"""How sure is a distance between two sets of features, and how far apart are two halves of the recorded one?
 
 A percentile bootstrap of a Frechet distance is no interval: a resampled set has fewer different rows than the set, so
 its distance is larger, and all replicates may lie above the value itself. Here both sets are cut at random into two
@@ -33,17 +33,17 @@ DISTANCE_ESTIMATES = TableSchema(
     1,
     None,
     (
-        Column("subject", pa.string(), "which frames are compared with the real training frames"),
+        Column("subject", pa.string(), "which frames are compared with the recorded training frames"),
         Column("metric", pa.string(), "score, with the extractor"),
         Column("value", pa.float64(), "of all frames"),
         Column("low", pa.float64(), "lower end of its 95 % interval, from halves by recording", nullable=True),
         Column("high", pa.float64(), "upper end", nullable=True),
         Column("halved", pa.float64(), "mean over halves of both sets; compare with the floor", nullable=True),
-        Column("floor", pa.float64(), "mean between the halves of the real training frames", nullable=True),
+        Column("floor", pa.float64(), "mean between the halves of the recorded training frames", nullable=True),
         Column("floor_low", pa.float64(), "central 95 % of the floor over the halvings, lower end", nullable=True),
         Column("floor_high", pa.float64(), "upper end", nullable=True),
         Column("num_predicted", pa.int64(), "frames compared", minimum=1),
-        Column("num_target", pa.int64(), "real training frames", minimum=1),
+        Column("num_target", pa.int64(), "recorded training frames", minimum=1),
         Column("num_features", pa.int64(), "features of a frame", minimum=1),
     ),
 )

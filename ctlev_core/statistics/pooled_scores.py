@@ -38,9 +38,9 @@ import pyarrow as pa
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from ctlev_core.statistics.paired_differences import NUM_RESAMPLES, Difference
 from data_contracts.errors import DataError
-from data_contracts.training_sets import ORACLE, REAL, LabelAgreement, TrainingSet
+from data_contracts.training_sets import ORACLE, RECORDED, LabelAgreement, TrainingSet
 
-WITHOUT_GENERATOR = (REAL, ORACLE)
+WITHOUT_GENERATOR = (RECORDED, ORACLE)
 """Settings made of these alone learnt from no generator's frames."""
 _LEVEL = 0.975
 _NORMAL = 1.959964

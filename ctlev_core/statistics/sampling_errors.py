@@ -1,4 +1,4 @@
-"""How far sampled frames are from real frames, from a reference's frames, and image by image from a solution."""
+"""How far sampled frames are from recorded frames, from a reference's frames, and image by image from a solution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, bootstrap_interval
 from ctlev_core.statistics.feature_distances import DistanceEstimate, estimate_distances
 from data_contracts.labels import Labels
 
-HELD_OUT, REFERENCE, CONVERGED, LABELS = "held-out real frames", "reference", "converged solution", "labels asked for"
+HELD_OUT, REFERENCE, CONVERGED, LABELS = (
+    "held-out recorded frames",
+    "reference",
+    "converged solution",
+    "labels asked for",
+)
 EXACT, FLOAT64 = "exact solution", "float64"
 """What is compared with."""
 FD, KID = "fd_event", "kid"
@@ -20,8 +25,8 @@ OF_HALVES = "_halves"
 """Ends the name of a distance between halves of the sets, which compares with the floor: that of the reference's own
 halves, as small and as biased."""
 EXCESS = "_excess"
-"""Ends the name of a distance minus that of the reference, over the same conditions, seeds and real frames: what these
-have in common falls out, so that its interval is much narrower than that of either distance."""
+"""Ends the name of a distance minus that of the reference, over the same conditions, seeds and recorded frames: what
+these have in common falls out, so that its interval is much narrower than that of either distance."""
 PIXEL_RMS, PIXEL_MAX = "pixel_rms_levels", "pixel_max_levels"
 LATENT_ERROR = "relative_latent_error"
 WASSERSTEIN, TRAJECTORY = "wasserstein_1", "trajectory_rms"
@@ -50,11 +55,11 @@ class FeatureSet:
 
 
 def feature_errors(sampled: FeatureSet, real: FeatureSet, reference: FeatureSet | None) -> list[Measurement]:
-    """Frechet and kernel distances to held-out real frames and, unless None, to the frames of the reference.
+    """Frechet and kernel distances to held-out recorded frames and, unless None, to the frames of the reference.
 
     Distances to the reference are given between halves too, since those between the reference's own halves, `floors`,
     are what a sampler of the same distribution would get; and where the rows are those of the reference's first rows,
-    how much farther they are from real frames than the reference, in pairs.
+    how much farther they are from recorded frames than the reference, in pairs.
     """
     found = []
     for against, target in ((HELD_OUT, real), (REFERENCE, reference)):
@@ -71,7 +76,7 @@ def feature_errors(sampled: FeatureSet, real: FeatureSet, reference: FeatureSet 
 
 
 def _excess(sampled: FeatureSet, reference: FeatureSet, real: FeatureSet) -> list[Measurement]:
-    """Distances to real frames minus those of the reference, every half cut through both alike."""
+    """Distances to recorded frames minus those of the reference, every half cut through both alike."""
     width = sampled.features.shape[1]
 
     def compute(first: np.ndarray, second: np.ndarray) -> dict[str, float]:
@@ -125,7 +130,7 @@ def pixel_error(frames: np.ndarray, solution: np.ndarray, groups: Sequence[str])
 
 
 def label_error(metric: plugins.Plugin, prediction: Mapping[str, np.ndarray], labels: Labels) -> Measurement:
-    """The first score of a metric plug-in of what a model trained on real frames sees, against what was asked for."""
+    """The first score of a metric plug-in of what a model trained on recorded frames sees: agreement of labels."""
     name, value = next(iter(metric.module.compute(prediction, labels, metric.options).items()))
     return Measurement(name, LABELS, float(value), len(labels))
 

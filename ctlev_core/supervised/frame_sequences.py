@@ -62,7 +62,7 @@ def find_sequences(count: int, length: int, *names: Sequence[object]) -> FrameSe
 def name_recordings(manifest: Manifest, rows: np.ndarray) -> list[str]:
     """Whose consecutive rows of a manifest are consecutive in time, [N].
 
-    Real frames are named by their recording. Synthetic ones are made one by one, but of labels that may follow one
+    Recorded frames are named by their recording. Synthetic ones are made one by one, but of labels that may follow one
     another in time (`temporal_order: true`): those are named by the recording of the labels, the others each by itself.
     """
     if "source_id" not in manifest.table.column_names:

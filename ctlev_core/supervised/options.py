@@ -18,8 +18,8 @@ class SupervisedOptions(Frozen):
         default=None,
         gt=0,
         lt=1,
-        description="share of each batch that comes from the first of several training sets (real + synthetic: the "
-        "real one); null = all rows alike",
+        description="share of each batch that comes from the first of several training sets (recorded + synthetic: the "
+        "recorded one); null = all rows alike",
     )
     learning_rate: float = Field(default=1e-3, gt=0, description="peak of AdamW's learning rate")
     warmup_steps: int = Field(default=40, ge=0, description="steps to the peak")

@@ -170,7 +170,7 @@ def test_the_page_names_every_function_of_the_contracts():
 def test_a_new_metric_says_itself_what_its_scores_are():
     """Nothing but its own file names it: tables, verdicts and gates know the direction and the words all the same."""
     assert lower_is_better("worst_joint_px") and not lower_is_better("best_joint_px")
-    values = {"real": 6.0, "real+synthetic": 5.0}
+    values = {"recorded": 6.0, "recorded+synthetic": 5.0}
     about = {"metric": "worst_joint_px", "group": "all"}
     rows = [{"subject": name, "value": value, **about} for name, value in values.items()]
     told = verdict.verdict(rows, list(values), Difference(-1.0, -1.5, -0.5))

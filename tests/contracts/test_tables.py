@@ -12,7 +12,7 @@ from data_contracts.tables import check_table
 def good_scores(**changed):
     columns = {
         "task": pa.array(["pose2d", "pose2d"]),
-        "subject": pa.array(["real", "synthetic"]),
+        "subject": pa.array(["recorded", "synthetic"]),
         "seed": pa.array([0, 0], pa.int64()),
         "group": pa.array(["all", "all"]),
         "metric": pa.array(["mpjpe2d_px", "mpjpe2d_px"]),

@@ -33,7 +33,7 @@ def refused(home, *arguments, preset="folder", run=plan_script, **how):
         ),
         (
             ("--set", "baselines={synthetic: {condition: {name: skeleton}, generator: {name: controlnet}}}"),
-            "a baseline's name is made of a-z, 0-9 and _, and is not real or synthetic or ",
+            "a baseline's name is made of a-z, 0-9 and _, and is not recorded or synthetic or ",
         ),
         (("--set", "nonesuch=1"), "unknown option 'nonesuch'; known: name,"),
         (("--set", "windows.num_events=0"), "option 'windows.num_events': input should be greater than 0, got 0"),

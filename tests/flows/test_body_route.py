@@ -30,7 +30,7 @@ def test_sentences_become_event_frames_in_motion_and_bodies_are_scored(tmp_path)
     report, scores = run("text_motion", tmp_path, 0, sentences, "num_synthetic=10")
     assert report.count("data:image/webp;base64,") == 1 and "a person walks then jumps" in report
     errors = {(row["subject"], row["metric"]): row["value"] for row in scores if row["group"] == "all"}
-    for setting in ("real", "synthetic", "real+synthetic"):
+    for setting in ("recorded", "synthetic", "recorded+synthetic"):
         assert 0 < errors[setting, "mpjpe3d_pa_mm"] <= errors[setting, "mpjpe3d_pelvis_mm"] < 2000
 
 
@@ -42,6 +42,9 @@ def test_one_generator_is_asked_for_poses_of_two_origins(tmp_path):
     own, foreign = sorted(artefacts(tmp_path, "sample"), key=lambda made: "person" in made.column("class_name")[0])
     assert set(foreign.column("class_name")) == {"a person jumps"} and len(own) == len(foreign) == 4
     trained = {row["subject"]: row["num_train"] for row in rows if row["group"] == "all"}
-    real = trained["real"]
-    assert trained["real+out_of_domain_poses"] == real + 4 and trained["real+synthetic+out_of_domain_poses"] == real + 8
-    assert "Sampled: out_of_domain_poses" in page and "<td>real+synthetic+out_of_domain_poses</td>" in page
+    real = trained["recorded"]
+    assert (
+        trained["recorded+out_of_domain_poses"] == real + 4
+        and trained["recorded+synthetic+out_of_domain_poses"] == real + 8
+    )
+    assert "Sampled: out_of_domain_poses" in page and "<td>recorded+synthetic+out_of_domain_poses</td>" in page

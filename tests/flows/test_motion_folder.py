@@ -1,4 +1,5 @@
-"""Motion files of anybody: every real one beside this checkout becomes skeletons and normals in `prepare_dataset`."""
+"""Motion files of anybody: every real one beside this checkout becomes skeletons and normals in
+`prepare_dataset`."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from flow_scripts import run_script_here
 
 from data_contracts.manifest import ManifestRef, read_manifest
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "motion"
+RECORDED = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "motion"
 STUDIO = "{num_train_recordings: 4, num_test_recordings: 2, num_condition_recordings: 0}"
 CLASSES = {
     "cartwheel", "dance a", "jump", "kick", "punch", "run", "spinkick", "walk", "cmu_12_01_walk", "pybvh_test3",
@@ -18,11 +19,11 @@ CLASSES = {
 
 @pytest.mark.parametrize("condition", ["skeleton", "normals"])
 def test_prepare_dataset(condition, tmp_path):
-    if not REAL.is_dir():
-        pytest.skip("the real motions are not beside this checkout")
+    if not RECORDED.is_dir():
+        pytest.skip("the recorded motions are not beside this checkout")
     settings = (
         "poses.name=motion_files",
-        f"poses.options={{root: {REAL}, camera: centred}}",
+        f"poses.options={{root: {RECORDED}, camera: centred}}",
         f"dataset.options={STUDIO}",
         f"condition.name={condition}",
         f"num_synthetic={4 * len(CLASSES)}",

@@ -1,4 +1,4 @@
-"""The study on real recordings, from pictures to its page, on files that this test writes."""
+"""The study on recordings, from pictures to its page, on files that this test writes."""
 
 import struct
 from pathlib import Path

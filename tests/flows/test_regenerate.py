@@ -149,10 +149,13 @@ def test_statistics_of_the_frames_can_be_gates(home, make_version):
     limits = "gates.max_realism_distances={active_pixel_share: 1, isolated_pixel_share: 1}"
     version = make_version(home, limits)
     checks = [check for check in version.checks if check.gate == "max_realism_distances"]
-    assert [check.score for check in checks] == ["active_pixel_share against real", "isolated_pixel_share against real"]
+    assert [check.score for check in checks] == [
+        "active_pixel_share against recorded",
+        "isolated_pixel_share against recorded",
+    ]
     assert all(check.passed for check in checks)
     assert "realism" in {artefact.stage for artefact in version.scored_in}
-    assert version.scores["synthetic against real, frames: active_pixel_share"] == checks[0].value
+    assert version.scores["synthetic against recorded, frames: active_pixel_share"] == checks[0].value
     with pytest.raises(DataError, match="max_c2st: needs 40 frames"):
         make_version(home, "gates.max_c2st=0.9")
 

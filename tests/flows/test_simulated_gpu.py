@@ -29,4 +29,10 @@ def test_every_stage_with_a_network_uses_the_gpu(tmp_path, monkeypatch):
         made = full_experiment.full_experiment.fn(load_study("smoke", []))
     assert {stage for stage, count in used.items() if count} >= COMPUTES
     scores = pq.read_table(made.path / "scores.parquet").to_pylist()
-    assert {row["subject"] for row in scores} >= {"real", "synthetic", "real+synthetic", "event_gan", "smpl_esim"}
+    assert {row["subject"] for row in scores} >= {
+        "recorded",
+        "synthetic",
+        "recorded+synthetic",
+        "event_gan",
+        "smpl_esim",
+    }

@@ -36,8 +36,8 @@ def test_smoke_ends_in_a_report(smoke_home):
     for expected in (
         "mpjpe2d",
         "fd_event_classifier_",
-        "real+synthetic",
-        "real+smpl_esim",
+        "recorded+synthetic",
+        "recorded+smpl_esim",
         "Does it copy?",
         "data:image/png;base64,",
     ):
@@ -124,7 +124,7 @@ def test_simulated_events_lie_on_the_body_they_were_asked_for(smoke_home):
 
 def test_training_and_test_subjects_are_disjoint(smoke_home):
     subjects = {split: set() for split in ("train", "test")}
-    for frames in artefacts(smoke_home, "encode"):  # the experiment's own, and more real frames to train on
+    for frames in artefacts(smoke_home, "encode"):  # the experiment's own, and more recorded frames to train on
         for split, subject in zip(frames.column("split"), frames.column("subject"), strict=True):
             subjects[split].add(subject)
     assert subjects["train"] and subjects["test"] and not subjects["train"] & subjects["test"]
@@ -321,9 +321,9 @@ def test_scores_are_tables(smoke_home):
     tables = list((smoke_home / "reports").glob("*/scores.parquet"))
     assert len(tables) == 1
     scores = pq.read_table(tables[0]).to_pylist()
-    trained = {"real"} | {f"{real}{name}" for real in ("", "real+") for name in GENERATORS}
-    trained |= {"label_consistent", "real+label_consistent", "oracle", "real+oracle", "real+synthetic@0.5"}
+    trained = {"recorded"} | {f"{real}{name}" for real in ("", "recorded+") for name in GENERATORS}
+    trained |= {"label_consistent", "recorded+label_consistent", "oracle", "recorded+oracle", "recorded+synthetic@0.5"}
     judged = {f"label agreement of {name}" for name in GENERATORS} | {"shuffled label agreement of synthetic"}
     assert {row["subject"] for row in scores if row["task"] == "pose2d"} == trained | judged
-    assert {row["subject"] for row in scores if row["task"] == "distance"} == {"held-out real", *GENERATORS}
+    assert {row["subject"] for row in scores if row["task"] == "distance"} == {"held-out recorded", *GENERATORS}
     assert all(np.isfinite(row["value"]) for row in scores)

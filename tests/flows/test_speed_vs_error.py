@@ -48,7 +48,7 @@ def test_the_page_recommends_and_shows(measured):
     page = (measured / "reports" / "smoke_speed_vs_error.html").read_text()
     for expected in (
         "far too small to learn from",
-        "Distance to held-out real frames",
+        "Distance to held-out recorded frames",
         "ddpm in 12 steps: 95 %",
         "Exact score: trajectory",
         "How real do the frames of each setting look?",
@@ -113,7 +113,7 @@ def test_distances_are_those_of_the_pooled_seeds(measured, rows):
         row
         for row in rows
         if (row["line"], row["num_inference_steps"], row["metric"]) == ("UniPC", 6, "fd_event")
-        and row["against"] == "held-out real frames"
+        and row["against"] == "held-out recorded frames"
     ]
     # Float32 features of a network, from another process.
     assert found["value"] == pytest.approx(expected, rel=1e-3)

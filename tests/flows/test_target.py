@@ -29,7 +29,7 @@ def made(tmp_path_factory):
         (folder / write.__name__).mkdir()
         write(folder / write.__name__)
     target = f"target={{name: n_caltech101, options: {{root: {folder / 'n_caltech101'}}}}}"
-    asked = [f"dataset.options.root={folder / 'n_imagenet'}", "training_sets=[real, synthetic]", *TINY]
+    asked = [f"dataset.options.root={folder / 'n_imagenet'}", "training_sets=[recorded, synthetic]", *TINY]
     options = [argument for change in asked for argument in ("--set", change)]
     alone = plan_script("full_experiment", "--preset", "n_imagenet", *options, "--dry-run", home=folder / "home")
     assert alone.status == 0, alone.errors
@@ -51,7 +51,7 @@ def test_only_the_targets_classes_are_sampled_learnt_and_tested(made):
     assert set(only(home, "sample").column("class_name")) == UNSEEN
     (of_target,) = (m for m in artefacts(home, "encode") if set(m.column("class_name")) == UNSEEN)
     scored = [row for m in artefacts(home, "score_model") for row in m.table.to_pylist()]
-    tested = {row["data_digest"] for row in scored if row["subject"] in ("real", "synthetic")}
+    tested = {row["data_digest"] for row in scored if row["subject"] in ("recorded", "synthetic")}
     assert tested == {of_target.ref.digest}
     assert {row["metric"] for row in scored} >= {"binary_accuracy_bonsai", "binary_accuracy_crocodile head"}
     # The judge of labels knows the target's classes; the features are those of what the generator has learnt.

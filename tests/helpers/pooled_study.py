@@ -1,4 +1,4 @@
-"""A finished study of several numbers of real recordings and several draws of each, as folders, for tests."""
+"""A finished study of several numbers of recordings and several draws of each, as folders, for tests."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tasks.stage import Output
 from tasks.study_report import study_report
 
 METRIC, LABELS = "accuracy", "label agreement of synthetic"
-# How much each training set gains over real frames, and how much of it is left with 20 recordings of each class.
+# How much each training set gains over recorded frames, and how much of it is left with 20 recordings of each class.
 GAINS = {
-    "real": 0.0, "synthetic": -0.03, "augmentation": -0.01, "random_weights": -0.12, "simulator": -0.09,
-    "oracle": 0.12, "real+synthetic": 0.08, "real+augmentation": 0.03, "real+random_weights": 0.01,
-    "real+simulator": 0.02, "real+oracle": 0.14,
+    "recorded": 0.0, "synthetic": -0.03, "augmentation": -0.01, "random_weights": -0.12, "simulator": -0.09,
+    "oracle": 0.12, "recorded+synthetic": 0.08, "recorded+augmentation": 0.03, "recorded+random_weights": 0.01,
+    "recorded+simulator": 0.02, "recorded+oracle": 0.14,
 }  # fmt: skip
 GENERATORS = ["synthetic", "augmentation", "random_weights", "simulator"]
 COUNTS, DRAWS, NUM_GENERATORS, SEEDS, NUM_TEST = (2, 5, 10, 20), 3, 5, 15, 60
@@ -37,7 +37,7 @@ def write_pooled_study(home: Path, counts=COUNTS, others: tuple[Manifest, ...] =
 
     Args:
         home: an empty folder.
-        counts: of real recordings of each class.
+        counts: of recordings of each class.
         others: reports of further experiments, `other0` and so on, in no group.
         changes: of the arguments of `study_report`.
     """
@@ -63,7 +63,7 @@ def _report(folder: Path, name: str, easy: np.ndarray, random: np.random.Generat
     count = int(name[1:].partition("_")[0])
     draw, values = random.normal(0, 0.06), {}
     for training_set, gain in GAINS.items():
-        tuned = random.normal(0, 0.04, NUM_GENERATORS) * (training_set != "real")
+        tuned = random.normal(0, 0.04, NUM_GENERATORS) * (training_set != "recorded")
         level = 0.25 * np.log2(count) + draw + 8 * gain / np.sqrt(count) + random.normal(0, 0.03)
         trained = level + np.tile(tuned, SEEDS // NUM_GENERATORS)[:, None] + random.normal(0, 0.05, (SEEDS, 1))
         noise = random.logistic(0, 0.25, (SEEDS, NUM_TEST))
@@ -78,7 +78,7 @@ def _report(folder: Path, name: str, easy: np.ndarray, random: np.random.Generat
     ]
     rows += [
         {**_row(training_set, 0, 9.0), "task": "distance", "metric": "fd_event_x"}
-        for training_set in ("held-out real", "synthetic")
+        for training_set in ("held-out recorded", "synthetic")
     ]
     pq.write_table(pa.Table.from_pylist(rows, schema=tables.SCORES.arrow()), folder / "scores.parquet")
     pictures = [random.integers(0, 255, (16, 16, 3), np.uint8) for _ in range(4)]

@@ -43,7 +43,7 @@ def simulate_draws(random, effects, *, draws=3, generators=5, seeds=3, recording
     for _ in range(draws):
         of_draw = {}
         for name, effect in effects.items():
-            tuned = random.normal(0, spread["generator"], generators) * (name != "real")
+            tuned = random.normal(0, spread["generator"], generators) * (name != "recorded")
             trained = np.tile(tuned, seeds) + random.normal(0, spread["seed"], generators * seeds)
             trained += effect + random.normal(0, spread["draw"])
             noise = random.normal(0, spread["sample"], (len(trained), recordings))

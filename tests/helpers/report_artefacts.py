@@ -19,14 +19,14 @@ from data_contracts.manifest import Manifest, ManifestRef, label_columns, read_m
 SIDE, COUNT, METRIC = 12, 12, "mpjpe2d_px"
 CLASSES = ["walk", "run"] * (COUNT // 2)
 TRAINING_SETS = {
-    "real": 0.0,
+    "recorded": 0.0,
     "synthetic": 0.3,
     "gan": 0.8,
-    "real+synthetic": -0.5,
-    "real+gan": 0.1,
-    "real+oracle": -1.0,
+    "recorded+synthetic": -0.5,
+    "recorded+gan": 0.1,
+    "recorded+oracle": -1.0,
 }
-TRAINING_SETS |= {"real+synthetic@0.5": -0.25}
+TRAINING_SETS |= {"recorded+synthetic@0.5": -0.25}
 
 
 class Experiment:
@@ -128,7 +128,7 @@ class Experiment:
             training_set, seed = name.split(", seed ")
             values = 6 + np.arange(len(names)) / 10 + TRAINING_SETS[training_set] + 0.01 * int(seed)
             rows = [_score(training_set, int(seed), float(values.mean()), model, self.frames)]
-            rows += [{**rows[0], "group": "walk"}, {**rows[0], "group": "classes with real training frames"}]
+            rows += [{**rows[0], "group": "walk"}, {**rows[0], "group": "classes with recorded training frames"}]
             columns = {"sample_id": names, "recording_id": names, "metric": [rows[0]["metric"]] * len(names)}
             samples = pa.table({**columns, "value": values, "weight": np.ones(len(names))})
             found.append(self._score_artefact(rows, model, {tables.SAMPLE_SCORES.name: samples}))
@@ -196,7 +196,7 @@ def _score(training_set: str, seed: int, value: float, model: Manifest, data: Ma
     return {
         "task": "pose2d", "subject": training_set, "seed": seed, "group": "all", "metric": METRIC, "value": value,
         "low": value - 0.1, "high": value + 0.1, "num_samples": 6,
-        "num_train": {"real": 6, "real+synthetic@0.5": 12}.get(training_set, 18),
+        "num_train": {"recorded": 6, "recorded+synthetic@0.5": 12}.get(training_set, 18),
         "model_digest": model.ref.digest, "data_digest": data.ref.digest,
     }  # fmt: skip
 
@@ -204,16 +204,16 @@ def _score(training_set: str, seed: int, value: float, model: Manifest, data: Ma
 def _realism() -> pa.Table:
     same = {"task": "realism", "seed": 0, "low": None, "high": None, "num_samples": 6, "num_train": 0}
     same |= {"model_digest": "", "data_digest": "", "group": "frames", "metric": "active_pixel_share"}
-    rows = [{**same, "subject": name, "value": 0.5} for name in ("real", "synthetic", "synthetic against real")]
+    rows = [{**same, "subject": name, "value": 0.5} for name in ("recorded", "synthetic", "synthetic against recorded")]
     return pa.Table.from_pylist(rows, schema=tables.SCORES.arrow())
 
 
 def _distributions() -> pa.Table:
-    row = {"group": "frames", "subject": "real", "axis": "value", "centre": 30.0, "share": 1.0}
+    row = {"group": "frames", "subject": "recorded", "axis": "value", "centre": 30.0, "share": 1.0}
     return pa.Table.from_pylist([row], schema=DISTRIBUTIONS.arrow())
 
 
 def _tests() -> pa.Table:
     unknown = dict.fromkeys(("value", "low", "high", "deviation"))
-    row = {"group": "frames", "subject": "synthetic against real", "num_first": 12, "num_second": 6, **unknown}
+    row = {"group": "frames", "subject": "synthetic against recorded", "num_first": 12, "num_second": 6, **unknown}
     return pa.Table.from_pylist([{**row, "note": "too few frames"}], schema=TWO_SAMPLE_TESTS.arrow())

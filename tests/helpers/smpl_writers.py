@@ -1,4 +1,4 @@
-"""Body files in SMPL's published layout, of random numbers: the real ones may not be passed on."""
+"""Body files in SMPL's published layout, of random numbers: the recorded ones may not be passed on."""
 
 from __future__ import annotations
 

@@ -11,8 +11,10 @@ from data_contracts.manifest import Manifest
 
 _CAPTION = (
     "A distance between small sets is larger than between large ones, even where both show the same. So it stands here "
-    "beside distances of equally small halves, whole recordings to one half or the other: of the frames and the real "
-    "training frames, and of the real training frames among themselves, the floor, with the central 95 % over random "
+    "beside distances of equally small halves, whole recordings to one half or the other: of the frames and the "
+    "recorded "
+    "training frames, and of the recorded training frames among themselves, the floor, with the central 95 % over "
+    "random "
     "halvings in brackets."
 )
 
@@ -30,5 +32,5 @@ def floor_tables(scores: Sequence[Manifest]) -> list[Table]:
             halved = None if row["halved"] is None else score_text(row["halved"])
             counts = [row[name] for name in ("num_predicted", "num_target", "num_features")]
             body.append([row["subject"], row["metric"], score_text(row["value"]), halved, floor, *counts])
-    columns = ["frames", "score", "all", "halves", "halves of real frames", "number", "real frames", "features"]
+    columns = ["frames", "score", "all", "halves", "halves of recorded frames", "number", "recorded frames", "features"]
     return [Table("How to read the distances", columns, body, caption=_CAPTION)] if body else []

@@ -11,9 +11,10 @@ from ctlev_core.statistics.bootstrap import score_text
 from data_contracts.manifest import Manifest
 
 _CAPTION = (
-    "close_share: share of generated frames nearer to a training frame than the closest 1 % of real frames are to "
+    "close_share: share of generated frames nearer to a training frame than the closest 1 % of recorded frames are to "
     "those of other recordings; about 0.01 without copying, in brackets 95 % over frames. duplicates: frames equal to "
-    "a training frame. nearest_distance_ratio: median distance to the nearest training frame, over that of real frames."
+    "a training frame. nearest_distance_ratio: median distance to the nearest training frame, over that of recorded "
+    "frames."
 )
 
 
@@ -37,7 +38,7 @@ def memorisation_sections(frames: Manifest, generated: Sequence[Manifest], copie
             ("training", [frames.array("frames")[pair["training_row"]] for pair in shown]),
         ]
         names = [f"{pair['distance'] / pair['threshold']:.2f}" if pair["threshold"] else "0" for pair in shown]
-        caption = "The pairs that lie closest; above each its distance over that of the closest 1 % of real frames."
+        caption = "The pairs that lie closest; above each its distance over that of the closest 1 % of recorded frames."
         sections.append(ImageGrid(f"Closest pairs: {shown[0]['subject']}, {features}", images, names, caption))
     return sections
 

@@ -25,12 +25,12 @@ _KINDS = {
 
 
 def steps(frames: Manifest, frame_conditions: Manifest, conditions: Manifest, made: Manifest, kind: str) -> list[Step]:
-    """What was done, in four pictures: a real label and its event image, a new label and its synthetic one.
+    """What was done, in four pictures: a recorded label and its event image, a new label and its synthetic one.
 
     Frames are those of median activity (active pixels), not chosen by eye.
 
     Args:
-        frames: real ones.
+        frames: recorded ones.
         frame_conditions: what they were learnt with.
         conditions: what was asked for.
         made: the synthetic frames, row by row those of `conditions`.
@@ -50,7 +50,7 @@ def steps(frames: Manifest, frame_conditions: Manifest, conditions: Manifest, ma
     return [
         Step("1. A label", _condition(frame_conditions, first), f"What is known of a recorded moment, {label}."),
         Step(
-            "2. A real event image",
+            "2. A recorded event image",
             real,
             "The camera takes no pictures: each pixel reports when its brightness changes. These are the reports, "
             f"events, of {(t_end_us - t_start_us) / 1000:.3g} ms, {colours}.",
@@ -110,12 +110,13 @@ def sample_grids(conditions: Manifest, generated: Mapping[str, Manifest], real: 
 
 
 def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest]) -> ImageGrid:
-    """Condition, real frame of the same moment or at least class where there is one, and the frame of each generator.
+    """Condition, recorded frame of the same moment or at least class where there is one, and the frame of each
+    generator.
 
     Args:
         conditions: what was asked for.
         generated: frames by generator; all were asked for the same.
-        real: sets of real frames to look for the same moments in.
+        real: sets of recorded frames to look for the same moments in.
     """
     synthetic = next(iter(generated.values()))
     matches = _same_moments(synthetic.column("source_id"), real)
@@ -132,8 +133,8 @@ def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: l
     caption = "One column a sample, evenly spread, none chosen by eye."
     if any(match is not None for match in found):
         blank = np.full_like(synthetic.array("frames")[0], 128)
-        caption += " Grey: no real frame shows that moment." if any(match is None for match in found) else ""
-        rows.append(("real, same moment", [blank if match is None else match for match in found]))
+        caption += " Grey: no recorded frame shows that moment." if any(match is None for match in found) else ""
+        rows.append(("recorded, same moment", [blank if match is None else match for match in found]))
     elif "images.npy" not in conditions.files:
         rows += _same_classes([names[row] for row in chosen], real)
     for name, frames in generated.items():
@@ -157,7 +158,7 @@ def evenly_by_class(class_names: Sequence[str], count: int) -> np.ndarray:
 
 
 def _same_classes(class_names: Sequence[str], real: list[Manifest]) -> list[tuple[str, list[np.ndarray]]]:
-    """A row of real test frames of these classes, the later set of frames first; none where they show no such class."""
+    """A row of recorded test frames of these classes, the later set of frames first; none where there are no such."""
     shown: dict[str, list[np.ndarray]] = {name: [] for name in class_names}
     for manifest in reversed(real):
         names = manifest.column("class_name")
@@ -168,12 +169,15 @@ def _same_classes(class_names: Sequence[str], real: list[Manifest]) -> list[tupl
         return []
     taken = [list(class_names[:column]).count(name) for column, name in enumerate(class_names)]
     return [
-        ("real, same class", [shown[name][n % len(shown[name])] for n, name in zip(taken, class_names, strict=True)])
+        (
+            "recorded, same class",
+            [shown[name][n % len(shown[name])] for n, name in zip(taken, class_names, strict=True)],
+        )
     ]
 
 
 def _same_moments(source_ids: list[str], real: list[Manifest]) -> list[np.ndarray | None]:
-    """For each `RECORDING:TIME`, or name of a frame, the real frame of it; None where there is none."""
+    """For each `RECORDING:TIME`, or name of a frame, the recorded frame of it; None where there is none."""
     found: list[np.ndarray | None] = [None] * len(source_ids)
     for manifest in real:
         names = {name: row for row, name in enumerate(manifest.column("sample_id"))}
@@ -199,17 +203,17 @@ def _moment(source_id: str) -> tuple[str, int]:
 
 
 def real_grid(frames: Manifest, target: Manifest | None = None) -> ImageGrid:
-    """Some real frames of training and of test, evenly spread; `target` are those of another dataset tested on."""
+    """Some recorded frames of training and of test, evenly spread; `target` are those of another dataset tested on."""
     rows: list[tuple[str, list[np.ndarray]]] = []
-    sets = [("real", frames, ("train", "test"))]
+    sets = [("recorded", frames, ("train", "test"))]
     if target is not None:
-        sets = [("the generator's", frames, ("train",)), ("real", target, ("train", "test"))]
+        sets = [("the generator's", frames, ("train",)), ("recorded", target, ("train", "test"))]
     for name, manifest, splits in sets:
         for split in splits:
             members = manifest.rows_where(split=split)
             chosen = members[spread(len(members), GRID_COLUMNS)]
             rows.append((f"{name}, {split}", [np.asarray(manifest.array("frames")[row]) for row in chosen]))
-    return ImageGrid("Real frames", rows, caption="The data the generator was tuned on, and the data tested on.")
+    return ImageGrid("Recorded frames", rows, caption="The data the generator was tuned on, and the data tested on.")
 
 
 def motion(conditions: Manifest, synthetic: Manifest) -> list[Animation]:

@@ -1,4 +1,4 @@
-"""The sections of the report that set synthetic beside real in numbers."""
+"""The sections of the report that set synthetic beside recorded in numbers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TITLES = {
         "how well a network tells the two sets apart, 0.5 = not at all.",
     ),
     "events": (
-        "How alike are the real recordings?",
+        "How alike are the recordings?",
         "Events of the training split beside those of the test split: what the data are like, and how much subjects "
         "and recordings differ. Noise rate: events that nothing around joins within 10 ms, a pixel and second in which "
         "nothing happens around.",
@@ -80,7 +80,7 @@ def _series(distributions: Sequence[dict[str, Any]], axis: str) -> Series:
     """Middles and shares of the bins, by set."""
     rows = [row for row in distributions if row["axis"] == axis]
     series: Series = {}
-    # Real frames are in the comparison with each generator, and the same in all.
+    # Recorded frames are in the comparison with each generator, and the same in all.
     groups = {row["subject"]: row["group"] for row in reversed(rows)}
     for subject in dict.fromkeys(row["subject"] for row in rows):
         of_set = [row for row in rows if row["subject"] == subject and row["group"] == groups[subject]]
@@ -91,7 +91,7 @@ def _series(distributions: Sequence[dict[str, Any]], axis: str) -> Series:
 def _values(series: Series) -> list[Section]:
     series = {name: (centres, np.cumsum(shares).tolist()) for name, (centres, shares) in series.items()}
     caption = (
-        "The area between the lines is their Wasserstein-1 distance in grey levels. Real lines have steps: event "
+        "The area between the lines is their Wasserstein-1 distance in grey levels. Recorded lines have steps: event "
         "images hold few different counts."
     )
     title, labels = "Brightness of active pixels", (AXES["value"].label, "share of active pixels up to it")

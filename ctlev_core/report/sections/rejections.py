@@ -10,7 +10,8 @@ from ctlev_core.report.page.html import Section, Table
 from data_contracts.manifest import Manifest
 
 _CAPTION = (
-    "A frame is refused where a number of it lies far outside those of real training frames: no event image at all. "
+    "A frame is refused where a number of it lies far outside those of recorded training frames: no event image at "
+    "all. "
     "Rejected frames are sampled again, from other seeds, until they pass or run out of tries; then they stay."
 )
 

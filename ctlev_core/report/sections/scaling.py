@@ -8,16 +8,16 @@ from typing import Any
 
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.score_tables import interval_over_trainings, trained_rows
-from data_contracts.training_sets import REAL, TrainingSet
+from data_contracts.training_sets import RECORDED, TrainingSet
 
 
 @dataclass(frozen=True)
 class ScalePoint:
-    """A score with a certain amount of synthetic data beside the same real data.
+    """A score with a certain amount of synthetic data beside the same recorded data.
 
     Attributes:
         series: which frames were added.
-        ratio: of added frames to real ones; 0 = real alone.
+        ratio: of added frames to recorded ones; 0 = recorded alone.
         value: the score.
         low: lower end of its 95 % interval; NaN = unknown.
         high: upper end.
@@ -31,25 +31,25 @@ class ScalePoint:
 
 
 def scaling_points(rows: Sequence[dict[str, Any]], metric: str) -> list[ScalePoint]:
-    """The points of every generator of which several amounts were added to real data.
+    """The points of every generator of which several amounts were added to recorded data.
 
     Args:
-        rows: of the table `scores`; training sets `real`, `real+NAME` (all frames) and `real+NAME@SHARE`.
+        rows: of the table `scores`; training sets `recorded`, `recorded+NAME` (all frames) and `recorded+NAME@SHARE`.
         metric: which score.
     """
     of_set: dict[str, list[dict[str, Any]]] = {}
     for row in trained_rows(rows):
         if row["group"] == "all" and row["metric"] == metric:
             of_set.setdefault(row["subject"], []).append(row)
-    real = of_set.get(REAL)
+    real = of_set.get(RECORDED)
     if not real or not real[0]["num_train"]:
         return []
     parsed = {TrainingSet.parse(name): found for name, found in of_set.items()}
-    varied = {one.whole for one in parsed if one.in_part and one.names[0] == REAL}
+    varied = {one.whole for one in parsed if one.in_part and one.names[0] == RECORDED}
     points = []
     for whole in sorted(varied, key=str):
         for training_set, found in parsed.items():
-            if training_set == TrainingSet.of(REAL) or training_set.whole == whole:
+            if training_set == TrainingSet.of(RECORDED) or training_set.whole == whole:
                 ratio = found[0]["num_train"] / real[0]["num_train"] - 1
                 added = str(TrainingSet(whole.sources[1:]))
                 points.append(ScalePoint(added, ratio, *interval_over_trainings(found)))
@@ -68,8 +68,9 @@ def scaling_figure(points: Sequence[ScalePoint], metric: str = "score") -> Curve
             for column, value in zip(where.setdefault(point.series, ([], [])), values, strict=True):
                 column.append(value)
     caption = (
-        "Held-out real test data after training on all real frames and more and more synthetic ones, in equal numbers "
+        "Held-out recorded test data after training on all recorded frames and more and more synthetic ones, in equal "
+        "numbers "
         "of optimiser steps; bars are 95 % intervals. At 0 there is no synthetic data."
     )
     title = f"{metric} by the amount of synthetic data"
-    return Curves(title, series, "synthetic frames for each real one", metric, caption=caption, spans=spans)
+    return Curves(title, series, "synthetic frames for each recorded one", metric, caption=caption, spans=spans)

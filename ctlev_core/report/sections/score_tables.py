@@ -28,10 +28,10 @@ _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
 _ENOUGH = 5
 """Trainings of a training set from which their spread is known well enough to say no more about it."""
 _SOURCES = {
-    "oracle": "real frames of the very poses that synthetic frames are sampled from: the most they can give",
-    "label_consistent": "the synthetic frames whose labels a model trained on real frames finds best",
+    "oracle": "recorded frames of the very poses that synthetic frames are sampled from: the most they can give",
+    "label_consistent": "the synthetic frames whose labels a model trained on recorded frames finds best",
     "synthetic": "frames of the experiment's own generator",
-    "real": "the labelled real frames that every generator learnt from",
+    "recorded": "the recorded frames that every generator learnt from",
 }
 
 
@@ -55,12 +55,12 @@ class PairedScores:
 
 
 def is_about_labels(row: Row) -> bool:
-    """Does the row score synthetic frames against labels, rather than a model on real test data?"""
+    """Does the row score synthetic frames against labels, rather than a model on recorded test data?"""
     return LabelAgreement.parse(row["subject"]) is not None
 
 
 def trained_rows(rows: Iterable[Row]) -> list[Row]:
-    """The rows that score models on held-out real data, all groups."""
+    """The rows that score models on held-out recorded data, all groups."""
     return [row for row in rows if row["task"] != "distance" and not is_about_labels(row)]
 
 
@@ -83,23 +83,26 @@ def score_tables(rows: list[Row], training_sets: Sequence[str], paired: PairedSc
         found += _one_against_rest(of_task, list(dict.fromkeys(row["subject"] for row in of_task)))
     labels = [row for row in rows if row["task"] != "distance" and is_about_labels(row) and row["group"] == "all"]
     if labels:
-        floor = [{**row, "subject": "held-out real (floor)"} for row in trained if row["subject"] == "real"]
+        floor = [{**row, "subject": "held-out recorded (floor)"} for row in trained if row["subject"] == "recorded"]
         caption = (
-            "The model trained on real frames, scored on synthetic frames against the labels they were sampled from, "
-            "beside its score on held-out real frames. Shuffled: the same frames against labels of others, which is "
+            "The model trained on recorded frames, scored on synthetic frames against the labels they were sampled "
+            "from, "
+            "beside its score on held-out recorded frames. Shuffled: the same frames against labels of others, which "
+            "is "
             "what frames that show nothing of their labels would score."
         )
         found.append(_pivot("Do the synthetic frames show their labels?", floor + labels, "frames", caption))
     distances = [row for row in rows if row["task"] == "distance"]
     if distances:
         caption = (
-            "Distances to the real training frames in the features of a classifier trained on real events (fd: "
+            "Distances to the recorded training frames in the features of a classifier trained on recorded events (fd: "
             "Frechet distance, which is not FID). They depend on the number of frames, so read them against the row "
-            "of held-out real frames; alone they do not tell whether labels are right. In brackets 95 %, from halves "
+            "of held-out recorded frames; alone they do not tell whether labels are right. In brackets 95 %, from "
+            "halves "
             "by recording."
         )
-        counts = ("real training frames", "frames compared")
-        found.append(_pivot("How far from real frames?", distances, "frames", caption, counts))
+        counts = ("recorded training frames", "frames compared")
+        found.append(_pivot("How far from recorded frames?", distances, "frames", caption, counts))
     return found
 
 
@@ -115,7 +118,7 @@ def group_tables(rows: list[Row], training_sets: Sequence[str]) -> tuple[list[Ta
     by_subject = [row for row in groups if row["group"].startswith(SUBJECTS)]
     by_class = [row for row in groups if not row["group"].startswith((ORIGINS, *SUBJECTS))]
     caption = (
-        "Held-out real frames by class. What synthetic frames add is seen in classes that no real training frame shows."
+        "Held-out recorded frames by class. What synthetic frames add is seen in those that no training frame shows."
     )
     origins = [_by_group(f"{metric}: where does it help?", by_origin, names, caption)] if by_origin else []
     if by_subject:
@@ -131,7 +134,11 @@ def baseline_tables(names: Sequence[str], metric: str, paired: PairedScores) -> 
     bold: set[tuple[int, int]] = set()
     for other in others:
         row: list[Cell] = [other]
-        for before, after in ((other, own), (f"real+{other}", f"real+{own}"), ("real", f"real+{other}")):
+        for before, after in (
+            (other, own),
+            (f"recorded+{other}", f"recorded+{own}"),
+            ("recorded", f"recorded+{other}"),
+        ):
             difference = paired.difference(before, after, metric)
             if difference is not None and difference.is_certain:
                 bold.add((len(body), len(row)))
@@ -139,7 +146,7 @@ def baseline_tables(names: Sequence[str], metric: str, paired: PairedScores) -> 
         body.append(row)
     if not body:
         return []
-    columns = ["baseline", f"{own} - baseline", f"real+{own} - real+baseline", "real+baseline - real"]
+    columns = ["baseline", f"{own} - baseline", f"recorded+{own} - recorded+baseline", "recorded+baseline - recorded"]
     caption = (
         f"Differences in `{metric}` ({_direction(metric)} is better), sample by sample on the same held-out frames; in "
         "brackets the 95 % interval over test recordings and trainings. Bold: the interval excludes 0. All generators "
@@ -161,23 +168,24 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
     bold: set[tuple[int, int]] = set()
     for training_set in training_sets:
         of_set = [row for row in rows if row["subject"] == training_set]
-        differences = [paired.difference("real", training_set, metric) for metric in metrics]
+        differences = [paired.difference("recorded", training_set, metric) for metric in metrics]
         for column, (metric, difference) in enumerate(zip(metrics, differences, strict=True), 1):
             if difference is not None and difference.is_certain:
                 better = (difference.value < 0) == lower_is_better(metric)
                 bold |= {(len(body), column)} if better else set()
-        first = differences[0] if training_set != "real" else None
+        first = differences[0] if training_set != "recorded" else None
         if first is not None and first.is_certain:
             bold.add((len(body), len(metrics) + 1))
         cells: list[Cell] = [cell_text([row for row in of_set if row["metric"] == metric]) for metric in metrics]
         counts = [len({_training(row) for row in of_set}), of_set[0]["num_train"]]
         body.append([training_set, *cells, "" if first is None else first.text(), *counts])
-    columns = ["trained on", *map(_heading, metrics), f"{metrics[0]}: minus real"]
+    columns = ["trained on", *map(_heading, metrics), f"{metrics[0]}: minus recorded"]
     columns += ["trainings", "frames trained on"]
     caption = (
-        f"Scores on {rows[0]['num_samples']:,} held-out real test frames; equal optimiser steps for every row. Each "
+        f"Scores on {rows[0]['num_samples']:,} held-out recorded test frames; equal optimiser steps for every row. "
+        "Each "
         "number is the mean over the row's trainings, which differ in their seeds; in brackets the 95 % interval over "
-        "test recordings and trainings. Bold: better than `real`, or a difference from it that is not 0, as the "
+        "test recordings and trainings. Bold: better than `recorded`, or a difference from it that is not 0, as the "
         "interval of the difference says that compares sample by sample."
     )
     parsed = [TrainingSet.parse(training_set) for training_set in training_sets]

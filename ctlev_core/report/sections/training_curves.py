@@ -7,7 +7,7 @@ from typing import Any
 
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.score_tables import interval_over_trainings
-from data_contracts.training_sets import REAL, LabelAgreement, TrainingSet
+from data_contracts.training_sets import RECORDED, LabelAgreement, TrainingSet
 
 FEWEST_AMOUNTS = 2
 """Amounts of training that are worth a line."""
@@ -21,8 +21,8 @@ _CAPTION = (
 def base_model_figures(
     rows: Sequence[dict[str, Any]], options: Mapping[str, Mapping[str, Any]], metric: str
 ) -> list[Curves]:
-    """Label error, distance to real frames, and the error of a model trained on them too, over steps of fine-tuning;
-    none where those were not varied for both starts.
+    """Label error, distance to recorded frames, and the error of a model trained on them too, over steps of
+    fine-tuning; none where those were not varied for both starts.
 
     Args:
         rows: of the table `scores`.
@@ -41,8 +41,12 @@ def base_model_figures(
     figures = []
     for title, subject_of, wanted in (
         ("Are labels found in the frames?", LabelAgreement, metric),
-        ("How far are the frames from real ones?", str, distance),
-        ("What does a model learn from real frames and these?", lambda name: TrainingSet.of(REAL, name), metric),
+        ("How far are the frames from recorded ones?", str, distance),
+        (
+            "What does a model learn from recorded frames and these?",
+            lambda name: TrainingSet.of(RECORDED, name),
+            metric,
+        ),
     ):
         series: dict[str, tuple[list[float], list[float]]] = {}
         spans: dict[str, tuple[list[float], list[float]]] = {}

@@ -19,9 +19,9 @@ _CAPTION = (
 )
 _AREA_COLUMN = 1
 _NAMES = {
-    "real against real": "recorded training frames: halves",
+    "recorded against recorded": "recorded training frames: halves",
     "test against test": "recorded test frames: halves",
-    "test against real": "recorded training from recorded test frames",
+    "test against recorded": "recorded training from recorded test frames",
 }
 
 
@@ -48,5 +48,5 @@ def two_sample_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
 
 def _name(subject: str) -> str:
     first, _, second = subject.partition(" against ")
-    against = {"real": "recorded training frames", "test": "recorded test frames"}.get(second, second)
+    against = {"recorded": "recorded training frames", "test": "recorded test frames"}.get(second, second)
     return _NAMES.get(subject, f"{first} from {against}")

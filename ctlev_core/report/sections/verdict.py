@@ -34,16 +34,17 @@ def verdict(
     oracle: tuple[Difference, Difference | None] | None = None,
     instead: Difference | None = None,
 ) -> str:
-    """Compare training on real data with training on real and synthetic data, and synthetic data with baselines.
+    """Compare training on recorded data with training on recorded and synthetic data, and synthetic data with
+    baselines.
 
     Args:
         rows: rows of the table `scores`.
         training_sets: the training sets that were trained; the first metric found is the one compared.
-        difference: real + synthetic minus real in that metric, paired by sample.
-        beside: for each baseline, real + synthetic minus real + baseline, paired by sample.
-        oracle: real + oracle minus real, and the share of that gain which synthetic data reached (None where the
-            gain is not certain).
-        instead: synthetic alone minus real, likewise; told where nothing was trained on both together.
+        difference: recorded + synthetic minus recorded in that metric, paired by sample.
+        beside: for each baseline, recorded + synthetic minus recorded + baseline, paired by sample.
+        oracle: recorded + oracle minus recorded, and the share of that gain which synthetic data reached (None where
+            the gain is not certain).
+        instead: synthetic alone minus recorded, likewise; told where nothing was trained on both together.
     Returns:
         A few sentences. A change counts as shown only where the interval of the difference excludes zero.
     """
@@ -53,23 +54,23 @@ def verdict(
     metric = scored[0]["metric"]
     values = _means(rows, metric)
     beside = beside or {}
-    own = {name: values[name] for name in ("real", "synthetic", "real+synthetic") if name in values}
+    own = {name: values[name] for name in ("recorded", "synthetic", "recorded+synthetic") if name in values}
     if not own:
         own = {name: values[name] for name in training_sets if name in values}
     sense = f"{'lower' if lower_is_better(metric) else 'higher'} is better"
-    summary = f"{metric} ({'; '.join(filter(None, (find_score(metric).meaning, sense)))}) on held-out real data: "
+    summary = f"{metric} ({'; '.join(filter(None, (find_score(metric).meaning, sense)))}) on held-out recorded data: "
     summary += ", ".join(f"{training_set} {score_text(value)}" for training_set, value in own.items()) + "."
-    if "real+synthetic" not in values and instead is not None and {"real", "synthetic"} <= values.keys():
-        told = _what_it_did(instead, metric, values["real"], "Training on synthetic data instead of real data")
+    if "recorded+synthetic" not in values and instead is not None and {"recorded", "synthetic"} <= values.keys():
+        told = _what_it_did(instead, metric, values["recorded"], "Training on synthetic data instead of recorded data")
         return f"{summary} {told} {_labels(values)}".rstrip()
-    if difference is None or "real" not in values or "real+synthetic" not in values:
+    if difference is None or "recorded" not in values or "recorded+synthetic" not in values:
         return summary
-    sentences = [summary, _what_it_did(difference, metric, values["real"])]
-    if oracle is not None and "real+oracle" in values:
+    sentences = [summary, _what_it_did(difference, metric, values["recorded"])]
+    if oracle is not None and "recorded+oracle" in values:
         sentences.append(_oracle(*oracle))
     for name, compared in beside.items():
-        if compared is not None and f"real+{name}" in values:
-            sentences.append(_beside(name, values[f"real+{name}"], compared, metric))
+        if compared is not None and f"recorded+{name}" in values:
+            sentences.append(_beside(name, values[f"recorded+{name}"], compared, metric))
     sentences.append(_labels(values))
     return " ".join(sentence for sentence in sentences if sentence)
 
@@ -93,12 +94,12 @@ def _what_it_did(difference: Difference, metric: str, real: float, what: str = "
     if not difference.is_certain:
         return f"Whether {doing} helped is undecided: {text}."
     better = made_better(difference, metric)
-    share = f", {abs(difference.value / real):.0%} of what real data alone gives" if real else ""
+    share = f", {abs(difference.value / real):.0%} of what recorded data alone gives" if real else ""
     return f"{what} made it {'better' if better else 'worse'}: {text}{share}."
 
 
 def _oracle(gain: Difference, share: Difference | None) -> str:
-    beginning = f"Real frames of the same poses in the place of synthetic ones change it by {gain.text()}"
+    beginning = f"Recorded frames of the same poses in the place of synthetic ones change it by {gain.text()}"
     if share is None:
         return f"{beginning}."
     interval = "" if math.isnan(share.low) else f" [{share.low:.0%}, {share.high:.0%}]"
@@ -106,7 +107,7 @@ def _oracle(gain: Difference, share: Difference | None) -> str:
 
 
 def _beside(name: str, value: float, difference: Difference, metric: str) -> str:
-    sentence = f"With frames of {name} in the place of its own, real+{name} is {score_text(value)}"
+    sentence = f"With frames of {name} in the place of its own, recorded+{name} is {score_text(value)}"
     if math.isnan(difference.low):
         return f"{sentence}."
     if not difference.is_certain:
@@ -116,11 +117,10 @@ def _beside(name: str, value: float, difference: Difference, metric: str) -> str
 
 
 def _labels(values: Mapping[str, float]) -> str:
-    """Whether synthetic frames show their labels, as the model trained on real frames sees them."""
+    """Whether synthetic frames show their labels, as the model trained on recorded frames sees them."""
     own, shuffled = (values.get(str(LabelAgreement(SYNTHETIC, shuffled))) for shuffled in (False, True))
     if own is None:
         return ""
     control = "" if shuffled is None else f", and {score_text(shuffled)} on them with shuffled labels"
-    return (
-        f"The model trained on real frames scores {score_text(own)} on synthetic frames against their labels{control}."
-    )
+    scores = f"scores {score_text(own)} on synthetic frames against their labels"
+    return f"The model trained on recorded frames {scores}{control}."

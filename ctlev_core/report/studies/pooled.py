@@ -1,7 +1,7 @@
 """Groups of experiments that differ in their draw of training recordings alone, told as one column each.
 
 The page of a study with groups begins with them: whether synthetic frames helped, every training set's score, the
-differences that matter, and accuracy over the number of real recordings.
+differences that matter, and accuracy over the number of recordings.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
 from ctlev_core.statistics.pooled_scores import PooledScores, pool_values
-from data_contracts.training_sets import LABEL_CONSISTENT, ORACLE, REAL, SYNTHETIC, LabelAgreement, TrainingSet
+from data_contracts.training_sets import LABEL_CONSISTENT, ORACLE, RECORDED, SYNTHETIC, LabelAgreement, TrainingSet
 
-BOTH = str(TrainingSet.of(REAL, SYNTHETIC))
+BOTH = str(TrainingSet.of(RECORDED, SYNTHETIC))
 LABELS = str(LabelAgreement(SYNTHETIC))
 _FRAMES = {
-    REAL: "real frames",
+    RECORDED: "recorded frames",
     SYNTHETIC: "synthetic frames",
-    "augmentation": "augmented copies of real frames",
+    "augmentation": "augmented copies of recorded frames",
     "random_weights": "synthetic frames of a generator from random weights",
     "simulator": "simulated frames",
-    ORACLE: "more real frames",
+    ORACLE: "more recorded frames",
     LABEL_CONSISTENT: "the synthetic frames with the clearest labels",
 }
 """What the parts of a training set's name stand for, in reading order."""
 _COMPARED = (
-    (REAL, BOTH, "real and synthetic frames, against real frames alone"),
-    ("real+augmentation", BOTH, "real and synthetic frames, against real frames and augmented copies"),
-    ("real+augmentation", "real+synthetic+augmentation", "synthetic frames on top of augmented copies"),
-    (REAL, SYNTHETIC, "synthetic frames alone, against real frames alone"),
+    (RECORDED, BOTH, "recorded and synthetic frames, against recorded frames alone"),
+    ("recorded+augmentation", BOTH, "recorded and synthetic frames, against recorded frames and augmented copies"),
+    ("recorded+augmentation", "recorded+synthetic+augmentation", "synthetic frames on top of augmented copies"),
+    (RECORDED, SYNTHETIC, "synthetic frames alone, against recorded frames alone"),
     ("random_weights", SYNTHETIC, "synthetic frames: pre-trained weights against random weights"),
-    ("real+simulator", BOTH, "real and synthetic frames, against real and simulated frames"),
+    ("recorded+simulator", BOTH, "recorded and synthetic frames, against recorded and simulated frames"),
 )
 """Before, after, and what the row is called."""
-_WITH_ORACLE = str(TrainingSet.of(REAL, ORACLE))
-_LINES = (REAL, "real+augmentation", BOTH, SYNTHETIC, "real+simulator")
+_WITH_ORACLE = str(TrainingSet.of(RECORDED, ORACLE))
+_LINES = (RECORDED, "recorded+augmentation", BOTH, SYNTHETIC, "recorded+simulator")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Group:
 
     @cached_property
     def label_agreement(self) -> Difference | None:
-        """Score of synthetic frames against the labels asked for, as models trained on real frames see them."""
+        """Score of synthetic frames against the labels asked for, as models trained on recorded frames see them."""
         draws = [
             [
                 row["value"]
@@ -142,8 +142,8 @@ def pooled_chart(groups: Sequence[Group]) -> list[Curves]:
             spans[name] = [score.low for _, score in points], [score.high for _, score in points]
     metric = groups[0].metric
     caption = f"{_counts(groups)} Bars are 95 % intervals; lines stand a little apart, so that all can be seen."
-    x_label = found[0][2] or "real recordings"
-    title = f"Scores (`{metric}`) by the number of real recordings"
+    x_label = found[0][2] or "recordings"
+    title = f"Scores (`{metric}`) by the number of recordings"
     return [Curves(title, series, x_label, metric, log_x=min(places) > 0, caption=caption, spans=spans)]
 
 
@@ -165,21 +165,21 @@ def pooled_sections(groups: Sequence[Group], tables: Sequence[Table]) -> list[Se
 
 
 def _sentence(group: Group) -> str:
-    added = group.difference(REAL, BOTH)
+    added = group.difference(RECORDED, BOTH)
     if added is None:
-        return f"{group.name}: nothing was trained on real and synthetic frames together."
-    before, after = (score_text(group.score(training_set).value) for training_set in (REAL, BOTH))
-    what = "adding synthetic frames to the real ones"
+        return f"{group.name}: nothing was trained on recorded and synthetic frames together."
+    before, after = (score_text(group.score(training_set).value) for training_set in (RECORDED, BOTH))
+    what = "adding synthetic frames to the recorded ones"
     numbers = f"{group.metric} went from {before} to {after}, a difference of {added.text()}"
     told = f"{group.name}: {_told(added, group.metric, what)}; {numbers}"
-    beside = group.difference("real+augmentation", BOTH)
+    beside = group.difference("recorded+augmentation", BOTH)
     if beside is None:
         return f"{told}."
     better = made_better(beside, group.metric)
     compared = {
-        True: "it did more than augmented copies of the real frames do",
-        False: "it did less than augmented copies of the real frames do",
-        None: "whether it did more than augmented copies of the real frames do is undecided",
+        True: "it did more than augmented copies of the recorded frames do",
+        False: "it did less than augmented copies of the recorded frames do",
+        None: "whether it did more than augmented copies of the recorded frames do is undecided",
     }[better]
     return f"{told}; {compared} ({beside.text()})."
 
@@ -192,9 +192,9 @@ def _told(difference: Difference, metric: str, what: str) -> str:
 
 
 def _in_words(training_set: str) -> str:
-    """A training set in plain words: `real and synthetic frames`."""
+    """A training set in plain words: `recorded and synthetic frames`."""
     if training_set == BOTH:
-        return "real and synthetic frames"
+        return "recorded and synthetic frames"
     parts = [_FRAMES.get(part, f"frames of {part.replace('_', ' ')}") for part in TrainingSet.parse(training_set).names]
     if len(parts) == 1:
         return f"{parts[0]} alone"
@@ -202,12 +202,12 @@ def _in_words(training_set: str) -> str:
 
 
 def _reading_order(training_sets: Sequence[str]) -> list[str]:
-    """Real frames alone, real frames with others, then others alone; within these as `_FRAMES` names them."""
+    """Recorded frames alone, recorded frames with others, then others alone; within these as `_FRAMES` names them."""
     known = list(_FRAMES)
 
     def place(training_set: str) -> tuple:
         parts = TrainingSet.parse(training_set).names
-        kind = 0 if parts == (REAL,) else 1 if REAL in parts else 2
+        kind = 0 if parts == (RECORDED,) else 1 if RECORDED in parts else 2
         others = [known.index(part) if part in known else len(known) for part in parts]
         return kind, len(parts), others
 
@@ -224,7 +224,7 @@ def _score_table(groups: Sequence[Group]) -> Table:
         for column, group in enumerate(groups, 1):
             known = training_set in group.scores.training_sets
             row.append(_score(group.score(training_set)) if known else "")
-            difference = group.difference(REAL, training_set)
+            difference = group.difference(RECORDED, training_set)
             if difference is not None and made_better(difference, metric):
                 bold.add((len(body), column))
         body.append(row)
@@ -233,16 +233,17 @@ def _score_table(groups: Sequence[Group]) -> Table:
     if any(agreed):
         body.append([f"label agreement (`{LABELS}`)", *("" if one is None else _score(one) for one in agreed)])
         notes.append(
-            f"Label agreement: {metric} of classifiers trained on real frames when they are shown synthetic frames and "
-            "the labels asked for. It says nothing of real test recordings."
+            f"Label agreement: {metric} of classifiers trained on recorded frames when they are shown synthetic frames "
+            "and "
+            "the labels asked for. It says nothing of test recordings."
         )
     sense = "lower" if lower_is_better(metric) else "higher"
     caption = (
-        f"Scores (`{metric}`) on real test recordings that nothing was trained on; {sense} is better. "
+        f"Scores (`{metric}`) on test recordings that nothing was trained on; {sense} is better. "
         f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: "
-        "better than real frames alone, by a difference whose interval excludes 0."
+        "better than recorded frames alone, by a difference whose interval excludes 0."
     )
-    title = "Scores by training frames and number of real recordings"
+    title = "Scores by training frames and number of recordings"
     return Table(title, ["trained on", *_names(groups)], body, caption=caption, bold=bold, footnotes=notes)
 
 
@@ -260,7 +261,7 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
         probable.append([told, *(_probability(group, before, after) for group in groups)])
     shares = [_share(group) for group in groups]
     if any(shares):
-        body.append(["share of the gain of more real frames that synthetic frames give", *shares])
+        body.append(["share of the gain of more recorded frames that synthetic frames give", *shares])
     if not body:
         return []
     sense = "Lower" if lower_is_better(metric) else "Higher"
@@ -271,7 +272,8 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
     notes = []
     if any(shares):
         notes.append(
-            "The share is that of the gain from adding more real frames to the real ones. It is given where this gain "
+            "The share is that of the gain from adding more recorded frames to the recorded ones. It is given where "
+            "this gain "
             "is certain."
         )
     chances = (
@@ -297,9 +299,9 @@ def _probability(group: Group, before: str, after: str) -> str:
 
 
 def _share(group: Group) -> str:
-    if not {REAL, BOTH, _WITH_ORACLE} <= set(group.scores.training_sets):
+    if not {RECORDED, BOTH, _WITH_ORACLE} <= set(group.scores.training_sets):
         return ""
-    share = group.scores.share_of_gain(REAL, BOTH, _WITH_ORACLE)
+    share = group.scores.share_of_gain(RECORDED, BOTH, _WITH_ORACLE)
     return "" if share is None else f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]".replace("%", " %")
 
 

@@ -1,7 +1,7 @@
 """What differs between two finished experiments: options, data, code and scores.
 
 Both are read from the folders of their reports, wherever those were copied to. Stages are matched by what they are in
-the experiment (`checkpoint of synthetic`, `model of real, seed 0`). Scores are compared sample by sample where both
+the experiment (`checkpoint of synthetic`, `model of recorded, seed 0`). Scores are compared sample by sample where both
 were measured on the very same samples, images and labels; elsewhere recordings are drawn for each on its own, and where
 no scores of samples were kept the intervals of both are joined: Zou & Donner, Construction of Confidence Limits about
 Effect Measures, Statistics in Medicine 2008.

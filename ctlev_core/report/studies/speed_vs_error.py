@@ -48,11 +48,11 @@ Point = tuple[str, int]
 
 @dataclass(frozen=True)
 class Recommendation:
-    """Settings as rows of the distance to held-out real frames; None where there is none.
+    """Settings as rows of the distance to held-out recorded frames; None where there is none.
 
     Attributes:
         default: with the fewest evaluations from which on its line stays within the reference's interval.
-        quick: the nearest to real frames of those with 5 to 10 evaluations.
+        quick: the nearest to recorded frames of those with 5 to 10 evaluations.
     """
 
     default: Row | None
@@ -63,7 +63,7 @@ def recommend(rows: Sequence[Row]) -> Recommendation:
     """What to use, from rows of the table `speed_vs_error`.
 
     Within: not above the interval's upper end, and by the paired difference, which tells more apart, not shown to be
-    farther from real frames than the reference. A single point may be there by luck, so all points of its line with
+    farther from recorded frames than the reference. A single point may be there by luck, so all points of its line with
     more evaluations must be too. Below the interval is not worse than the reference, and counts as within.
     """
     points = [row for row in rows_of(rows, FD, HELD_OUT) if row["line"] not in (REFERENCE_LINE, CONVERGED_LINE)]
@@ -133,7 +133,7 @@ class SpeedPage:
         return " ".join([*self._recommendation(reference), *self._own_setting(reference)])
 
     def _known_reference(self) -> Row | None:
-        """The reference's distance to held-out real frames, where it has an interval."""
+        """The reference's distance to held-out recorded frames, where it has an interval."""
         reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
         return None if reference is None or reference["high"] is None else reference
 
@@ -182,12 +182,12 @@ class SpeedPage:
         ]
 
     def distance_charts(self) -> list[Curves]:
-        """Distances over evaluations: to held-out real frames, and to the reference's samples."""
+        """Distances over evaluations: to held-out recorded frames, and to the reference's samples."""
         reference = self._row(REFERENCE_LINE, FD, HELD_OUT)
         floor = self._row(REFERENCE_LINE, FD + OF_HALVES, REFERENCE)
         count = 0 if reference is None else reference["num_samples"]
         shown = {
-            "Distance to held-out real frames": (
+            "Distance to held-out recorded frames": (
                 lines_of(self.rows, FD, HELD_OUT),
                 reference,
                 f"{self.reference_name}: 95 %",
@@ -243,18 +243,19 @@ class SpeedPage:
             intervals = ["" if row is None else _text(row) for row in (distance, excess)]
             body.append([self._name(point[0]), *networks, *times, *intervals, *cells])
         columns = [
-            "sampler", "U-Net", "Control Net", "ms", "CPU ms", f"{FD}: real", f"{FD}: excess", f"{KID}: real",
+            "sampler", "U-Net", "Control Net", "ms", "CPU ms", f"{FD}: recorded", f"{FD}: excess", f"{KID}: recorded",
             f"{FD}: ref.", "RMS",
         ]  # fmt: skip
         columns += [label.replace("_", " ")] if label else []
         caption = (
             "U-Net, ControlNet: evaluations an image, counted. ms: median time an image, batch by batch in one process "
             f"with the networks loaded and warm, on the machine as busy as it was. {FD}: Frechet distance, to "
-            f"{HELD_OUT} with its 95 % interval, and between halves to the reference's samples. Excess: that to real "
+            f"{HELD_OUT} with its 95 % interval, and between halves to the reference's samples. Excess: that to "
+            "recorded "
             f"frames minus the reference's, paired, with its 95 % interval. {KID}: kernel distance times 1,000, which "
             "has no bias. RMS: grey levels from the converged solution."
         )
-        caption += f" {label}: of a model trained on real frames, against the labels asked for." if label else ""
+        caption += f" {label}: of a model trained on recorded frames, against the labels asked for." if label else ""
         return Table("Every setting", columns, body, caption=f"{caption} Bold: recommended.", bold=bold)
 
     def _at(self, point: Point, metric: str, against: str) -> Row | None:

@@ -26,7 +26,7 @@ _QUESTIONS = (
     ("mpjpe3d", "3D body", paper_numbers.BODY_3D),
 )
 """What an experiment asks, by a score that begins so; the first that any of its scores begins with."""
-_COMPARED = ("real", "synthetic", "real+synthetic")
+_COMPARED = ("recorded", "synthetic", "recorded+synthetic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Part:
     @property
     def compares(self) -> bool:
         """Was anything trained on synthetic frames? If not, it is here for its samples and figures."""
-        return any(training_set != "real" for training_set in self.training_sets)
+        return any(training_set != "recorded" for training_set in self.training_sets)
 
     @property
     def heading(self) -> str:
@@ -76,8 +76,8 @@ class Part:
 
     @cached_property
     def difference(self) -> Difference | None:
-        """Trained on real and synthetic frames minus on real ones alone, in that score."""
-        return self.paired.difference("real", "real+synthetic", self.metric)
+        """Trained on recorded and synthetic frames minus on recorded ones alone, in that score."""
+        return self.paired.difference("recorded", "recorded+synthetic", self.metric)
 
     @property
     def _asked(self) -> tuple[str, Table | None]:
@@ -114,11 +114,11 @@ def study_overview(parts: Sequence[Part]) -> Table:
         if find_score(part.metric).meaning:
             explained[part.metric] = find_score(part.metric).meaning
     caption = (
-        "Models trained on labelled real frames, on synthetic ones and on both, all tested on real frames that nothing "
+        "Models trained on recorded frames, on synthetic ones and on both, all tested on recorded frames that nothing "
         "was trained on; ↓ less is better, ↑ more is. In brackets 95 % intervals. Bold: differences, frame by frame, "
         "whose interval excludes 0, and scores that are better for it."
     )
-    columns = ["experiment", "score", "real", "synthetic", "both", "both minus real"]
+    columns = ["experiment", "score", "recorded", "synthetic", "both", "both minus recorded"]
     notes = [f"`{metric}`: {words}" for metric, words in explained.items()]
     return Table("Do synthetic frames help?", columns, body, caption=caption, bold=bold, footnotes=notes)
 
@@ -134,7 +134,7 @@ def study_verdict(parts: Sequence[Part]) -> str:
         return ""
     told = ((True, "helped"), (False, "did harm"), (None, "made no difference that can be told"))
     clauses = [f"{what} in {len(found[key])} of {total}: {', '.join(found[key])}" for key, what in told if found[key]]
-    return f"By 95 % intervals, adding synthetic frames to real ones {'; it '.join(clauses)}."
+    return f"By 95 % intervals, adding synthetic frames to recorded ones {'; it '.join(clauses)}."
 
 
 def study_tables(parts: Sequence[Part]) -> list[list[Table]]:
@@ -147,7 +147,7 @@ def study_tables(parts: Sequence[Part]) -> list[list[Table]]:
 
 
 def _answers(table: Table) -> bool:
-    """Is it about models tested on real frames? What else was scored is on the experiment's own page."""
+    """Is it about models tested on recorded frames? What else was scored is on the experiment's own page."""
     return table.columns[0] in ("trained on", "classes")
 
 
@@ -209,8 +209,9 @@ def distances_table(parts: Sequence[Part]) -> Table:
         for training_set in training_sets
     ]
     caption = (
-        "Frechet distance to the real training frames, in features of a classifier trained on real events: another one "
+        "Frechet distance to the recorded training frames, in features of a classifier trained on recorded events: "
+        "another one "
         "for each experiment, so that only numbers below one another compare. Lower is nearer; the row of held-out "
-        "real frames is the floor. In brackets 95 %."
+        "recorded frames is the floor. In brackets 95 %."
     )
     return Table("Quality of the frames", ["frames", *(f"{part.name} ↓" for part in parts)], body, caption=caption)

@@ -42,7 +42,7 @@ def make_real(home):
         "split": ["train"] * 3 + ["test"], "class_name": ["walk"] * 4,
         **{name: [1] * 4 for name in ("t_start_us", "t_end_us", "num_events")}, **label_columns(make_labels(4)),
     }  # fmt: skip
-    return publish(home, "encode", "real", columns, tables.FRAMES, {}, frames=frames), frames
+    return publish(home, "encode", "recorded", columns, tables.FRAMES, {}, frames=frames), frames
 
 
 def test_samples_hold_images_conditions_and_labels(made, place):

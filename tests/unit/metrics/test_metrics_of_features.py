@@ -54,7 +54,7 @@ def test_the_reference_may_be_a_file_of_statistics(tmp_path):
     assert frechet.input_files(options) == [file]
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     assert cache_material(options) == {"statistics": digest} and cache_material(frechet.Options()) == {"statistics": ""}
-    # No matter which real frames there are.
+    # No matter which recorded frames there are.
     expected = {f"fd_to_{digest[:8]}": pytest.approx(frechet_distance(a, b), rel=1e-11)}
     assert frechet.compute(a, a[:3], options) == expected
     with pytest.raises(ValueError, match="same number of features, got 6 and 5"):

@@ -169,12 +169,12 @@ def test_auc_is_the_integral_of_pck(errors_mm, auc_max_mm):
 
 
 TABLE_3 = {  # MPJPE mm, PCK@25 %, PCK@50 %, AUC %
-    "real": (27.30, 46.05, 95.02, 81.79),
+    "recorded": (27.30, 46.05, 95.02, 81.79),
     "Event-GAN": (29.43, 35.61, 91.79, 80.37),
     "SMPL-ESIM": (53.53, 5.84, 42.54, 36.44),
     "ours, Event-HPE poses": (25.13, 54.97, 96.45, 83.24),
     "ours, AMASS poses": (28.32, 45.11, 92.59, 81.12),
-    "ours both + real": (18.65, 79.37, 99.66, 87.57),
+    "ours both + recorded": (18.65, 79.37, 99.66, 87.57),
 }
 
 

@@ -81,7 +81,7 @@ def test_independent_events_are_recognised_and_made_again():
         # First and last event of a pixel with two: the smaller and the larger of two uniform variables.
         order = np.argsort(events.y.astype(int) * 80 + events.x, kind="stable")
         gaps = np.diff(events.t[order].reshape(-1, 2), axis=1)[:, 0] / 20_000
-        # 4,800 gaps drawn from some 500 real ones: a Kolmogorov-Smirnov distance of 0.08 is 1.8 / sqrt(500).
+        # 4,800 gaps drawn from some 500 recorded ones: a Kolmogorov-Smirnov distance of 0.08 is 1.8 / sqrt(500).
         assert kstest(gaps, lambda gap: 1 - (1 - np.clip(gap, 0, 1)) ** 2).statistic < 0.08
         assert kstest(events.t / 20_000, "uniform").statistic < 0.06
         first_is_positive = events.p[order].reshape(-1, 2)[:, 0].mean()
@@ -184,7 +184,7 @@ def distances_of(spread: Spread, model: TimeModel, windows: list[Events]) -> dic
 
 
 def test_real_gaps_are_closer_to_the_real_person_than_uniform_times(real_recordings):
-    """Other windows of the recording; the floor is the distance of halves of the real windows from one another."""
+    """Other windows of the recording; the floor is the distance of halves of the recorded windows from one another."""
     (path,) = (real_recordings / "person").iterdir()
     events = event_files.read_events_file(path)
     windows = [events.slice(*window) for window in cut(events, Windows(num_events=7500)).tolist()]

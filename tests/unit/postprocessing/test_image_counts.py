@@ -1,4 +1,4 @@
-"""Counts from event images: real ones come back exactly, blurred ones nearly, and nothing else passes."""
+"""Counts from event images: recorded ones come back exactly, blurred ones nearly, and nothing else passes."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_saturated_counts_are_settled_without_going_below_the_least():
 
 def test_what_nothing_can_be_learnt_from_is_refused():
     options = ENCODING.Options()
-    with pytest.raises(DataError, match="none of 3 real windows has an event"):
+    with pytest.raises(DataError, match="none of 3 recorded windows has an event"):
         fit_counts(np.zeros((3, 2, 4, 4), np.uint16), options)
     with pytest.raises(DataError, match="none of 0"):
         fit_counts(np.zeros((0, 2, 4, 4), np.uint16), options)

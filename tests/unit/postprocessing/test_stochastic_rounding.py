@@ -64,7 +64,7 @@ def test_a_row_depends_on_its_own_seed_alone():
         (np.zeros((2, 4, 4), np.uint8), [5], [0, 1], "must be"),
         (np.zeros((2, 4, 4, 3)), [5], [0, 1], "must be"),
         (np.zeros((2, 4, 4, 3), np.uint8), [5], [0], "one seed a frame"),
-        (np.zeros((1, 4, 4, 3), np.uint8), [], [0], "real windows"),
+        (np.zeros((1, 4, 4, 3), np.uint8), [], [0], "recorded windows"),
     ],
 )
 def test_what_does_not_fit_is_refused(frames, num_events, seeds, message):

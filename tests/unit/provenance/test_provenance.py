@@ -135,7 +135,7 @@ def test_costs_are_added_up_by_stage_the_dearest_first(store):
     assert ["stage encode", "1"] in versions_table(found).rows
 
 
-def score_rows(value, subject="real", samples=30):
+def score_rows(value, subject="recorded", samples=30):
     return pa.Table.from_pylist(
         [
             {

@@ -1,6 +1,6 @@
-"""Recordings of `studio` beside a real one: every statistic of the same order of magnitude, most of them near.
+"""Recordings of `studio` beside a recorded one: every statistic of the same order of magnitude, most of them near.
 
-The real recording is of a person's head and shoulders, 0.59 s before a DVXplorer at 320 x 240 px; it is not part of the
+The recording is of a person's head and shoulders, 0.59 s before a DVXplorer at 320 x 240 px; it is not part of the
 repository. The sensor preset was estimated from this very recording, so that hot pixels and noise agree by design.
 How large people are in the picture and how light it is was chosen; nothing else was fitted.
 """
@@ -24,7 +24,7 @@ PRESET = Path(__file__).resolve().parents[3] / "flows" / "presets" / "studio_per
 NUM_RECORDINGS = 4
 """One of each motion that is learnt from; 2 to 3 s each."""
 FACTOR_OF_MEAN, FACTOR_OF_EACH = 3.0, 10.0
-"""Between a statistic of the real recording and the mean over studio's, and each of them."""
+"""Between a statistic of the recording and the mean over studio's, and each of them."""
 DISTANCE_DECADES = 0.5
 """Wasserstein distance of rates and intervals; those of studio's own motions differ by 0.1 to 0.4."""
 STATISTICS = (
@@ -35,10 +35,10 @@ STATISTICS = (
 
 @pytest.fixture
 def person(real_recordings):
-    """The events of the real recording."""
+    """The events of the recording."""
     path = real_recordings / "person" / "tonic_sample.aedat4"
     if not path.is_file():
-        pytest.skip("the real recording of a person is not beside this checkout")
+        pytest.skip("the recording of a person is not beside this checkout")
     return read_events_file(path)
 
 
@@ -52,7 +52,7 @@ def summarise_studio(count=NUM_RECORDINGS, **changes):
 
 
 def ratios(summaries, reference):
-    """[recordings, statistics], of those of studio to those of the real recording."""
+    """[recordings, statistics], of those of studio to those of the recording."""
     return np.array([[summary.numbers[name] / reference.numbers[name] for name in STATISTICS] for summary in summaries])
 
 

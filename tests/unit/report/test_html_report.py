@@ -103,12 +103,12 @@ def test_backticks_become_code_after_escaping():
 
 
 def test_table_aligns_numbers_and_marks_uncertainty_and_bold():
-    rows = [["real", "6.870 [6.5, 7.2]", 1400], ["both", "6.31 ± 0.02", None]]
+    rows = [["recorded", "6.870 [6.5, 7.2]", 1400], ["both", "6.31 ± 0.02", None]]
     page = render_report(title="t", lead="", verdict="", sections=[Table("T", ["on", "px", "n"], rows, bold={(1, 1)})])
     assert '<td class="number" data-sort="6.870">6.870<span class="uncertainty"> [6.5, 7.2]</span></td>' in page
     assert '<td class="number bold" data-sort="6.31">6.31<span class="uncertainty"> ± 0.02</span></td>' in page
     assert '<td class="number" data-sort="1400">1,400</td>' in page
-    assert '<td class="number">–</td>' in page and "<td>real</td>" in page
+    assert '<td class="number">–</td>' in page and "<td>recorded</td>" in page
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""The report in a real browser: nothing is wider than a phone, tables sort, links unfold, and the console is silent."""
+"""The report in a real browser: nothing is wider than a phone, tables sort, links unfold, and the console is
+silent."""
 
 import contextlib
 import functools

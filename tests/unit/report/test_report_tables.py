@@ -12,7 +12,7 @@ from ctlev_core.report.studies.paper_numbers import TABLES
 MIXED = Table(
     "Does it help? 95 %",
     ["trained on", "px ↓", "n_frames"],
-    [["real", "6.870 [6.5, 7.2]", 1400], ["a_b & c|d", "-0.31 ± 0.02", None]],
+    [["recorded", "6.870 [6.5, 7.2]", 1400], ["a_b & c|d", "-0.31 ± 0.02", None]],
     caption="With `code_x` & more",
     footnotes=["a note"],
     bold={(1, 1)},
@@ -45,7 +45,7 @@ def test_latex_aligns_numbers_and_marks_bold_and_uncertainty():
     assert r"\begin{tabular}{lrr}" in text and balanced(text)
     assert latex_cells(text) == [
         ["trained on", r"px $\downarrow$", r"n\_frames"],
-        ["real", r"6.870 {\scriptsize {[}6.5, 7.2{]}}", "1,400"],
+        ["recorded", r"6.870 {\scriptsize {[}6.5, 7.2{]}}", "1,400"],
         [r"a\_b \& c\textbar{}d", r"\textbf{$-$0.31} {\scriptsize $\pm$ 0.02}", "--"],
     ]
     assert r"\caption{\textbf{Does it help? 95 \%.} With \texttt{code\_x} \& more. a note.}" in text
@@ -55,7 +55,7 @@ def test_markdown_aligns_numbers_and_marks_bold():
     assert markdown_cells(markdown_table(MIXED)) == [
         ["trained on", "px ↓", r"n\_frames"],
         ["-" * 11, "-" * 17 + ":", "-" * 8 + ":"],
-        ["real", r"6.870 \[6.5, 7.2\]", "1,400"],
+        ["recorded", r"6.870 \[6.5, 7.2\]", "1,400"],
         [r"a\_b & c\|d", "**-0.31 ± 0.02**", "–"],
     ]
 

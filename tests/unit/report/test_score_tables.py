@@ -31,7 +31,7 @@ def row(training_set, value, *, seed=0, metric=METRIC, group="all", task="pose2d
 
 
 def scored(training_set, shift, *, seed=0, noise=0.1, names=NAMES):
-    """Rows, scores of samples, and a digest, of one training whose errors are those of `real` plus a shift."""
+    """Rows, scores of samples, and a digest, of one training whose errors are those of `recorded` plus a shift."""
     random = np.random.default_rng([seed, len(training_set)])
     values = 6 + np.random.default_rng(9).normal(0, 1, len(names)) + shift + random.normal(0, noise, len(names))
     columns = {"sample_id": names, "recording_id": names, "value": values, "weight": np.ones(len(names))}
@@ -39,29 +39,34 @@ def scored(training_set, shift, *, seed=0, noise=0.1, names=NAMES):
     return [row(training_set, float(values.mean()), seed=seed)], samples, "d"
 
 
-def tables_of(*parts, more=(), training_sets=("real",)):
+def tables_of(*parts, more=(), training_sets=("recorded",)):
     rows = [one for rows, _, _ in parts for one in rows] + list(more)
     paired = PairedScores(paired_samples(parts))
     return score_tables(rows, training_sets, paired), paired, rows
 
 
 def test_only_what_the_paired_interval_shows_is_bold():
-    parts = [scored("real", 0, noise=0), scored("synthetic", -0.5), scored("real+synthetic", 0.01, noise=0.5)]
+    parts = [scored("recorded", 0, noise=0), scored("synthetic", -0.5), scored("recorded+synthetic", 0.01, noise=0.5)]
     parts += [scored("worse", 0.5)]
-    (table, *_), _, _ = tables_of(*parts, training_sets=("real", "synthetic", "real+synthetic", "worse"))
-    assert table.columns[:4] == ["trained on", f"{METRIC} ↓", f"{METRIC}: minus real", "trainings"]
-    assert [cells[0] for cells in table.rows] == ["real", "synthetic", "real+synthetic", "worse"]
+    (table, *_), _, _ = tables_of(*parts, training_sets=("recorded", "synthetic", "recorded+synthetic", "worse"))
+    assert table.columns[:4] == ["trained on", f"{METRIC} ↓", f"{METRIC}: minus recorded", "trainings"]
+    assert [cells[0] for cells in table.rows] == ["recorded", "synthetic", "recorded+synthetic", "worse"]
     # Better: score and difference; undecided: neither; worse: the difference alone.
     assert set(table.bold) == {(1, 1), (1, 2), (3, 2)}
     assert table.rows[0][2] == "" and float(str(table.rows[1][2]).split()[0]) == pytest.approx(-0.5, abs=0.05)
 
 
 def test_trainings_are_averaged_and_counted_and_unknown_settings_follow_the_known():
-    parts = [scored("oracle", -1), scored("real", 0, seed=1), scored("real", 0.2, seed=2), scored("thing+other", 0)]
-    (table, *_), _, rows = tables_of(*parts, training_sets=("real",))
-    assert [cells[0] for cells in table.rows] == ["real", "oracle", "thing+other"]
+    parts = [
+        scored("oracle", -1),
+        scored("recorded", 0, seed=1),
+        scored("recorded", 0.2, seed=2),
+        scored("thing+other", 0),
+    ]
+    (table, *_), _, rows = tables_of(*parts, training_sets=("recorded",))
+    assert [cells[0] for cells in table.rows] == ["recorded", "oracle", "thing+other"]
     assert [cells[3] for cells in table.rows] == [2, 1, 1]
-    mean = np.mean([one["value"] for one in rows if one["subject"] == "real"])
+    mean = np.mean([one["value"] for one in rows if one["subject"] == "recorded"])
     assert table.rows[0][1] == f"{mean:.3f}"
     assert any("the most they can give" in note for note in table.footnotes)
 
@@ -70,24 +75,24 @@ def test_labels_shuffled_labels_and_distances_have_tables_of_their_own():
     more = [
         row("label agreement of synthetic", 5.0),
         row("shuffled label agreement of synthetic", 15.0),
-        row("held-out real", 3.0, task="distance", metric="fd_event_x"),
+        row("held-out recorded", 3.0, task="distance", metric="fd_event_x"),
         row("synthetic", 9.0, task="distance", metric="fd_event_x", low=8.0, high=10.0),
     ]
-    (headline, labels, distances), _, _ = tables_of(scored("real", 0), more=more)
-    assert [cells[0] for cells in headline.rows] == ["real"]
-    names = ["held-out real (floor)", "label agreement of synthetic", "shuffled label agreement of synthetic"]
+    (headline, labels, distances), _, _ = tables_of(scored("recorded", 0), more=more)
+    assert [cells[0] for cells in headline.rows] == ["recorded"]
+    names = ["held-out recorded (floor)", "label agreement of synthetic", "shuffled label agreement of synthetic"]
     assert [cells[0] for cells in labels.rows] == names
     assert distances.rows[1][:2] == ["synthetic", "9.00 [8.00, 10.00]"]
 
 
 def test_two_tasks_are_two_tables_and_classes_against_the_rest_a_third():
     more = [
-        row("real", 0.7, task="classifier", metric="accuracy"),
-        row("real", 0.1, task="classifier", metric="chance_accuracy"),
-        row("real", 0.8, task="classifier", metric="binary_accuracy_mean"),
-        row("real", 0.9, task="classifier", metric="binary_accuracy_bonsai"),
+        row("recorded", 0.7, task="classifier", metric="accuracy"),
+        row("recorded", 0.1, task="classifier", metric="chance_accuracy"),
+        row("recorded", 0.8, task="classifier", metric="binary_accuracy_mean"),
+        row("recorded", 0.9, task="classifier", metric="binary_accuracy_bonsai"),
     ]
-    (_, classes, binary), _, _ = tables_of(scored("real", 0), more=more)
+    (_, classes, binary), _, _ = tables_of(scored("recorded", 0), more=more)
     assert classes.title == "classifier: Does synthetic data help?"
     assert classes.columns[1:3] == ["accuracy ↑", "binary_accuracy_mean ↑"]
     assert "`chance_accuracy`: 0.100" in classes.footnotes
@@ -95,13 +100,13 @@ def test_two_tasks_are_two_tables_and_classes_against_the_rest_a_third():
 
 
 def test_scores_of_other_samples_are_not_paired():
-    parts = [scored("real", 0), scored("synthetic", -0.5, names=NAMES[::-1])]
-    (table, *_), paired, _ = tables_of(*parts, training_sets=("real", "synthetic"))
-    assert paired.difference("real", "synthetic", METRIC) is None and not table.bold
+    parts = [scored("recorded", 0), scored("synthetic", -0.5, names=NAMES[::-1])]
+    (table, *_), paired, _ = tables_of(*parts, training_sets=("recorded", "synthetic"))
+    assert paired.difference("recorded", "synthetic", METRIC) is None and not table.bold
 
 
 def test_baselines_stand_beside_the_first_generator():
-    training_sets = {"real": 0, "synthetic": 0.3, "gan": 0.6, "real+synthetic": -0.5, "real+gan": -0.2}
+    training_sets = {"recorded": 0, "synthetic": 0.3, "gan": 0.6, "recorded+synthetic": -0.5, "recorded+gan": -0.2}
     _, paired, _ = tables_of(*(scored(name, shift) for name, shift in training_sets.items()))
     (table,) = baseline_tables(["synthetic", "gan", "absent"], METRIC, paired)
     # Means of 40 samples, each with noise of 0.1 in both training sets.
@@ -112,20 +117,20 @@ def test_baselines_stand_beside_the_first_generator():
 
 
 def test_groups_by_origin_and_by_class_are_apart():
-    groups = ("walk", "classes with real training frames", "classes without training frames")
-    rows = [row(training_set, 5.0, group=group) for training_set in ("real", "new") for group in groups]
-    (origins,), (classes,) = group_tables([row("real", 5.0), *rows], ["real"])
+    groups = ("walk", "classes with recorded training frames", "classes without training frames")
+    rows = [row(training_set, 5.0, group=group) for training_set in ("recorded", "new") for group in groups]
+    (origins,), (classes,) = group_tables([row("recorded", 5.0), *rows], ["recorded"])
     assert [cells[0] for cells in origins.rows] == [*groups[1:]]
-    assert classes.columns == ["classes", "real", "new", "frames scored"]
+    assert classes.columns == ["classes", "recorded", "new", "frames scored"]
     assert classes.rows == [["walk", "5.000", "5.000", 40]]
-    assert group_tables([row("real", 5.0)], ["real"]) == ([], [])
+    assert group_tables([row("recorded", 5.0)], ["recorded"]) == ([], [])
 
 
 def test_subjects_have_a_table_of_their_own():
     groups = ("walk", "subject 14", "subjects not learnt from")
-    rows = [row(training_set, 5.0, group=group) for training_set in ("real", "new") for group in groups]
-    (subjects,), (classes,) = group_tables(rows, ["real", "new"])
-    assert subjects.columns == ["subjects", "real", "new", "frames scored"]
+    rows = [row(training_set, 5.0, group=group) for training_set in ("recorded", "new") for group in groups]
+    (subjects,), (classes,) = group_tables(rows, ["recorded", "new"])
+    assert subjects.columns == ["subjects", "recorded", "new", "frames scored"]
     assert [cells[0] for cells in subjects.rows] == [*groups[1:]]
     assert [cells[0] for cells in classes.rows] == ["walk"]
 
@@ -141,8 +146,9 @@ def test_intervals_join_recordings_and_trainings():
 
 def test_scaling_points_are_amounts_for_each_real_frame():
     rows = [
-        row("real", 7.0, num_train=100), row("real+synthetic@0.5", 6.5, num_train=150, low=6.4, high=6.6),
-        row("real+synthetic", 6.0, num_train=200), row("real+gan", 5.0, num_train=200), row("synthetic@0.5", 9.0),
+        row("recorded", 7.0, num_train=100), row("recorded+synthetic@0.5", 6.5, num_train=150, low=6.4, high=6.6),
+        row("recorded+synthetic", 6.0, num_train=200), row("recorded+gan", 5.0, num_train=200),
+        row("synthetic@0.5", 9.0),
     ]  # fmt: skip
     points = scaling_points(rows, METRIC)
     assert [(p.series, p.ratio, p.value) for p in sorted(points, key=lambda p: p.ratio)] == [
@@ -157,12 +163,14 @@ def test_scaling_points_are_amounts_for_each_real_frame():
 
 
 def test_the_verdict_says_how_much_of_the_ceiling_was_reached_and_whether_labels_hold():
-    rows = [row(name, value) for name, value in (("real", 7.0), ("real+synthetic", 6.4), ("real+oracle", 6.0))]
+    rows = [
+        row(name, value) for name, value in (("recorded", 7.0), ("recorded+synthetic", 6.4), ("recorded+oracle", 6.0))
+    ]
     rows += [row("label agreement of synthetic", 5.5), row("shuffled label agreement of synthetic", 15.0)]
-    training_sets = ("real", "real+synthetic", "real+oracle")
+    training_sets = ("recorded", "recorded+synthetic", "recorded+oracle")
     difference, gain = Difference(-0.6, -0.8, -0.4), Difference(-1.0, -1.2, -0.8)
     text = verdict(rows, training_sets, difference, oracle=(gain, Difference(0.6, 0.45, 0.75)))
-    assert "Adding synthetic data made it better" in text and "9% of what real data alone gives" in text
+    assert "Adding synthetic data made it better" in text and "9% of what recorded data alone gives" in text
     assert "synthetic ones give 60% [45%, 75%] of that." in text
     assert "scores 5.500 on synthetic frames against their labels, and 15.00 on them with shuffled labels." in text
     unsure = verdict(rows, training_sets, difference, oracle=(Difference(-0.1, -0.3, 0.1), None))

@@ -163,7 +163,7 @@ def test_damaged_summaries_are_refused(tmp_path, damage):
 def test_charts_have_the_references_interval_and_tables_every_setting():
     made = page(ROWS)
     charts = {section.title: section for section in made.sections() if isinstance(section, Curves)}
-    real = charts["Distance to held-out real frames"]
+    real = charts["Distance to held-out recorded frames"]
     assert list(real.series) == ["UniPC", "ddpm in 250 steps: 95 %"]
     assert real.series["UniPC"] == ([5.0, 10.0], [8.0, 3.2])
     low, high = real.spans["ddpm in 250 steps: 95 %"]

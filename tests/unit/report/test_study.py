@@ -113,8 +113,8 @@ def test_the_page_has_every_experiment_its_samples_the_papers_numbers_and_all_di
     page = (published / "both.html").read_text()
     texts = [
         "Data: <code>x</code>",
-        "adding synthetic frames to real ones helped in 2 of 2: 2D pose",
-        "both minus real",
+        "adding synthetic frames to recorded ones helped in 2 of 2: 2D pose",
+        "both minus recorded",
     ]
     texts += ["2D pose (<code>first</code>)</td>", "2D pose (<code>second</code>)</td>", "1. A label"]
     for part in PARTS:
@@ -145,12 +145,12 @@ def test_an_experiment_that_trains_on_nothing_synthetic_shows_samples_and_figure
         paired = PairedScores(pq.read_table(reports[0] / "samples.parquet"))
         return Part("first", rows, training_sets, ["synthetic"], paired, summary)
 
-    for training_sets in (["real"], list(TRAINING_SETS)):
+    for training_sets in (["recorded"], list(TRAINING_SETS)):
         parts = [part(training_sets)]
         tables = study_tables(parts)
         titles = [section.title for section in study_sections(parts, tables)]
         assert {"2D pose (`first`): asked for, and sampled", "2D pose (`first`): by amount"} <= set(titles)
-        told = training_sets != ["real"]
+        told = training_sets != ["recorded"]
         assert bool(tables[0]) == told == any("Paper, Table 2" in title for title in titles)
         assert ("the verdict" in study_words(parts)) == told
 
@@ -161,14 +161,14 @@ def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
             self.found = found
 
         def difference(self, before, after, metric):
-            assert (before, after) == ("real", "real+synthetic")
+            assert (before, after) == ("recorded", "recorded+synthetic")
             return Difference(*self.found) if self.found else None
 
     def part(name, metric, *found):
         rows = [
             {
                 "metric": metric,
-                "subject": "real",
+                "subject": "recorded",
                 "task": "test",
                 "group": "all",
                 "value": 6.0,
@@ -176,7 +176,7 @@ def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
                 "high": None,
             }
         ]
-        return Part(name, rows, ["real", "real+synthetic"], [], Paired(*found), Summary("told.", [], None, []))
+        return Part(name, rows, ["recorded", "recorded+synthetic"], [], Paired(*found), Summary("told.", [], None, []))
 
     parts = [
         part("a", "mpjpe2d_px", -0.3, -0.5, -0.1),  # an error that fell
@@ -188,13 +188,13 @@ def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
     ]
     others = study_words(parts).split("\n\n")
     assert study_verdict(parts) == (
-        "By 95 % intervals, adding synthetic frames to real ones helped in 2 of 4: 2D pose (`a`), Object "
+        "By 95 % intervals, adding synthetic frames to recorded ones helped in 2 of 4: 2D pose (`a`), Object "
         "recognition (`b`); it did harm in 1 of 4: Object recognition (`c`); it made no difference that can be told in "
         "1 of 4: 3D body (`d`)."
     )
     assert len(others) == 6 and others[0] == "2D pose (`a`): told."
     assert study_verdict(parts[3:]) == ""  # one alone needs no summing up
-    table = study_overview([*parts, replace(parts[0], training_sets=["real"])])
+    table = study_overview([*parts, replace(parts[0], training_sets=["recorded"])])
     assert [row[:2] for row in table.rows[:2]] == [
         ["2D pose (`a`)", "mpjpe2d_px ↓"],
         ["Object recognition (`b`)", "accuracy ↑"],
@@ -277,7 +277,7 @@ def test_the_demo_trains_once_what_its_experiments_share():
         for name in ("dataset", "windows", "encoding", "condition", "generator", "downstream", "downstream_seeds",
                      "feature_extractor", "seed"):  # fmt: skip
             assert getattr(one, name) == getattr(other, name)
-        assert other.training_sets == ("real",)  # trained for `one`
+        assert other.training_sets == ("recorded",)  # trained for `one`
     assert body.baselines["out_of_domain_poses"].generator == body.generator
     alike = {"random_50": {"random_init": True, "num_steps": 50}, "random_150": {"random_init": True},
              "base_model_50": {"num_steps": 50}}  # fmt: skip

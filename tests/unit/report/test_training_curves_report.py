@@ -25,14 +25,14 @@ OPTIONS = {
     "event_gan": {"num_steps": 999},
 }
 ROWS = [
-    row("real", "error_px", 5.0),
+    row("recorded", "error_px", 5.0),
     row("label agreement of synthetic", "error_px", 6.0, low=5.5, high=6.5),
     row("label agreement of synthetic", "error_px", 8.0, low=7.5, high=8.5),
     row("label agreement of synthetic", "error_px", 99.0, group="class walk"),
     row("label agreement of few", "error_px", 9.0),
     row("label agreement of random_300", "error_px", 8.5),
     row("label agreement of random_30", "error_px", 14.0),
-    *(row(f"real+{name}", "error_px", 4.0 + number) for number, name in enumerate(OPTIONS)),
+    *(row(f"recorded+{name}", "error_px", 4.0 + number) for number, name in enumerate(OPTIONS)),
     row("shuffled label agreement of synthetic", "error_px", 20.0),
     row("label agreement of event_gan", "error_px", 1.0),
     *(row(name, "kid_event_x", 0.5, task="distance") for name in OPTIONS),
@@ -48,7 +48,7 @@ def test_lines_are_means_over_fine_tunings_by_steps_and_start():
     assert (low, high) == pytest.approx((7 - (0.5**2 + 1.96**2) ** 0.5, 7 + (0.5**2 + 1.96**2) ** 0.5))
     assert distances.series == {PRE_TRAINED: ([30, 300], [1, 0]), RANDOM: ([30, 300], [3, 2])}
     assert learnt.series == {PRE_TRAINED: ([30, 300], [5, 4]), RANDOM: ([30, 300], [7, 6])}
-    assert len(base_model_figures([r for r in ROWS if "real" not in r["subject"]], OPTIONS, "error_px")) == 2
+    assert len(base_model_figures([r for r in ROWS if "recorded" not in r["subject"]], OPTIONS, "error_px")) == 2
     assert labels.log_x and (labels.y_label, distances.y_label) == ("error_px", "fd_event_x")
 
 

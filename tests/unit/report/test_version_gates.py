@@ -25,23 +25,23 @@ def row(task, training_set, metric, value, group="all"):
 def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px", realism=(0.75, 0.1)):
     real_error = 6.0 if metric == "mpjpe2d_px" else 0.75
     return [
-        row("distance", "held-out real", f"fd_event_classifier_{DIGEST}", 3.0),
-        row("distance", "held-out real", f"kid_event_classifier_{DIGEST}", -0.1),
+        row("distance", "held-out recorded", f"fd_event_classifier_{DIGEST}", 3.0),
+        row("distance", "held-out recorded", f"kid_event_classifier_{DIGEST}", -0.1),
         row("distance", "synthetic", f"kid_event_classifier_{DIGEST}", 99.0),
         row("distance", "synthetic", f"fd_event_classifier_{DIGEST}", distance),
         row("memorisation", "synthetic", "duplicates", 5.0, "small pictures"),
         row("memorisation", "synthetic", "close_share", copies[0], "small pictures"),
         row("memorisation", "synthetic", "close_share", copies[1], "features of classifier"),
-        row("net", "real", metric, real_error),
-        row("net", "real", metric, 100.0, "walk"),
-        row("net", "real", "pck_px4", 0.9),
+        row("net", "recorded", metric, real_error),
+        row("net", "recorded", metric, 100.0, "walk"),
+        row("net", "recorded", "pck_px4", 0.9),
         row("net", "label agreement of synthetic", metric, error),
         row("net", "label agreement of synthetic", "pck_px4", 0.1),
-        row("realism", "synthetic against real", "c2st", 0.99, "frames"),
+        row("realism", "synthetic against recorded", "c2st", 0.99, "frames"),
         row("realism", "synthetic against test", "c2st", realism[0], "frames"),
-        row("realism", "real against real", "isolated_pixel_share", 0.9, "frames"),
+        row("realism", "recorded against recorded", "isolated_pixel_share", 0.9, "frames"),
         row("realism", "synthetic", "isolated_pixel_share", 0.9, "frames"),
-        row("realism", "synthetic against real", "isolated_pixel_share", realism[1], "frames"),
+        row("realism", "synthetic against recorded", "isolated_pixel_share", realism[1], "frames"),
     ]
 
 
@@ -90,11 +90,11 @@ def test_gates_that_are_not_asked_need_no_scores():
     ("gate", "without"),
     [
         ({"max_distance_ratio": 2}, ("distance", "synthetic", "fd_")),
-        ({"max_distance_ratio": 2}, ("distance", "held-out real", "fd_")),
-        ({"max_label_error_ratio": 2}, ("net", "real", "")),
+        ({"max_distance_ratio": 2}, ("distance", "held-out recorded", "fd_")),
+        ({"max_label_error_ratio": 2}, ("net", "recorded", "")),
         ({"max_memorised_share": 1}, ("memorisation", "synthetic", "close")),
         ({"max_c2st": 1}, ("realism", "synthetic against test", "c2st")),
-        ({"max_realism_distances": {"isolated_pixel_share": 1}}, ("realism", "synthetic against real", "isolated")),
+        ({"max_realism_distances": {"isolated_pixel_share": 1}}, ("realism", "synthetic against recorded", "isolated")),
     ],
 )
 def test_a_gate_without_its_score_is_no_gate_that_was_kept(gate, without):
@@ -109,7 +109,7 @@ def test_a_gate_without_its_score_is_no_gate_that_was_kept(gate, without):
 
 
 def test_no_error_of_real_frames_leaves_no_room():
-    found = [r | {"value": 0.0} if (r["task"], r["subject"]) == ("net", "real") else r for r in scores(error=0.1)]
+    found = [r | {"value": 0.0} if (r["task"], r["subject"]) == ("net", "recorded") else r for r in scores(error=0.1)]
     assert not check({"max_label_error_ratio": 100}, found)[0].passed
 
 

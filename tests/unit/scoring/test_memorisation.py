@@ -122,7 +122,7 @@ def test_constant_frames_and_single_rows():
     found = check_memorisation(
         constant, constant, constant, training_recordings=list("aabbcc"), real_recordings=list("aabbcc")
     )
-    # Real frames of other recordings are as equal: no frame is nearer than those, and duplicates are counted apart.
+    # Recorded frames of other recordings are as equal: no frame is nearer than those, and duplicates are counted apart.
     assert found.close_share == 0 and found.num_duplicates == 6 and np.isnan(found.ratio)
     single = check_memorisation(
         np.zeros((1, 3)), np.ones((1, 3)), np.ones((1, 3)) * 2, training_recordings=["a"], real_recordings=["b"]

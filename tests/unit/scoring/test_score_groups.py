@@ -67,7 +67,7 @@ def score(tmp_path, monkeypatch):
 
     def run(data, *training_sets):
         table = score_model.function(
-            Output(tmp_path, tmp_path), data, data, list(training_sets), [], subject="real", split="test", seed=0,
+            Output(tmp_path, tmp_path), data, data, list(training_sets), [], subject="recorded", split="test", seed=0,
             downstream=DownstreamChoice(name="classifier"), metrics=[MetricChoice(name="classification")],
         )  # fmt: skip
         rows = [row for row in table.to_pylist() if row["metric"] == "accuracy"]
@@ -84,7 +84,7 @@ def test_recordings_split_in_time_are_scored_apart_from_unseen_subjects(tmp_path
         ("3", "bob", "test"),
         ("4", "eve", "train"),
     ]
-    data = frame_set(tmp_path / "real", rows)
+    data = frame_set(tmp_path / "recorded", rows)
     assert score(data, data) == {
         "all": (2 / 3, 3), "a": (2 / 3, 3), "subjects learnt from": (1, 1), "subjects not learnt from": (1 / 2, 2),
         "subject ann": (1, 1), "subject bob": (1 / 2, 2),
@@ -93,19 +93,19 @@ def test_recordings_split_in_time_are_scored_apart_from_unseen_subjects(tmp_path
 
 def test_each_of_a_few_unseen_subjects_has_its_own_score(tmp_path, score):
     rows = [("0", "joe", "train"), ("1", "ann", "test"), ("2", "bob", "test"), ("3", "ann", "test")]
-    data = frame_set(tmp_path / "real", rows)
+    data = frame_set(tmp_path / "recorded", rows)
     assert score(data, data) == {"all": (2 / 3, 3), "a": (2 / 3, 3), "subject ann": (1, 2), "subject bob": (0, 1)}
 
 
 def test_a_recording_learnt_from_and_tested_on_is_refused(tmp_path, score):
-    data = frame_set(tmp_path / "real", [("0", "joe", "train"), ("1", "ann", "test")])
+    data = frame_set(tmp_path / "recorded", [("0", "joe", "train"), ("1", "ann", "test")])
     more = frame_set(tmp_path / "more", [("8", "eve", "train"), ("1", "ann", "train")])
     with pytest.raises(DataError, match=r"recording '1' is in the training data .*more and in split 'test'"):
         score(data, data, more)
 
 
 def test_frames_made_from_poses_of_a_tested_recording_are_refused(tmp_path):
-    data = frame_set(tmp_path / "real", [("0", "joe", "train"), ("1", "ann", "test")])
+    data = frame_set(tmp_path / "recorded", [("0", "joe", "train"), ("1", "ann", "test")])
     columns = {"sample_id": ["s/0", "s/1"], "subject": ["eve", "ann"], "source_id": ["7:100", "1:200"]}
     table = pa.table({**columns, "split": ["train", "train"]})
     made = Manifest(ManifestRef(key="made", path=tmp_path / "made"), tables.SYNTHETIC, table, {})
@@ -114,7 +114,7 @@ def test_frames_made_from_poses_of_a_tested_recording_are_refused(tmp_path):
 
 
 def test_a_subject_of_the_same_name_in_another_set_is_a_warning(tmp_path, score, caplog):
-    data = frame_set(tmp_path / "real", [("0", "joe", "train"), ("1", "ann", "test")])
+    data = frame_set(tmp_path / "recorded", [("0", "joe", "train"), ("1", "ann", "test")])
     more = frame_set(tmp_path / "more", [("8", "ann", "train"), ("9", "joe", "train")])
     with caplog.at_level(logging.WARNING, "tasks.evaluate"):
         score(data, data, more)
@@ -126,7 +126,7 @@ def test_a_subject_of_the_same_name_in_another_set_is_a_warning(tmp_path, score,
 
 def test_a_distance_lies_beside_what_real_frames_score_against_one_another(tmp_path, monkeypatch):
     data = frame_set(
-        tmp_path / "real", [(str(r), "ann", "test" if r % 2 else "train") for r in range(14) for _ in "abc"]
+        tmp_path / "recorded", [(str(r), "ann", "test" if r % 2 else "train") for r in range(14) for _ in "abc"]
     )
     monkeypatch.setattr(
         classifier, "features", lambda folder, frames: np.random.default_rng(len(frames)).normal(size=(len(frames), 3))

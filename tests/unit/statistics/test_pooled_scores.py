@@ -9,8 +9,8 @@ from pooled_tables import samples_table, simulate_draws
 
 from ctlev_core.statistics.pooled_scores import DrawsDiffer, PooledScores, pool_values
 
-REAL, SYNTHETIC = "real", "real+synthetic"
-EFFECTS = {REAL: 0.5, SYNTHETIC: 0.6}
+RECORDED, SYNTHETIC = "recorded", "recorded+synthetic"
+EFFECTS = {RECORDED: 0.5, SYNTHETIC: 0.6}
 CLOSE = {"recording": 0.3, "recording_of_setting": 0.1, "sample": 0.1}
 
 
@@ -35,9 +35,9 @@ def test_intervals_have_the_width_that_the_normal_model_gives():
         trained = np.stack([tuned[g] + with_spread(random.normal(size=seeds), 0.04) for g in range(generators)], axis=1)
         synthetic = 0.6 + effect + trained.reshape(-1, 1) + of_recording
         real = 0.5 + with_spread(random.normal(size=generators * seeds), 0.03)[:, None] + 0 * of_recording
-        found.append({REAL: real, SYNTHETIC: synthetic})
+        found.append({RECORDED: real, SYNTHETIC: synthetic})
     scores = pooled(found, generators)
-    difference = scores.difference(REAL, SYNTHETIC)
+    difference = scores.difference(RECORDED, SYNTHETIC)
     assert difference.value == pytest.approx(0.1)
     # Tunings and seeds have the same means in every draw, so that the spread between draws is 0.05 alone, and contains
     # whatever trainings add to it.
@@ -56,7 +56,7 @@ def test_without_a_spread_between_draws_that_of_trainings_is_covered():
     flat = np.zeros(50)
     synthetic = 0.6 + (tuned + seed_effects).reshape(-1, 1) + flat
     real = 0.5 + with_spread(random.normal(size=15), 0.03)[:, None] + flat
-    found = pooled([{REAL: real, SYNTHETIC: synthetic}] * 3).difference(REAL, SYNTHETIC)
+    found = pooled([{RECORDED: real, SYNTHETIC: synthetic}] * 3).difference(RECORDED, SYNTHETIC)
     parts = 0.06**2 / 5, 0.03**2 / 15
     freedom = sum(parts) ** 2 / (parts[0] ** 2 / 12 + parts[1] ** 2 / 42)
     assert 13 < freedom < 15
@@ -79,7 +79,7 @@ def test_intervals_of_three_draws_cover_the_truth(monkeypatch, spread):
     covered = np.zeros(2)
     for run in range(runs):
         scores = pooled(simulate_draws(random, EFFECTS, **CLOSE, **spread), seed=run)
-        difference, score = scores.difference(REAL, SYNTHETIC), scores.score(SYNTHETIC)
+        difference, score = scores.difference(RECORDED, SYNTHETIC), scores.score(SYNTHETIC)
         covered += [difference.low <= 0.1 <= difference.high, score.low <= 0.6 <= score.high]
     # The binomial spread of 300 runs is 1.3 %.
     assert (covered / runs >= 0.92).all()
@@ -88,39 +88,39 @@ def test_intervals_of_three_draws_cover_the_truth(monkeypatch, spread):
 def test_equal_settings_differ_by_exactly_zero():
     random = np.random.default_rng(0)
     shared = random.normal(size=(3, 1, 40)).repeat(15, axis=1)
-    scores = pooled([{REAL: values, "copy": values, SYNTHETIC: values + 0.1} for values in shared])
-    for before, after in ((REAL, REAL), (REAL, "copy")):
+    scores = pooled([{RECORDED: values, "copy": values, SYNTHETIC: values + 0.1} for values in shared])
+    for before, after in ((RECORDED, RECORDED), (RECORDED, "copy")):
         found = scores.difference(before, after)
         assert (found.value, found.low, found.high) == (0, 0, 0)
         assert scores.probability(after, before) == 0.5
     # Draws and recordings are paired: what all training sets share is in no difference.
-    gained = scores.difference(REAL, SYNTHETIC)
+    gained = scores.difference(RECORDED, SYNTHETIC)
     assert (gained.value, gained.low, gained.high) == pytest.approx((0.1, 0.1, 0.1))
     assert scores.score(SYNTHETIC).high - scores.score(SYNTHETIC).low > 0.2
     noisy = pooled(simulate_draws(random, EFFECTS, seed=0.1, **CLOSE))
-    assert noisy.difference(REAL, REAL).text() == "+0.000 [+0.000, +0.000]"
+    assert noisy.difference(RECORDED, RECORDED).text() == "+0.000 [+0.000, +0.000]"
 
 
 def test_probabilities_say_what_intervals_say():
     scores = pooled(simulate_draws(np.random.default_rng(3), EFFECTS | {"other": 0.6}, seed=0.02, **CLOSE))
-    assert scores.difference(REAL, SYNTHETIC).is_certain and scores.probability(SYNTHETIC, REAL) > 0.97
-    assert scores.probability(SYNTHETIC, REAL, lower_is_better=True) < 0.03
-    assert scores.probability(REAL, SYNTHETIC) == pytest.approx(1 - scores.probability(SYNTHETIC, REAL))
+    assert scores.difference(RECORDED, SYNTHETIC).is_certain and scores.probability(SYNTHETIC, RECORDED) > 0.97
+    assert scores.probability(SYNTHETIC, RECORDED, lower_is_better=True) < 0.03
+    assert scores.probability(RECORDED, SYNTHETIC) == pytest.approx(1 - scores.probability(SYNTHETIC, RECORDED))
     assert 0.025 < scores.probability(SYNTHETIC, "other") < 0.975
 
 
 def test_the_share_of_a_gain():
-    effects = {REAL: 0.5, SYNTHETIC: 0.56, "real+oracle": 0.6}
+    effects = {RECORDED: 0.5, SYNTHETIC: 0.56, "recorded+oracle": 0.6}
     draws = simulate_draws(np.random.default_rng(0), effects, recording=0.4, seed=0.01)
     scores = pooled(draws)
-    share = scores.share_of_gain(REAL, SYNTHETIC, "real+oracle")
-    gained, most = scores.difference(REAL, SYNTHETIC), scores.difference(REAL, "real+oracle")
+    share = scores.share_of_gain(RECORDED, SYNTHETIC, "recorded+oracle")
+    gained, most = scores.difference(RECORDED, SYNTHETIC), scores.difference(RECORDED, "recorded+oracle")
     assert share.value == pytest.approx(gained.value / most.value) and 0.4 < share.low < share.value < share.high < 0.8
     # Where the gain is much larger than its error, the interval is about that of the delta method.
     errors = [(d.high - d.low) / 2 for d in (gained, most)]
     assert share.high - share.value < np.hypot(errors[0], errors[1]) / most.value
-    unchanged = [values | {"real+oracle": values[REAL]} for values in draws]
-    assert pooled(unchanged).share_of_gain(REAL, SYNTHETIC, "real+oracle") is None
+    unchanged = [values | {"recorded+oracle": values[RECORDED]} for values in draws]
+    assert pooled(unchanged).share_of_gain(RECORDED, SYNTHETIC, "recorded+oracle") is None
 
 
 def test_the_order_of_rows_changes_nothing():
@@ -128,32 +128,35 @@ def test_the_order_of_rows_changes_nothing():
     tables = [samples_table(values, per_recording=3) for values in draws]
     shuffled = [table.take(np.random.default_rng(n).permutation(len(table))) for n, table in enumerate(tables)]
     one, other = (PooledScores(given, "accuracy", 5) for given in (tables, shuffled))
-    assert one.difference(REAL, SYNTHETIC) == other.difference(REAL, SYNTHETIC)
-    assert one.score(REAL) == other.score(REAL) and one.num_recordings == other.num_recordings == 20
-    assert one.probability(SYNTHETIC, REAL) == other.probability(SYNTHETIC, REAL)
+    assert one.difference(RECORDED, SYNTHETIC) == other.difference(RECORDED, SYNTHETIC)
+    assert one.score(RECORDED) == other.score(RECORDED) and one.num_recordings == other.num_recordings == 20
+    assert one.probability(SYNTHETIC, RECORDED) == other.probability(SYNTHETIC, RECORDED)
 
 
 def test_samples_of_a_recording_are_drawn_together():
     values = np.repeat(np.random.default_rng(0).normal(size=30), 4)[None]
-    scores = PooledScores([samples_table({REAL: values}, per_recording=4)] * 2, "accuracy", 1).score(REAL)
+    scores = PooledScores([samples_table({RECORDED: values}, per_recording=4)] * 2, "accuracy", 1).score(RECORDED)
     error = values[0, ::4].std(ddof=1) / np.sqrt(30)
     assert scores.high - scores.low == pytest.approx(2 * 2.05 * error, rel=0.06)
 
 
 def test_few_recordings_give_no_interval():
-    scores = pooled([{REAL: np.full((15, 4), 0.5), SYNTHETIC: np.full((15, 4), 0.7)}] * 3)
-    assert scores.difference(REAL, SYNTHETIC).text() == "+0.200"
-    assert np.isnan(scores.probability(REAL, SYNTHETIC)) and scores.share_of_gain(REAL, REAL, SYNTHETIC) is None
+    scores = pooled([{RECORDED: np.full((15, 4), 0.5), SYNTHETIC: np.full((15, 4), 0.7)}] * 3)
+    assert scores.difference(RECORDED, SYNTHETIC).text() == "+0.200"
+    assert (
+        np.isnan(scores.probability(RECORDED, SYNTHETIC))
+        and scores.share_of_gain(RECORDED, RECORDED, SYNTHETIC) is None
+    )
 
 
 def test_missing_scores_leave_the_sample_out():
     values = np.tile(np.arange(8.0), (5, 1))
     missing = values.copy()
     missing[2, 7] = np.nan
-    scores = pooled([{REAL: values, SYNTHETIC: missing}, {REAL: values, SYNTHETIC: values}])
-    assert scores.num_samples == 7 and scores.score(REAL).value == pytest.approx(3.0)
+    scores = pooled([{RECORDED: values, SYNTHETIC: missing}, {RECORDED: values, SYNTHETIC: values}])
+    assert scores.num_samples == 7 and scores.score(RECORDED).value == pytest.approx(3.0)
     with pytest.raises(ValueError, match="none of the 8 samples is scored by every training"):
-        pooled([{REAL: values, SYNTHETIC: values * np.nan}] * 2)
+        pooled([{RECORDED: values, SYNTHETIC: values * np.nan}] * 2)
 
 
 def changed(table, column, values):
@@ -161,7 +164,7 @@ def changed(table, column, values):
 
 
 def test_draws_tested_on_different_samples_are_refused():
-    table = samples_table({REAL: np.zeros((1, 6))})
+    table = samples_table({RECORDED: np.zeros((1, 6))})
     ids = table["sample_id"].to_pylist()
     for column, values, message in (
         ("sample_id", [*ids[:5], "other"], r"draws 0 and 1 .* 2 of them in one alone"),
@@ -173,18 +176,18 @@ def test_draws_tested_on_different_samples_are_refused():
     ):
         with pytest.raises(DrawsDiffer, match=message):
             PooledScores([table, changed(table, column, values)], "accuracy", 1)
-    two = samples_table({REAL: np.zeros((2, 6))})
-    with pytest.raises(DrawsDiffer, match=r"'real' of draw 0: each training must score each of the 6 samples once"):
+    two = samples_table({RECORDED: np.zeros((2, 6))})
+    with pytest.raises(DrawsDiffer, match=r"'recorded' of draw 0: each training must score each of the 6 samples once"):
         PooledScores([two.slice(1), two], "accuracy", 1)
 
 
 def test_other_bad_input_is_refused():
-    table = samples_table({REAL: np.zeros((4, 6)), SYNTHETIC: np.zeros((4, 6))})
+    table = samples_table({RECORDED: np.zeros((4, 6)), SYNTHETIC: np.zeros((4, 6))})
     for draws, metric, generators, message in (
         ([table], "accuracy", 1, "at least two draws, got 1"),
         ([table] * 2, "error", 1, "draw 0 has no samples scored by 'error'"),
-        ([table] * 2, "accuracy", 3, r"'real\+synthetic': .* multiple of the 3 fine-tunings, got 4"),
-        ([table, samples_table({REAL: np.zeros((2, 6))})], "accuracy", 1, r"as many trainings .* \[4, 2\]"),
+        ([table] * 2, "accuracy", 3, r"'recorded\+synthetic': .* multiple of the 3 fine-tunings, got 4"),
+        ([table, samples_table({RECORDED: np.zeros((2, 6))})], "accuracy", 1, r"as many trainings .* \[4, 2\]"),
     ):
         with pytest.raises(ValueError, match=message):
             PooledScores(draws, metric, generators)
@@ -198,9 +201,9 @@ def test_other_bad_input_is_refused():
 
 
 def test_settings_scored_on_samples_of_their_own_are_left_out():
-    one = samples_table({REAL: np.zeros((1, 6))})
+    one = samples_table({RECORDED: np.zeros((1, 6))})
     labels = changed(samples_table({"label agreement of synthetic": np.zeros((1, 9))}), "samples_digest", ["other"] * 9)
-    assert PooledScores([pa.concat_tables([one, labels])] * 2, "accuracy", 1).training_sets == (REAL,)
+    assert PooledScores([pa.concat_tables([one, labels])] * 2, "accuracy", 1).training_sets == (RECORDED,)
 
 
 def test_pooled_values_have_the_width_of_their_spread():
@@ -211,13 +214,13 @@ def test_pooled_values_have_the_width_of_their_spread():
 
 
 def test_a_whole_study_takes_seconds():
-    names = [REAL, "synthetic", SYNTHETIC, *(f"{kind}{n}" for n in range(4) for kind in ("x", "real+x"))]
+    names = [RECORDED, "synthetic", SYNTHETIC, *(f"{kind}{n}" for n in range(4) for kind in ("x", "recorded+x"))]
     random = np.random.default_rng(0)
     draws = simulate_draws(random, dict.fromkeys(names, 0.5), recordings=300, seed=0.1)
     tables = [samples_table(values) for values in draws]
     start = time.perf_counter()
     scores = PooledScores(tables, "accuracy", 5)
     for name in names:
-        scores.difference(REAL, name)
+        scores.difference(RECORDED, name)
     # A quarter of a study of four groups; far more than it needs, for machines that are busy.
     assert time.perf_counter() - start < 10

@@ -30,11 +30,11 @@ def frame_set(folder, split, count=3):
 
 
 def test_an_empty_test_split_is_refused_before_the_model_is_read(tmp_path):
-    data = frame_set(tmp_path / "real", "train")
-    with pytest.raises(DataError, match=r"real: no rows in split 'test' to score on"):
+    data = frame_set(tmp_path / "recorded", "train")
+    with pytest.raises(DataError, match=r"recorded: no rows in split 'test' to score on"):
         score_model.function(
             Output(tmp_path, tmp_path), None, data, [data], [], downstream=DownstreamChoice(name="classifier"),
-            metrics=[MetricChoice(name="classification")], subject="real", split="test", seed=0,
+            metrics=[MetricChoice(name="classification")], subject="recorded", split="test", seed=0,
         )  # fmt: skip
 
 
@@ -44,7 +44,7 @@ def test_an_empty_set_of_frames_is_compared_with_nothing(tmp_path, splits, named
 
     extractor, real, other = (
         frame_set(tmp_path / name, split)
-        for name, split in zip(("x", "real", "other"), ("train", *splits), strict=True)
+        for name, split in zip(("x", "recorded", "other"), ("train", *splits), strict=True)
     )
     monkeypatch.setattr(classifier, "features", lambda folder, frames: np.zeros((len(frames), 2), np.float32))
     with pytest.raises(DataError, match=named):
@@ -55,8 +55,8 @@ def test_an_empty_set_of_frames_is_compared_with_nothing(tmp_path, splits, named
 
 
 def test_conditions_of_an_empty_split_are_refused(tmp_path):
-    data = frame_set(tmp_path / "real", "train")
-    with pytest.raises(DataError, match=r"real: expected frames of split 'test', got none"):
+    data = frame_set(tmp_path / "recorded", "train")
+    with pytest.raises(DataError, match=r"recorded: expected frames of split 'test', got none"):
         condition_some_frames.function(
             Output(tmp_path, tmp_path), None, data, condition=ConditionChoice(name="text"),
             encoding=EncodingChoice(name="event_histogram"), split="test", count=5, seed=0,

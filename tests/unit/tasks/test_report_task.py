@@ -41,7 +41,7 @@ def test_the_page_says_first_what_data_it_is_then_the_verdict_then_what_was_done
     folded = ("Where the time went", "The paper&#x27;s own numbers, on other data")
     places += [page.index(f"{text}</h2></summary>") for text in folded]
     assert places == sorted(places)
-    for expected in ("real+oracle", "synthetic ones give 50% [", "15.00 on them with shuffled labels"):
+    for expected in ("recorded+oracle", "synthetic ones give 50% [", "15.00 on them with shuffled labels"):
         assert expected in page
     assert "http://" not in page and "https://" not in page
 
@@ -62,7 +62,7 @@ def test_every_number_can_be_traced(published, experiment):
 
 def test_tables_hold_what_the_page_holds(published):
     markdown, latex = ((published / "tiny" / name).read_text() for name in ("tables.md", "tables.tex"))
-    for text in ("Does synthetic data help?", "Beside the baselines", "How far from real frames?", "Does it copy?"):
+    for text in ("Does synthetic data help?", "Beside the baselines", "How far from recorded frames?", "Does it copy?"):
         assert text in markdown and text in latex
     assert latex.count("{table}") == 2 * latex.count(r"\toprule") and "Data: `made up`." in markdown
 
@@ -76,7 +76,7 @@ def test_several_sets_of_a_generator_and_more_real_frames_are_taken(experiment, 
     }
     report.function(Output(tmp_path, tmp_path), **arguments)
     page = (tmp_path / "report.html").read_text()
-    assert page.count("<span>gan</span>") == 1 and "real, same moment" in page
+    assert page.count("<span>gan</span>") == 1 and "recorded, same moment" in page
     roles = [record.role for record in read_provenance(tmp_path / "provenance.json")]
     assert "frames of gan" in roles and len(roles) == len(set(roles))
 
@@ -102,8 +102,8 @@ def test_the_four_pictures_are_of_median_activity(experiment):
 def test_grids_show_the_real_frame_of_the_same_moment(experiment):
     grid = sample_grid(experiment.conditions, {"synthetic": experiment.generated[0]}, [experiment.frames])
     labels = [label for label, _ in grid.rows]
-    assert labels == ["condition", "real, same moment", "synthetic"]
-    real = dict(grid.rows)["real, same moment"]
+    assert labels == ["condition", "recorded, same moment", "synthetic"]
+    real = dict(grid.rows)["recorded, same moment"]
     # Every condition names recording r0, of which there is one frame.
     assert all(np.array_equal(image, experiment.frames.array("frames")[0]) for image in real)
     assert "Grey" not in grid.caption
@@ -143,8 +143,8 @@ def test_frames_of_words_stand_beside_real_ones_of_their_class(experiment):
             return columns.get(name, [0] * 3)
 
     rows = dict(sample_grid(Words(), {"synthetic": Words()}, [Real()]).rows)
-    assert [int(image[0, 0, 0]) for image in rows["real, same class"]] == [1, 0, 1]  # of x there is one only
-    assert "real, same class" not in dict(sample_grid(Words(), {"synthetic": Words()}, [experiment.frames]).rows)
+    assert [int(image[0, 0, 0]) for image in rows["recorded, same class"]] == [1, 0, 1]  # of x there is one only
+    assert "recorded, same class" not in dict(sample_grid(Words(), {"synthetic": Words()}, [experiment.frames]).rows)
 
 
 def test_runs_are_rows_that_follow_in_the_time_of_one_recording():
@@ -175,7 +175,7 @@ def test_moments_that_no_real_frame_shows_are_grey():
     grid = sample_grid(Frames(), {"synthetic": Frames()}, [Frames()])
     (label, (first, second)), _ = grid.rows
     # Recording a is seen until 10 us; at 50 us there is no frame of it, but one of b.
-    assert label == "real, same moment" and not first.any() and (second == 128).all() and "Grey" in grid.caption
+    assert label == "recorded, same moment" and not first.any() and (second == 128).all() and "Grey" in grid.caption
 
 
 def test_colours_of_event_images_are_told_by_what_is_drawn():

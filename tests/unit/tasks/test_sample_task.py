@@ -81,7 +81,7 @@ def write_conditions(folder) -> Manifest:
 
 @pytest.fixture
 def inputs(tmp_path):
-    """A checkpoint, real frames like those the generator draws, and conditions."""
+    """A checkpoint, recorded frames like those the generator draws, and conditions."""
     _, other = make_data(8, seed=1)
     real = draw(other, [2 * row for row in range(8)], tmp_path / "real_work")
     frames = write_frames(tmp_path / "frames", real)

@@ -35,11 +35,12 @@ def smoke(*overrides):
 def test_training_sets_are_named_after_what_is_learnt_from():
     names = list(map(str, smoke("scaling=[0.5,0.25]").all_training_sets))
     assert names == [
-        "real", "synthetic", "event_gan", "smpl_esim", "label_consistent", "oracle", "real+synthetic", "real+event_gan",
-        "real+smpl_esim", "real+label_consistent", "real+oracle", "real+synthetic@0.25", "real+synthetic@0.5",
+        "recorded", "synthetic", "event_gan", "smpl_esim", "label_consistent", "oracle", "recorded+synthetic",
+        "recorded+event_gan", "recorded+smpl_esim", "recorded+label_consistent", "recorded+oracle",
+        "recorded+synthetic@0.25", "recorded+synthetic@0.5",
     ]  # fmt: skip
     plain = smoke("scaling=[]", "keep_fraction=null", "oracle=null", "baselines={}")
-    assert list(map(str, plain.all_training_sets)) == ["real", "synthetic", "real+synthetic"]
+    assert list(map(str, plain.all_training_sets)) == ["recorded", "synthetic", "recorded+synthetic"]
 
 
 @pytest.mark.parametrize("override", ["scaling=[1.0]", "scaling=[0.5,0.5]", "scaling=[0]", "keep_fraction=1"])
@@ -61,10 +62,12 @@ def test_what_a_baseline_leaves_out_is_the_experiments_own():
 
 
 def test_frames_of_several_generators_are_learnt_from_together():
-    names = list(map(str, smoke(FOREIGN, "mixtures=[real+synthetic+foreign, synthetic+foreign]").all_training_sets))
-    assert names[-2:] == ["real+synthetic+foreign", "synthetic+foreign"]
-    for wrong in ("real+nobody", "real", "real+real", "real+label_consistent+gan"):
-        with pytest.raises(ValueError, match=r"mixtures join different ones of foreign, gan, oracle, real, synthetic"):
+    names = list(map(str, smoke(FOREIGN, "mixtures=[recorded+synthetic+foreign, synthetic+foreign]").all_training_sets))
+    assert names[-2:] == ["recorded+synthetic+foreign", "synthetic+foreign"]
+    for wrong in ("recorded+nobody", "recorded", "recorded+recorded", "recorded+label_consistent+gan"):
+        with pytest.raises(
+            ValueError, match=r"mixtures join different ones of foreign, gan, oracle, recorded, synthetic"
+        ):
             smoke(FOREIGN, f"mixtures=[{wrong}]")
 
 
@@ -211,7 +214,7 @@ def test_groups_by_origin_part_the_test_rows():
     )
     groups = {name: rows.tolist() for name, rows in _groups_by_origin(names, data, [poses])}
     assert groups == {
-        "classes with real training frames": [0, 3],
+        "classes with recorded training frames": [0, 3],
         "classes with synthetic frames only": [1, 4],
         "classes without training frames": [2],
     }

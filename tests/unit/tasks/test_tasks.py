@@ -100,13 +100,13 @@ def row(setting, value, metric="mpjpe2d_px"):
     return {"subject": setting, "group": "all", "metric": metric, "value": value}
 
 
-SETTINGS = ("real", "synthetic", "real+synthetic")
-ROWS = [row("real", 7.0), row("real", 7.2), row("synthetic", 8.0), row("real+synthetic", 6.3)]
+SETTINGS = ("recorded", "synthetic", "recorded+synthetic")
+ROWS = [row("recorded", 7.0), row("recorded", 7.2), row("synthetic", 8.0), row("recorded+synthetic", 6.3)]
 
 
 def test_verdict_averages_seeds_and_says_which_way_is_better():
     text = verdict(ROWS, SETTINGS)
-    assert "real 7.100, synthetic 8.000, real+synthetic 6.300." in text and "lower is better" in text
+    assert "recorded 7.100, synthetic 8.000, recorded+synthetic 6.300." in text and "lower is better" in text
 
 
 @pytest.mark.parametrize(
@@ -126,21 +126,25 @@ def test_verdict_claims_only_what_the_interval_of_the_difference_shows(metric, d
 
 
 def test_verdict_sets_each_baseline_beside_in_a_sentence_of_its_own():
-    rows = [*ROWS, row("gan", 9.0), row("real+gan", 6.9), row("esim", 9.5), row("real+esim", 6.2)]
-    settings = (*SETTINGS, "gan", "esim", "real+gan", "real+esim")
+    rows = [*ROWS, row("gan", 9.0), row("recorded+gan", 6.9), row("esim", 9.5), row("recorded+esim", 6.2)]
+    settings = (*SETTINGS, "gan", "esim", "recorded+gan", "recorded+esim")
     beside = {"gan": Difference(-0.6, -0.8, -0.4), "esim": Difference(0.1, -0.1, 0.3)}
     text = verdict(rows, settings, Difference(-0.8, -1.0, -0.6), beside)
-    assert "synthetic 8.000, real+synthetic 6.300. Adding" in text and "gan 9.000" not in text
-    assert "real+gan is 6.900; its own are better: -0.600 [-0.800, -0.400]." in text
-    assert "real+esim is 6.200; which is better is undecided: +0.100 [-0.100, +0.300]." in text
+    assert "synthetic 8.000, recorded+synthetic 6.300. Adding" in text and "gan 9.000" not in text
+    assert "recorded+gan is 6.900; its own are better: -0.600 [-0.800, -0.400]." in text
+    assert "recorded+esim is 6.200; which is better is undecided: +0.100 [-0.100, +0.300]." in text
 
 
 def test_without_both_together_synthetic_data_is_told_beside_real_data():
-    rows = [{**one, "metric": "accuracy"} for one in ROWS if one["subject"] != "real+synthetic"]
+    rows = [{**one, "metric": "accuracy"} for one in ROWS if one["subject"] != "recorded+synthetic"]
     text = verdict(rows, SETTINGS, instead=Difference(0.5, 0.25, 0.75))
-    assert "Training on synthetic data instead of real data made it better: paired difference +0.500 [+0.250" in text
+    assert (
+        "Training on synthetic data instead of recorded data made it better: paired difference +0.500 [+0.250" in text
+    )
     unsure = verdict(rows, SETTINGS, instead=Difference(0.5, -0.25, 1.25))
-    assert "Whether training on synthetic data instead of real data helped is undecided: paired difference" in unsure
+    assert (
+        "Whether training on synthetic data instead of recorded data helped is undecided: paired difference" in unsure
+    )
     assert "instead" not in verdict(ROWS, SETTINGS, Difference(-0.8, -1.0, -0.6), instead=Difference(0.5, 0.25, 0.75))
 
 

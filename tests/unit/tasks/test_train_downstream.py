@@ -57,7 +57,7 @@ def given(monkeypatch):
     return calls
 
 
-REAL = [
+RECORDED = [
     ("train", "S1", "S1/a", "x"),
     ("test", "S3", "S3/a", "x"),
     ("train", "S2", "S2/a", "y"),
@@ -67,7 +67,7 @@ MADE = [("train", "S1", "made/0", "x"), ("train", "S9", "made/1", "y")]
 
 
 def test_sizes_and_subjects_of_all_sets_reach_the_model(tmp_path, given):
-    sets = [frame_set(tmp_path / "real", REAL), frame_set(tmp_path / "made", MADE)]
+    sets = [frame_set(tmp_path / "recorded", RECORDED), frame_set(tmp_path / "made", MADE)]
     table = run(tmp_path, sets, DownstreamChoice(name="classifier"))
     assert given[0]["frames"] == [0, 2, 3, 0, 1] and given[0]["classes"] == ("x", "y", "x", "x", "y")
     assert given[0]["parts"] == [3, 2] and given[0]["groups"] == ["S1", "S2", "S2", "S1", "S9"]
@@ -75,8 +75,8 @@ def test_sizes_and_subjects_of_all_sets_reach_the_model(tmp_path, given):
 
 
 def test_of_one_subject_recordings_are_told_apart(tmp_path, given):
-    alone = [(split, "S1", recording, name) for split, _, recording, name in REAL]
-    run(tmp_path, [frame_set(tmp_path / "real", alone)], DownstreamChoice(name="classifier"))
+    alone = [(split, "S1", recording, name) for split, _, recording, name in RECORDED]
+    run(tmp_path, [frame_set(tmp_path / "recorded", alone)], DownstreamChoice(name="classifier"))
     assert given[0]["parts"] == [3] and given[0]["groups"] == ["S1/a", "S2/a", "S2/b"]
 
 
@@ -96,7 +96,7 @@ def test_a_model_of_sequences_is_told_the_recordings(tmp_path, monkeypatch):
         return History([1], [0.5], [], [])
 
     monkeypatch.setattr(smpl_regressor, "train_sequences", train)
-    sets = [frame_set(tmp_path / "real", REAL), frame_set(tmp_path / "made", MADE)]
+    sets = [frame_set(tmp_path / "recorded", RECORDED), frame_set(tmp_path / "made", MADE)]
     run(tmp_path, sets, DownstreamChoice(name="smpl_regressor"))
     assert told[0]["recordings"] == ["S1/a", "S2/a", "S2/b", "made/0", "made/1"]
     assert told[0]["groups"] == ["S1", "S2", "S2", "S1", "S9"] and told[0]["parts"] == [3, 2]
@@ -110,7 +110,7 @@ class Means(torch.nn.Module):
 def test_a_ready_made_extractor_goes_through_the_stage_without_losses(tmp_path):
     torch.jit.script(Means()).save(str(tmp_path / "means.pt"))
     choice = DownstreamChoice(name="torchscript", options={"file": str(tmp_path / "means.pt"), "device": "cpu"})
-    table = run(tmp_path, [frame_set(tmp_path / "real", REAL)], choice)
+    table = run(tmp_path, [frame_set(tmp_path / "recorded", RECORDED)], choice)
     assert len(table) == 0
     ref = write_manifest(tmp_path / "artefact", table, tables.TRAINING)
     assert set(read_manifest(ref, full=True).files) == {"model/config.json", "model/network/network.pt"}
