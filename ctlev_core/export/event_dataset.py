@@ -72,7 +72,7 @@ class EventDataset(Dataset[Sample]):
         conditions: also read condition images, where there are any: beside an exported image, or in the artefact that
             generated frames were sampled from. Encoded frames have none.
         rejected: of an artefact, also the frames that the quality filter rejected to the last; an exported folder has
-        none.
+            none.
         class_names: what `class_index` counts; default: all classes of the table, sorted. Where datasets are used
             together, give one the `class_names` of the other.
         transform: from the whole sample to what is returned for it, so that labels can move with the image.
