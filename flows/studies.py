@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from copy import deepcopy
 from typing import Any
@@ -37,6 +38,7 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     where = f"preset {preset!r}"
     if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
         raise PluginError(f"{where}: experiments must be a mapping of names to options, got {parts!r}")
+    parts = _repeat(parts, where)
     given, others = ([o for o in overrides if o.startswith("paths.") == is_path] for is_path in (True, False))
     for override in given:
         name = override.partition("=")[0].removeprefix("paths.")
@@ -60,6 +62,39 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     check_inputs(study, thoroughly=any(given is None for path, given in paths.items() if path not in done_without))
     speed_vs_error_of(study)
     return study
+
+
+def _repeat(parts: dict[str, Any], where: str) -> dict[str, Any]:
+    """The experiments, with one that has `for: {NAME: [values]}` once for each combination of the values.
+
+    `{NAME}` is filled in wherever it stands in the experiment and in its own name.
+    """
+    found: dict[str, Any] = {}
+    for template, part in parts.items():
+        repeated = part.get("for", {})
+        if not isinstance(repeated, dict) or not all(isinstance(values, list) for values in repeated.values()):
+            raise PluginError(f"{where}, experiments.{template}: for must map names to lists, got {repeated!r}")
+        for values in itertools.product(*repeated.values()):
+            chosen = dict(zip(repeated, values, strict=True))
+            name, one = _filled_in([template, {key: value for key, value in part.items() if key != "for"}], chosen)
+            if name in found:
+                raise PluginError(
+                    f"{where}, experiments.{template}: two experiments are called {name!r}; its name must hold "
+                    f"{' and '.join(f'{{{key}}}' for key in repeated) or 'something of its own'}"
+                )
+            found[name] = one
+    return found
+
+
+def _filled_in(value: Any, chosen: dict[str, Any]) -> Any:
+    """Everything text in nested mappings and lists with `{NAME}` replaced."""
+    if isinstance(value, dict):
+        return {key: _filled_in(item, chosen) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_filled_in(item, chosen) for item in value]
+    if isinstance(value, str):
+        return re.sub(r"\{(\w+)\}", lambda match: str(chosen.get(match[1], match[0])), value)
+    return value
 
 
 def _leave_out(parts: dict[str, Any], paths: dict[str, Any], where: str) -> dict[str, str]:

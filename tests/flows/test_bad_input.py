@@ -25,7 +25,7 @@ def refused(home, *arguments, preset="folder", run=plan_script, **how):
     [
         (
             ("--preset", "nonesuch"),
-            "unknown preset 'nonesuch'; known: ablations, aist, all_routes, amass, body, cdehp, demo, dhp19, ",
+            "unknown preset 'nonesuch'; known: ablations, aist, all_routes, amass, base_model_over_training, body, ",
         ),
         (
             ("--set", "dataset.options.intensity_rate_hz=null"),
@@ -40,7 +40,7 @@ def refused(home, *arguments, preset="folder", run=plan_script, **how):
         (("--set", "dataset.options.colour=red"), "datasets 'studio': unknown option 'colour'; known: "),
         (
             ("--set", "dataset.name=dhp91"),
-            "unknown plug-in 'dhp91' in datasets; known: aist, amass, cdehp, dhp19, event_hpe, folder, ",
+            "unknown plug-in 'dhp91' in datasets; did you mean 'dhp19'?; known: aist, amass, cdehp, dhp19, ",
         ),
         (("--set", "generator.options.num_steps=many"), "generators 'controlnet': option 'num_steps'"),
         (("--set", "sampling.num_inference_steps=0"), "option 'num_inference_steps': input should be greater"),

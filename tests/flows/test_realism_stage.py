@@ -20,7 +20,7 @@ def only_artefact(home, stage):
 def test_the_report_sets_synthetic_beside_real(smoke_home):
     page = (smoke_home / "reports" / "smoke.html").read_text()
     for expected in (
-        "How real do the synthetic frames look?", "How alike are the real recordings?", "noise_rate_hz",
+        "How real do the synthetic frames look?", "How alike are the recordings?", "noise_rate_hz",
         "Can a network tell synthetic from recorded frames?", "fewer than 40 frames in a set", "isolated_pixel_share",
         "Power spectrum",
     ):  # fmt: skip
@@ -38,18 +38,18 @@ def test_numbers_are_those_of_the_frames_that_were_sampled(smoke_home):
     np.testing.assert_allclose(row["value"], np.mean(shares))
     assert row["num_samples"] == len(synthetic) and row["low"] <= row["value"] <= row["high"]
     assert found["events", "train", "noise_rate_hz"]["num_samples"] == 8
-    for setting in ("synthetic against real", "real against real"):
+    for setting in ("synthetic against recorded", "recorded against recorded"):
         assert 0 <= found["frames", setting, "value_js_bits"]["value"] <= 1
 
 
 def test_generator_and_baselines_are_told_from_recorded_frames_or_it_says_why_not(smoke_home):
     tests = only_artefact(smoke_home, "realism").attached(TWO_SAMPLE_TESTS).to_pylist()
     names = ("synthetic", "event_gan", "smpl_esim")
-    expected = {f"{name} against {other}" for name in names for other in ("real", "test")}
+    expected = {f"{name} against {other}" for name in names for other in ("recorded", "test")}
     assert {test["subject"] for test in tests} == expected | {
-        "real against real",
+        "recorded against recorded",
         "test against test",
-        "test against real",
+        "test against recorded",
     }
     assert all(test["value"] is None and test["note"] for test in tests), "smoke has too few frames for any"
 
@@ -60,6 +60,8 @@ def test_distributions_add_up_to_1(smoke_home):
     for row in table:
         key = (row["group"], row["subject"], row["axis"])
         sums[key] = sums.get(key, 0) + row["share"]
-    assert {("events", "train", "interval"), ("events", "test", "pixel_rate"), ("frames", "real", "value")} <= set(sums)
+    assert {("events", "train", "interval"), ("events", "test", "pixel_rate"), ("frames", "recorded", "value")} <= set(
+        sums
+    )
     assert ("frames", "synthetic", "power_spectrum") in sums
     np.testing.assert_allclose(list(sums.values()), 1)

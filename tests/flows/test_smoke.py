@@ -203,7 +203,7 @@ def test_second_run_recomputes_nothing_and_is_as_quick_as_a_bare_flow(smoke_home
                 "on smpl_esim",
                 "+event_gan",
                 "+smpl_esim",
-                "labels of",
+                "label agreement of",
                 "score_distance: event_gan",
                 "score_distance: smpl_esim",
                 "memorisation",

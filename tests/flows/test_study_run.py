@@ -10,7 +10,7 @@ name: pair
 data_notice: far too small to learn from
 experiments:
   all: {extends: smoke}
-  part: {extends: smoke, name: part, settings: [recorded], baselines: {}, scaling: [], set: [keep_fraction=null]}
+  part: {extends: smoke, name: part, training_sets: [recorded], baselines: {}, scaling: [], set: [keep_fraction=null]}
 speed_vs_error:
   experiment: all
   num_images: 4

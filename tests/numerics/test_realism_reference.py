@@ -1,4 +1,4 @@
-"""Realism numbers of real recordings and of simulated noise, against references that share no code with them."""
+"""Realism numbers of recordings and of simulated noise, against references that share no code with them."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from ctlev_core.report.sections.realism import realism_sections
 def row(group: str, training_set: str, metric: str, value: float, low: float | None = None, high: float | None = None):
     return {
         "group": group, "subject": training_set, "metric": metric, "value": value, "low": low, "high": high,
-        "num_samples": {"real": 6, "synthetic": 9}.get(training_set, 5),
+        "num_samples": {"recorded": 6, "synthetic": 9}.get(training_set, 5),
     }  # fmt: skip
 
 
@@ -18,16 +18,16 @@ ROWS = [
     row("events", "test", "spread", 0.75),
     row("events", "test against train", "spread", 0.25),
     row("events", "train against train", "spread", 0.1),
-    row("frames", "real", "speckle_share", 0.25, 0.2, 0.3),
+    row("frames", "recorded", "speckle_share", 0.25, 0.2, 0.3),
     row("frames", "synthetic", "speckle_share", 0.05),
-    row("frames", "synthetic against real", "speckle_share", 0.2, 0.1, 0.3),
-    row("frames", "synthetic against real", "value_js_bits", 0.01),
-    row("frames", "real against real", "speckle_share", 0.02, 0.0, 0.04),
-    row("frames", "real against real", "value_js_bits", 0.02, 0.0, 0.04),
+    row("frames", "synthetic against recorded", "speckle_share", 0.2, 0.1, 0.3),
+    row("frames", "synthetic against recorded", "value_js_bits", 0.01),
+    row("frames", "recorded against recorded", "speckle_share", 0.02, 0.0, 0.04),
+    row("frames", "recorded against recorded", "value_js_bits", 0.02, 0.0, 0.04),
 ]
 DISTRIBUTIONS = [
     {"group": "frames", "subject": training_set, "axis": axis, "centre": centre, "share": share}
-    for training_set, shares in (("real", (0.75, 0.25)), ("synthetic", (0.5, 0.5)))
+    for training_set, shares in (("recorded", (0.75, 0.25)), ("synthetic", (0.5, 0.5)))
     for axis in ("value", "other")
     for centre, share in zip((26.0, 27.0), shares, strict=True)
 ]
@@ -36,7 +36,7 @@ DISTRIBUTIONS = [
 def test_frames_come_first_with_both_sets_their_distance_and_the_floor():
     frames, values, events = realism_sections(ROWS, DISTRIBUTIONS)
     assert isinstance(frames, Table) and isinstance(values, Curves) and isinstance(events, Table)
-    assert frames.columns == ["number", "real (6)", "synthetic (9)", "ratio", "distance", "floor: real, halves"]
+    assert frames.columns == ["number", "recorded (6)", "synthetic (9)", "ratio", "distance", "floor: recorded, halves"]
     assert frames.rows == [
         ["speckle_share", "0.25 [0.2, 0.3]", "0.05", "0.2", "0.2 [0.1, 0.3]", "0.02 [0, 0.04]"],
         ["value_js_bits", "", "", "", "0.01", "0.02 [0, 0.04]"],
@@ -73,8 +73,8 @@ def test_frames_of_baselines_have_tables_of_their_own_and_a_line_in_the_chart():
     ]
     _, values, of_gan, _ = realism_sections([*ROWS, *baseline], [*DISTRIBUTIONS, *more])
     assert isinstance(of_gan, Table) and of_gan.title == "How real do the frames of gan look?"
-    assert isinstance(values, Curves) and list(values.series) == ["real", "synthetic", "gan"]
-    assert values.series["real"] == ([26.0, 27.0], [0.75, 1.0])
+    assert isinstance(values, Curves) and list(values.series) == ["recorded", "synthetic", "gan"]
+    assert values.series["recorded"] == ([26.0, 27.0], [0.75, 1.0])
 
 
 def test_large_numbers_are_written_out():
@@ -85,7 +85,7 @@ def test_large_numbers_are_written_out():
 def test_the_chart_adds_the_shares_up():
     values = realism_sections(ROWS, DISTRIBUTIONS)[1]
     assert isinstance(values, Curves)
-    assert values.series == {"real": ([26.0, 27.0], [0.75, 1.0]), "synthetic": ([26.0, 27.0], [0.5, 1.0])}
+    assert values.series == {"recorded": ([26.0, 27.0], [0.75, 1.0]), "synthetic": ([26.0, 27.0], [0.5, 1.0])}
 
 
 def test_what_is_missing_is_left_out():
@@ -106,10 +106,10 @@ def told(training_set: str, value: float | None, low: float | None, high: float 
 
 def test_the_two_sample_tests_of_all_generators_stand_below_those_of_recorded_frames():
     tests = [
-        told("synthetic against real", 0.75, 0.625, 0.875),
+        told("synthetic against recorded", 0.75, 0.625, 0.875),
         told("gan against test", None, None, None, "fewer than 40 frames in a set"),
-        told("real against real", 0.5, 0.375, 0.625),
-        told("test against real", 0.625, None, None),
+        told("recorded against recorded", 0.5, 0.375, 0.625),
+        told("test against recorded", 0.625, None, None),
     ]
     frames, table, values, _ = realism_sections(ROWS, DISTRIBUTIONS, tests)
     assert isinstance(frames, Table) and isinstance(values, Curves) and isinstance(table, Table)
@@ -129,4 +129,4 @@ def test_power_spectra_are_a_chart():
     empty = [{**one, "axis": "power_spectrum", "centre": 25.0, "share": 0.0} for one in spectra[::2]]
     _, chart, _ = realism_sections(ROWS, [*empty, *spectra])
     assert isinstance(chart, Curves) and chart.title == "Power spectrum" and chart.log_y
-    assert chart.series == {"real": ([26.0, 27.0], [0.75, 0.25]), "synthetic": ([26.0, 27.0], [0.5, 0.5])}
+    assert chart.series == {"recorded": ([26.0, 27.0], [0.75, 0.25]), "synthetic": ([26.0, 27.0], [0.5, 0.5])}

@@ -481,3 +481,39 @@ def test_demo_has_real_recordings_where_they_are_given():
     given = ["paths.nmnist=/nowhere", "paths.images=/nowhere"]
     with pytest.raises(InputsMissing, match="/nowhere"):
         load_study("demo", given)
+
+
+def write_study(folder, experiments):
+    path = folder / "study.yaml"
+    path.write_text(f"name: one\nexperiments:\n{experiments}")
+    return str(path)
+
+
+def test_for_makes_an_experiment_of_each_combination(tmp_path):
+    study = load_study(
+        write_study(
+            tmp_path,
+            "  n{count}_{seed}: {for: {count: [3, 4], seed: [0, 7]}, extends: smoke, name: 'run_{count}_{seed}',\n"
+            "    set: ['num_synthetic={count}', 'seed={seed}']}\n  plain: {extends: smoke, name: plain}\n",
+        ),
+        ["experiments.n4_7.num_generators=2"],
+    )
+    made = {name: (one.name, one.num_synthetic, one.seed) for name, one in study.experiments.items()}
+    assert made == {
+        "n3_0": ("run_3_0", 3, 0), "n3_7": ("run_3_7", 3, 7), "n4_0": ("run_4_0", 4, 0), "n4_7": ("run_4_7", 4, 7),
+        "plain": ("plain", study.experiments["plain"].num_synthetic, 0),
+    }  # fmt: skip
+    assert [name for name, one in study.experiments.items() if one.num_generators == 2] == ["n4_7"]
+
+
+@pytest.mark.parametrize(
+    ("experiments", "message"),
+    [
+        ("  n{a}: {for: {a: [1], b: [1, 2]}, extends: smoke}\n", r"two experiments are called 'n1'.*\{a\} and \{b\}"),
+        ("  n: {for: 3, extends: smoke}\n", r"experiments.n: for must map names to lists, got 3"),
+        ("  n{a}: {for: {a: 3}, extends: smoke}\n", r"for must map names to lists"),
+    ],
+)
+def test_wrong_repetitions_are_refused(tmp_path, experiments, message):
+    with pytest.raises(PluginError, match=message):
+        load_study(write_study(tmp_path, experiments), [])

@@ -66,14 +66,14 @@ def run(tmp_path):
 def test_every_generator_is_told_from_training_and_test_frames_beside_both_floors(tmp_path, run):
     count = 80
     recordings = [f"r{row // 2}" for row in range(2 * count)]
-    real = frame_set(tmp_path / "real", noise(2 * count, 0.2, 0), recordings, ["train"] * count + ["test"] * count)
+    real = frame_set(tmp_path / "recorded", noise(2 * count, 0.2, 0), recordings, ["train"] * count + ["test"] * count)
     alike = synthetic_set(tmp_path / "alike", noise(count, 0.2, 1), ["elsewhere"] * count)
     other = synthetic_set(tmp_path / "other", noise(count, 0.6, 2), ["elsewhere"] * count)
     rows, tests = run(real, [alike, other])
     assert set(tests) == {
-        ("frames", "real against real"), ("frames", "test against real"), ("frames", "test against test"),
-        ("frames", "synthetic against real"),
-        ("frames", "synthetic against test"), ("frames of gan", "gan against real"),
+        ("frames", "recorded against recorded"), ("frames", "test against recorded"), ("frames", "test against test"),
+        ("frames", "synthetic against recorded"),
+        ("frames", "synthetic against test"), ("frames of gan", "gan against recorded"),
         ("frames of gan", "gan against test"),
     }  # fmt: skip
     for (group, setting), test in tests.items():
@@ -82,7 +82,7 @@ def test_every_generator_is_told_from_training_and_test_frames_beside_both_floor
         else:
             assert test["low"] < 0.5 < test["high"], (group, setting)
     scored = {(row["group"], row["subject"]): row for row in rows if row["metric"] == "c2st"}
-    floors = ("real against real", "test against test", "test against real")
+    floors = ("recorded against recorded", "test against test", "test against recorded")
     assert set(scored) == {*tests, *(("frames of gan", setting) for setting in floors)}
     found = scored["frames of gan", "gan against test"]
     assert (found["value"], found["low"]) == tuple(
@@ -93,7 +93,7 @@ def test_every_generator_is_told_from_training_and_test_frames_beside_both_floor
 
 
 def test_with_few_frames_the_table_says_why_and_the_scores_have_no_row(tmp_path, run):
-    real = frame_set(tmp_path / "real", noise(20, 0.2, 0), [f"r{row}" for row in range(20)], ["train"] * 20)
+    real = frame_set(tmp_path / "recorded", noise(20, 0.2, 0), [f"r{row}" for row in range(20)], ["train"] * 20)
     made = synthetic_set(tmp_path / "made_set", np.zeros((50, 12, 12, 3), np.uint8), ["elsewhere"] * 50)
     rows, tests = run(real, [made], ("synthetic",))
     assert all(test["value"] is None and "fewer than 40 frames" in test["note"] for test in tests.values())
@@ -104,7 +104,7 @@ def test_with_few_frames_the_table_says_why_and_the_scores_have_no_row(tmp_path,
 def test_frames_made_from_a_recording_are_held_out_with_it(tmp_path, run, monkeypatch):
     count = 40
     recordings = [f"r{row}" for row in range(count)]
-    real = frame_set(tmp_path / "real", noise(count, 0.2, 0), recordings, ["train"] * count)
+    real = frame_set(tmp_path / "recorded", noise(count, 0.2, 0), recordings, ["train"] * count)
     made = synthetic_set(tmp_path / "made_set", noise(count, 0.2, 1), [*recordings[:-1], "elsewhere"])
     seen = []
     compare = two_sample.compare_frames
