@@ -47,7 +47,7 @@ def test_splits_share_no_subject_and_held_out_motions_are_in_tests_alone():
     assert len({(r.subject, r.class_name) for r in of_split("train")}) == 16
 
 
-def test_condition_people_can_be_filmed_as_training_recordings():
+def test_condition_people_can_be_recorded_for_training():
     recorded = changed(record_conditions=True, num_train_recordings=0, num_test_recordings=1, num_cameras=2)
     recordings = [r for r in studio.list_recordings(recorded) if r.recording_id.startswith("condition/")]
     assert [r.recording_id for r in recordings] == [r.recording_id for r in of_split("condition")]

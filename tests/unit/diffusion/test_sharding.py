@@ -34,6 +34,7 @@ def share_out(rank, folder):
     torch.distributed.destroy_process_group()
 
 
+@pytest.mark.slow
 def test_a_process_holds_its_part_and_parts_make_the_whole(tmp_path):
     torch.multiprocessing.spawn(share_out, args=(str(tmp_path),), nprocs=PROCESSES)
     told = [torch.load(tmp_path / f"{rank}.pt") for rank in range(PROCESSES)]

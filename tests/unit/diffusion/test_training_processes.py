@@ -76,7 +76,7 @@ def assert_same_run(one, two, start):
 @pytest.mark.parametrize(
     "shared",
     [
-        {},
+        pytest.param({}, marks=pytest.mark.slow),
         pytest.param({"fsdp": True, "sample_every": 2}, marks=pytest.mark.slow),
         pytest.param({"fsdp": True, "gradient_checkpointing": True}, marks=pytest.mark.slow),
     ],

@@ -211,7 +211,7 @@ def test_no_events_are_black(normalisation, polarity):
 
 @pytest.mark.parametrize("normalisation", ["three_sigma", "max"])
 @pytest.mark.parametrize("count", [1, 2, 65535])
-def test_a_lone_pixel_and_equal_pixels_are_at_full_scale(normalisation, count):
+def test_an_isolated_pixel_and_equal_pixels_are_at_full_scale(normalisation, count):
     options = Options(normalisation=normalisation)
     counts = np.zeros((2, 2, 3, 4), np.uint16)
     counts[0, 0, 1, 2] = count

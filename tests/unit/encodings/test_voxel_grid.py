@@ -68,7 +68,7 @@ def test_an_event_between_two_bins_is_shared_by_distance():
     assert grid[:, 1, 2].tolist() == [-0.5, -0.5, 0]
 
 
-def test_a_lone_event_and_equal_time_stamps_are_in_the_first_bin():
+def test_one_event_and_equal_time_stamps_are_in_the_first_bin():
     assert grid_of([(7, 1, 1, 0)])[:, 1, 1].tolist() == [-1, 0, 0, 0, 0]
     assert grid_of([(2**62, 1, 1, 1)] * 3)[:, 1, 1].tolist() == [3, 0, 0, 0, 0]
 

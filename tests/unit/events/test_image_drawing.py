@@ -80,7 +80,7 @@ def test_an_image_of_the_sensors_size_has_the_levels_of_its_counts(sensor, how, 
 
 @settings(deadline=None)
 @given(SIZES, SIZES, FITS, st.data())
-def test_a_lone_pixel_lies_where_its_point_maps_to(sensor, size, how, data):
+def test_an_isolated_pixel_lies_where_its_point_maps_to(sensor, size, how, data):
     fit = ImageFit(image_size=size, fit=how)
     column, row = (data.draw(st.integers(0, side - 1)) for side in sensor)
     levels = np.zeros((1, sensor[1], sensor[0]), np.uint8)

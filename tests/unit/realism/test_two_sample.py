@@ -109,7 +109,7 @@ def test_an_easy_difference_is_told_always():
     assert found.value > 0.99 and found.low > 0.95 and found.high <= 1
 
 
-def test_lone_pixels_are_told():
+def test_isolated_pixels_are_told():
     """What a decoder smooths away, and no classifier of digits looks at."""
     found = compare(bars(120, 0, isolated=3), bars(120, 1))
     assert found.value > 0.9 and found.low > 0.5

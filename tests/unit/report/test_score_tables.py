@@ -162,7 +162,7 @@ def test_scaling_points_are_amounts_for_each_real_frame():
     assert scaling_figure([ScalePoint("a", 1.0, 2.0)]).series == {"a": ([1.0], [2.0])}
 
 
-def test_the_verdict_says_how_much_of_the_ceiling_was_reached_and_whether_labels_hold():
+def test_the_verdict_says_how_much_of_the_oracles_gain_was_reached_and_whether_labels_hold():
     rows = [
         row(name, value) for name, value in (("recorded", 7.0), ("recorded+synthetic", 6.4), ("recorded+oracle", 6.0))
     ]

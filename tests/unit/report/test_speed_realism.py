@@ -29,7 +29,7 @@ def names(count: int) -> list[str]:
     return [f"r{number}" for number in range(count)]
 
 
-def test_lone_pixels_are_counted_and_told():
+def test_isolated_pixels_are_counted_and_told():
     count = MIN_FRAMES
     found = realism_of_samples(pictures(count, True, 0), names(count), pictures(count, False, 1), names(count))
     by_name = {(one.metric, one.against): one for one in found}

@@ -67,7 +67,7 @@ def make(home, patch, inputs, windows, sampling=None, condition="picture", seed=
     return read_manifest(made, full=True), read_manifest(asked), read_manifest(given["frames"])
 
 
-def test_whole_recordings_are_filmed_and_fitted_to_those_of_training(tmp_path, monkeypatch, inputs):
+def test_whole_recordings_are_simulated_and_fitted_to_those_of_training(tmp_path, monkeypatch, inputs):
     whole = Windows(method="whole")
     made, asked, frames = make(tmp_path, monkeypatch, inputs, whole)
     assert len(made) == COUNT and made.column("class_name") == asked.column("class_name")
