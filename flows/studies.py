@@ -9,6 +9,7 @@ from typing import Any
 
 from ctlev_core.plugins import PluginError, validate_options
 from data_contracts.experiment import Experiment
+from data_contracts.renamed_options import name_hint
 from data_contracts.study import Study
 from flows.command_line import PRESETS, apply_override, load_experiment, read_preset
 from flows.inputs import check_inputs
@@ -32,12 +33,14 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
         PluginError: as `load_experiment` and `speed_vs_error_of`.
     """
     values = read_preset(PRESETS, preset)
-    parts, paths = values.get("experiments"), values.pop("paths", {})
+    parts, paths, groups = values.get("experiments"), values.pop("paths", {}), values.pop("sets", {})
     if parts is None:
         return load_experiment(preset, overrides)
     where = f"preset {preset!r}"
     if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
         raise PluginError(f"{where}: experiments must be a mapping of names to options, got {parts!r}")
+    if not isinstance(groups, dict) or not all(_are_texts(group) for group in groups.values()):
+        raise PluginError(f"{where}: sets must map names to lists of texts key=value, got {groups!r}")
     parts = _repeat(parts, where)
     given, others = ([o for o in overrides if o.startswith("paths.") == is_path] for is_path in (True, False))
     for override in given:
@@ -51,7 +54,7 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
         values["data_notice"] = " ".join([str(values.get("data_notice", "")), *left_out.values()]).strip()
     # Copies: what YAML's anchors repeat is one object, and `set` changes it in place.
     values["experiments"] = {
-        name: _part(deepcopy(part), paths, f"{where}, experiments.{name}") for name, part in parts.items()
+        name: _part(deepcopy(part), paths, groups, f"{where}, experiments.{name}") for name, part in parts.items()
     }
     for override in others:
         if name := next((name for name in left_out if override.startswith(f"experiments.{name}.")), None):
@@ -114,15 +117,23 @@ def _leave_out(parts: dict[str, Any], paths: dict[str, Any], where: str) -> dict
     return left_out
 
 
-def _part(part: dict[str, Any], paths: dict[str, Any], where: str) -> dict[str, Any]:
+def _part(part: dict[str, Any], paths: dict[str, Any], groups: dict[str, list[str]], where: str) -> dict[str, Any]:
     """The options of one experiment of a study."""
     extended, changes = part.pop("extends", None), part.pop("set", [])
-    if not isinstance(changes, list) or not all(isinstance(change, str) for change in changes):
+    if not _are_texts(changes):
         raise PluginError(f"{where}: set must be a list of texts key=value, got {changes!r}")
     values = ({} if extended is None else read_preset(PRESETS, str(extended), (where,))) | part
-    for change in changes:
-        apply_override(values, _filled(change, paths, where))
+    for entry in changes:
+        if "=" not in entry and entry not in groups:
+            hint = name_hint(entry, groups)
+            raise PluginError(f"{where}: set: {entry!r} is neither key=value nor one of `sets`{hint}")
+        for change in groups.get(entry, [entry]):
+            apply_override(values, _filled(change, paths, where))
     return values
+
+
+def _are_texts(changes: Any) -> bool:
+    return isinstance(changes, list) and all(isinstance(change, str) for change in changes)
 
 
 def _filled(change: str, paths: dict[str, Any], where: str) -> str:

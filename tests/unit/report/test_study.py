@@ -304,7 +304,7 @@ def test_the_demo_trains_once_what_its_experiments_share():
         ({"experiments": {}}, "experiments"),
         ({"experiments": {"a": {"extends": "nonesuch"}}}, r"experiments\.a extends an unknown preset 'nonesuch'"),
         ({"experiments": {"a": {"extends": "smoke", "set": "x=1"}}}, "set must be a list of texts"),
-        ({"experiments": {"a": {"extends": "smoke", "set": ["seed"]}}}, "--set expects key=value, got 'seed'"),
+        ({"experiments": {"a": {"extends": "smoke", "set": ["seed"]}}}, "set: 'seed' is neither key=value nor one of `sets`"),
         ({"experiments": {"a": {"extends": "smoke", "set": ["seeds=1"]}}}, "seeds"),
         ({"experiments": {"a": {"extends": "smoke"}, "b": {"extends": "smoke"}}}, "need different names"),
         (
@@ -517,3 +517,22 @@ def test_for_makes_an_experiment_of_each_combination(tmp_path):
 def test_wrong_repetitions_are_refused(tmp_path, experiments, message):
     with pytest.raises(PluginError, match=message):
         load_study(write_study(tmp_path, experiments), [])
+
+
+def test_experiments_take_groups_of_options_by_name(tmp_path):
+    path = tmp_path / "study.yaml"
+    text = "name: one\nsets: {few: [num_synthetic=3, seed=5]}\nexperiments:\n"
+    path.write_text(
+        text + "  a: {extends: smoke, set: [few, seed=6]}\n  b: {extends: smoke, name: b, set: [seed=6, few]}\n"
+    )
+    study = load_study(str(path), [])
+    assert {name: (one.num_synthetic, one.seed) for name, one in study.experiments.items()} == {
+        "a": (3, 6),
+        "b": (3, 5),
+    }
+    path.write_text(text + "  a: {extends: smoke, set: [fwe]}\n")
+    with pytest.raises(PluginError, match=r"experiments.a: set: 'fwe' is neither key=value nor one of `sets`"):
+        load_study(str(path), [])
+    path.write_text(text.replace("[num_synthetic=3, seed=5]", "3") + "  a: {extends: smoke}\n")
+    with pytest.raises(PluginError, match=r"sets must map names to lists"):
+        load_study(str(path), [])
