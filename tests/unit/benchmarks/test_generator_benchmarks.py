@@ -193,11 +193,11 @@ TOY = ["--device", "cpu", "--size", "tiny", "--image-size", "64", "--batch-size"
 
 
 @pytest.mark.slow
-def test_gpu_benchmark_in_small(benchmarks, capsys, monkeypatch):
+def test_gpu_benchmark_in_small(benchmarks, capsys):
     """Every function of it; compiling takes minutes and is switched off, the lines around it run."""
     parts = ["sampling", "sampling_compiled", "controlnet_compiled", "text"]
-    monkeypatch.setattr(torch._dynamo.config, "disable", True)
-    benchmarks.gpu.main([*TOY, "--ddpm-steps", "4", "--inference-steps", "2", "--parts", *parts])
+    with torch._dynamo.config.patch(disable=True):  # monkeypatch would take the option away for good
+        benchmarks.gpu.main([*TOY, "--ddpm-steps", "4", "--inference-steps", "2", "--parts", *parts])
     printed = capsys.readouterr().out
     for part in parts:
         assert f"== {part}\n" in printed
