@@ -304,7 +304,10 @@ def test_the_demo_trains_once_what_its_experiments_share():
         ({"experiments": {}}, "experiments"),
         ({"experiments": {"a": {"extends": "nonesuch"}}}, r"experiments\.a extends an unknown preset 'nonesuch'"),
         ({"experiments": {"a": {"extends": "smoke", "set": "x=1"}}}, "set must be a list of texts"),
-        ({"experiments": {"a": {"extends": "smoke", "set": ["seed"]}}}, "'seed' is neither key=value nor one of `sets`"),
+        (
+            {"experiments": {"a": {"extends": "smoke", "set": ["seed"]}}},
+            "'seed' is neither key=value nor one of `sets`",
+        ),
         ({"experiments": {"a": {"extends": "smoke", "set": ["seeds=1"]}}}, "seeds"),
         ({"experiments": {"a": {"extends": "smoke"}, "b": {"extends": "smoke"}}}, "need different names"),
         (
