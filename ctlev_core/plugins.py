@@ -123,17 +123,15 @@ def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: s
             elif problem["type"] == "path_type":
                 lines.append(f"option {option!r} must be a path, got {problem['input']!r}; --set ...{option}=PATH")
             else:
-                value = problem["input"]
-                hint = f"; {value!r} is now {RENAMED_VALUES[value]!r}" if _is_renamed(problem) else ""
-                lines.append(f"option {option!r}: {problem['msg'].lower()}, got {value!r}{hint}")
+                lines.append(f"option {option!r}: {problem['msg'].lower()}, got {problem['input']!r}{_hint(problem)}")
         raise PluginError(f"{where}: " + "; ".join(lines)) from None
 
 
-def _is_renamed(problem: Any) -> bool:
-    value = problem["input"]
-    if problem["type"] != "literal_error" or not isinstance(value, str) or value not in RENAMED_VALUES:
-        return False
-    return repr(RENAMED_VALUES[value]) in problem["ctx"]["expected"]
+def _hint(problem: Any) -> str:
+    """What a value that is not among those of its option is called now; empty where nobody knows."""
+    new = RENAMED_VALUES.get(problem["input"]) if isinstance(problem["input"], str) else None
+    known = new is not None and problem["type"] == "literal_error" and repr(new) in problem["ctx"]["expected"]
+    return f"; {problem['input']!r} is now {new!r}" if known else ""
 
 
 def _options_at(model: Any, path: Sequence[int | str]) -> list[str]:

@@ -254,6 +254,20 @@ def concat_labels(parts: Iterable[Labels], *, common: bool = False) -> Labels:
     )
 
 
+def matching_rows(frames: Manifest, conditions: Manifest) -> np.ndarray:
+    """Row of the frame [N] int64 that each of N condition rows describes, joined on `sample_id`.
+
+    Raises:
+        DataError: a condition has no frame.
+    """
+    position = {name: row for row, name in enumerate(frames.column("sample_id"))}
+    wanted = conditions.column("sample_id")
+    missing = [name for name in wanted if name not in position]
+    if missing:
+        raise DataError(f"{conditions.ref.path}: condition {missing[0]!r} has no frame in {frames.ref.path}")
+    return np.array([position[name] for name in wanted], dtype=np.int64)
+
+
 def conditions_of(manifest: Manifest) -> Conditions:
     """The conditions of a manifest of conditions; row i is row i of its table."""
     images = manifest.array("images") if "images.npy" in manifest.files else None

@@ -86,6 +86,11 @@ class TrainingSet:
         return TrainingSet(tuple(sources))
 
 
+def with_recorded(name: str) -> str:
+    """The training set of all recorded frames and all of another source, as it is written."""
+    return str(TrainingSet.of(RECORDED, name))
+
+
 @dataclass(frozen=True)
 class LabelAgreement:
     """The subject of scores of a model trained on recorded frames, on generated frames with the labels they were made

@@ -19,7 +19,7 @@ from data_contracts.config import Frozen
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.published import StoredArtefact, Version, published_folder, version_file
 from data_contracts.regeneration import Regeneration
-from data_contracts.training_sets import LabelAgreement
+from data_contracts.training_sets import RECORDED, SYNTHETIC, LabelAgreement
 from flows.command_line import load_experiment, main
 from flows.prepare_dataset import PreparedDataset, condition_asked_samples, prepare_dataset
 from flows.settings import flow
@@ -35,7 +35,6 @@ from tasks.stage import call_flow, call_together
 from tasks.store import home_folder
 
 VERSION_STREAM = 50
-NAME = "synthetic"
 
 
 class MadeVersion(Frozen):
@@ -125,7 +124,10 @@ def _score_likeness(regeneration: Regeneration, dataset: PreparedDataset, synthe
                 label="beside recorded",
             )
         )
-    return [*scores, memorisation(frames, synthetic, extractor, downstream=downstream, subject=NAME, label=NAME)]
+    return [
+        *scores,
+        memorisation(frames, synthetic, extractor, downstream=downstream, subject=SYNTHETIC, label=SYNTHETIC),
+    ]
 
 
 def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
@@ -133,8 +135,8 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
     frames, downstream, seed = dataset.tested_frames, regeneration.downstream, regeneration.downstream_seeds[0]
     model = train_downstream([frames], downstream=downstream, seed=seed, label=f"{downstream.name} on recorded")
     scored = [
-        (frames, "test", "recorded", [dataset.poses]),
-        (synthetic, "train", str(LabelAgreement(NAME)), []),
+        (frames, "test", RECORDED, [dataset.poses]),
+        (synthetic, "train", str(LabelAgreement(SYNTHETIC)), []),
     ]
     return [
         score_model(
@@ -155,7 +157,7 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
 
 def _score_realism(dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
     """Statistics of the version's frames beside those of recorded ones, and whether a network tells them apart."""
-    return [realism(None, dataset.tested_frames, [synthetic], None, names=[NAME], label=NAME)]
+    return [realism(None, dataset.tested_frames, [synthetic], None, names=[SYNTHETIC], label=SYNTHETIC)]
 
 
 def _judge(regeneration: Regeneration, checkpoint: ManifestRef, made: MadeVersion, number: int, seed: int) -> Version:
@@ -181,7 +183,7 @@ def _judge(regeneration: Regeneration, checkpoint: ManifestRef, made: MadeVersio
                 regeneration.gates,
                 rows,
                 task=regeneration.downstream.name,
-                labels_of=str(LabelAgreement(NAME)),
+                labels_of=str(LabelAgreement(SYNTHETIC)),
                 rejected_share=rejections.num_rejected / rejections.num_rows,
             )
         ),

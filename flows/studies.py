@@ -79,7 +79,7 @@ def _repeat(parts: dict[str, Any], where: str) -> dict[str, Any]:
             raise PluginError(f"{where}, experiments.{template}: for must map names to lists, got {repeated!r}")
         for values in itertools.product(*repeated.values()):
             chosen = dict(zip(repeated, values, strict=True))
-            name, one = _filled_in([template, {key: value for key, value in part.items() if key != "for"}], chosen)
+            name, one = _with_values([template, {key: value for key, value in part.items() if key != "for"}], chosen)
             if name in found:
                 raise PluginError(
                     f"{where}, experiments.{template}: two experiments are called {name!r}; its name must hold "
@@ -89,12 +89,12 @@ def _repeat(parts: dict[str, Any], where: str) -> dict[str, Any]:
     return found
 
 
-def _filled_in(value: Any, chosen: dict[str, Any]) -> Any:
+def _with_values(value: Any, chosen: dict[str, Any]) -> Any:
     """Everything text in nested mappings and lists with `{NAME}` replaced."""
     if isinstance(value, dict):
-        return {key: _filled_in(item, chosen) for key, item in value.items()}
+        return {key: _with_values(item, chosen) for key, item in value.items()}
     if isinstance(value, list):
-        return [_filled_in(item, chosen) for item in value]
+        return [_with_values(item, chosen) for item in value]
     if isinstance(value, str):
         return re.sub(r"\{(\w+)\}", lambda match: str(chosen.get(match[1], match[0])), value)
     return value
@@ -128,7 +128,7 @@ def _part(part: dict[str, Any], paths: dict[str, Any], groups: dict[str, list[st
             hint = name_hint(entry, groups)
             raise PluginError(f"{where}: set: {entry!r} is neither key=value nor one of `sets`{hint}")
         for change in groups.get(entry, [entry]):
-            apply_override(values, _filled(change, paths, where))
+            apply_override(values, _with_paths(change, paths, where))
     return values
 
 
@@ -136,7 +136,7 @@ def _are_texts(changes: Any) -> bool:
     return isinstance(changes, list) and all(isinstance(change, str) for change in changes)
 
 
-def _filled(change: str, paths: dict[str, Any], where: str) -> str:
+def _with_paths(change: str, paths: dict[str, Any], where: str) -> str:
     def place(match: re.Match[str]) -> str:
         if match[1] not in paths:
             raise PluginError(f"{where}: {change!r} names no path of this preset; it has {', '.join(paths) or 'none'}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +9,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.events.windows import spread
-from ctlev_core.realism.chain import RECORDED
 from ctlev_core.report.page.html import render_report
-from ctlev_core.report.page.report_files import PAGE
+from ctlev_core.report.page.report_files import PAGE, publish_page
 from ctlev_core.report.studies.realism_chain import GRID_COLUMNS, ChainPage
 from data_contracts import tables
-from data_contracts.manifest import Manifest, ManifestRef
+from data_contracts.manifest import Manifest, ManifestRef, matching_rows
 from data_contracts.realism_chain import Link
+from data_contracts.training_sets import RECORDED
 from tasks.stage import Output, stage
 
 TABLE = f"{tables.REALISM_CHAIN.name}.parquet"
@@ -44,10 +43,9 @@ def chain_report(
         title: what the experiment is called.
         notice: what data these are.
     """
-    names = processed[0].column("sample_id")
-    shown = spread(len(names), GRID_COLUMNS)
-    row_of = {name: row for row, name in enumerate(frames.column("sample_id"))}
-    pictures = {(RECORDED, 0): np.asarray(frames.array("frames")[[row_of[names[row]] for row in shown]])}
+    rows = matching_rows(frames, processed[0])
+    shown = spread(len(rows), GRID_COLUMNS)
+    pictures = {(RECORDED, 0): np.asarray(frames.array("frames")[rows[shown]])}
     for link, made in zip(links, processed, strict=True):
         pictures[link.kind, link.amount] = np.asarray(made.array("frames")[shown])
     page = ChainPage(measured.table.to_pylist(), pictures)
@@ -61,10 +59,4 @@ def chain_report(
 
 def publish_chain_report(ref: ManifestRef, home: Path, name: str) -> str:
     """Put the newest page of an experiment, and its table, where a person looks for them; says where the page is."""
-    folder = home / "reports"
-    folder.mkdir(parents=True, exist_ok=True)
-    for source, suffix in ((TABLE, "parquet"), (PAGE, "html")):
-        temporary = folder / f".{name}_realism_chain.{suffix}"
-        shutil.copyfile(ref.path / source, temporary)
-        temporary.replace(folder / f"{name}_realism_chain.{suffix}")
-    return f"where realism is lost: {folder / f'{name}_realism_chain.html'}"
+    return f"where realism is lost: {publish_page(ref, TABLE, home, f'{name}_realism_chain')}"

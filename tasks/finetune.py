@@ -12,8 +12,7 @@ from ctlev_core import plugins
 from ctlev_core.pictures.labelled_pictures import picture_files
 from data_contracts import tables
 from data_contracts.config import GeneratorChoice
-from data_contracts.errors import DataError
-from data_contracts.manifest import Manifest, conditions_of, history_table
+from data_contracts.manifest import Manifest, conditions_of, history_table, matching_rows
 from tasks.stage import Output, files_of, stage
 
 
@@ -53,13 +52,3 @@ def finetune(
         work=out.work,
     )
     return history_table(history)
-
-
-def matching_rows(frames: Manifest, conditions: Manifest) -> np.ndarray:
-    """Row of the frame that each condition row describes, joined on `sample_id`."""
-    position = {name: row for row, name in enumerate(frames.column("sample_id"))}
-    wanted = conditions.column("sample_id")
-    missing = [name for name in wanted if name not in position]
-    if missing:
-        raise DataError(f"{conditions.ref.path}: condition {missing[0]!r} has no frame in {frames.ref.path}")
-    return np.array([position[name] for name in wanted], dtype=np.int64)

@@ -14,6 +14,7 @@ from ctlev_core.realism import distances, two_sample
 from ctlev_core.realism.summary import AXES, Summary, summarise_events, summarise_frames
 from data_contracts import tables
 from data_contracts.manifest import Manifest
+from data_contracts.training_sets import RECORDED
 from tasks.stage import Output, stage
 
 MAX_EVENTS = 500_000
@@ -59,14 +60,14 @@ def realism(
         if reference is not None:
             found.append(_compare("reference", "reference", "train", _summarise_whole(reference), learnt, recordings))
     real = _summarise_frames(frames)
-    recorded = {"recorded": _read_frames(frames, "train"), "test": _read_frames(frames, "test")}
+    recorded = {RECORDED: _read_frames(frames, "train"), "test": _read_frames(frames, "test")}
     floors = {
         **{f"{name} against {name}": two_sample.compare_halves(*of_split) for name, of_split in recorded.items()},
-        "test against recorded": _tell_apart("test", recorded["test"], "recorded", recorded["recorded"]),
+        "test against recorded": _tell_apart("test", recorded["test"], RECORDED, recorded[RECORDED]),
     }
     groups = ["frames", *(f"frames of {name}" for name in names[1:])]
     for group, name, made in zip(groups, names, generated, strict=True):
-        found.append(_compare(group, "recorded", name, real, _summarise_frames(made), made))
+        found.append(_compare(group, RECORDED, name, real, _summarise_frames(made), made))
         own = {
             f"{name} against {other}": _tell_apart(name, _read_made_frames(made, others[1]), other, others)
             for other, others in recorded.items()

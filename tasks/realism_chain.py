@@ -10,13 +10,14 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
-from ctlev_core.realism.chain import RECORDED, measure_processed, measure_recorded, summarise_recordings
+from ctlev_core.realism.chain import measure_processed, measure_recorded, summarise_recordings
 from ctlev_core.realism.two_sample import choose_rows
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice
-from data_contracts.manifest import Manifest, conditions_of
+from data_contracts.manifest import Manifest, conditions_of, matching_rows
 from data_contracts.realism_chain import Link
+from data_contracts.training_sets import RECORDED
 from tasks.stage import Output, stage
 
 if TYPE_CHECKING:  # torch, which most plans do without
@@ -47,7 +48,7 @@ def chain_frames(
         rounding: the encoding whose levels sampled frames are rounded to, if any.
         seed: of all noise.
     """
-    rows = _rows(frames, conditions)
+    rows = matching_rows(frames, conditions)
     seeds = sample_seeds(seed, len(rows))
     with out.open_array("frames") as written:
         for made in _send(out, checkpoint, frames, conditions, rows, sampling, link, rounding, seeds):
@@ -111,7 +112,7 @@ def chain_realism(
         links: the parts.
         seed: of halvings, networks, resampling, and of the frames behind the floor.
     """
-    rows = _rows(frames, conditions)
+    rows = matching_rows(frames, conditions)
     recorded, groups = np.asarray(frames.array("frames")[rows]), _recordings(frames, rows)
     split = frames.column("split")[int(rows[0])]
     several = frames.rows_where(split=split)
@@ -134,12 +135,6 @@ def _evaluations(link: Link) -> int:
 
         return len(denoising_times(link.amount, link.max_evaluations))
     return link.amount
-
-
-def _rows(frames: Manifest, conditions: Manifest) -> np.ndarray:
-    """The recorded frame of each condition."""
-    row_of = {name: row for row, name in enumerate(frames.column("sample_id"))}
-    return np.array([row_of[name] for name in conditions.column("sample_id")], np.int64)
 
 
 def _recordings(frames: Manifest, rows: np.ndarray) -> list[str]:

@@ -43,6 +43,7 @@ from ctlev_core.report.studies.summary import Figure, Summary, write_summary
 from ctlev_core.statistics.paired_differences import share_of_gain
 from data_contracts import tables
 from data_contracts.manifest import RUN_FILE, Manifest
+from data_contracts.training_sets import ORACLE, RECORDED, with_recorded
 from tasks.stage import Output, stage
 
 Row = dict[str, Any]
@@ -183,14 +184,16 @@ def _figures(
 def _verdict(rows: list[Row], training_sets: Sequence[str], names: list[str], paired: PairedScores) -> str:
     metric = _first_metric(rows)
     own, *others = names
-    beside = {other: paired.difference(f"recorded+{other}", f"recorded+{own}", metric) for other in others}
-    gain = paired.difference("recorded", "recorded+oracle", metric)
-    trainings = [paired.of(training_set, metric) for training_set in ("recorded", f"recorded+{own}", "recorded+oracle")]
+    beside = {other: paired.difference(with_recorded(other), with_recorded(own), metric) for other in others}
+    gain = paired.difference(RECORDED, with_recorded(ORACLE), metric)
+    trainings = [
+        paired.of(training_set, metric) for training_set in (RECORDED, with_recorded(own), with_recorded(ORACLE))
+    ]
     start, reached, most = trainings
     oracle = None
     if gain is not None and start is not None and reached is not None and most is not None:
         oracle = gain, share_of_gain(start, reached, most)
-    added, instead = (paired.difference("recorded", training_set, metric) for training_set in (f"recorded+{own}", own))
+    added, instead = (paired.difference(RECORDED, training_set, metric) for training_set in (with_recorded(own), own))
     return verdict(rows, training_sets, added, beside, oracle, instead)
 
 

@@ -44,7 +44,7 @@ BLOCK_BYTES = 1 << 30
 CALIBRATION_FILE = "calibration.json"
 MAX_CALIBRATION, MAX_CALIBRATION_EVENTS = 64, 1 << 22
 """Training recordings that a simulator is fitted to, evenly spread over all, and events that are read of each."""
-MAX_GATE_FRAMES = 2_000
+MAX_FILTER_FRAMES = 2_000
 """Training frames the quality filter is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
@@ -116,7 +116,7 @@ def _chunk_rows(frames: Manifest) -> int:
 def quality_filter_of(frames: Manifest) -> QualityFilter:
     """Fitted to the training frames. Red and blue images have no green; grey ones have as much of it as of red."""
     rows = frames.rows_where(split="train")
-    real = np.asarray(frames.array("frames")[rows[spread(len(rows), MAX_GATE_FRAMES)]])
+    real = np.asarray(frames.array("frames")[rows[spread(len(rows), MAX_FILTER_FRAMES)]])
     return fit_quality_filter(real, polarity=not real[..., 1].any())
 
 

@@ -7,12 +7,13 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.events.windows import spread
-from ctlev_core.report.version_gates import HELD_OUT, SYNTHETIC
+from ctlev_core.report.version_gates import HELD_OUT
 from ctlev_core.statistics.feature_distances import name_distance
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest
+from data_contracts.training_sets import SYNTHETIC
 from tasks.stage import Output, stage
 
 

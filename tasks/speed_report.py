@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.report.page.html import render_report
-from ctlev_core.report.page.report_files import PAGE
+from ctlev_core.report.page.report_files import PAGE, publish_page
 from ctlev_core.report.studies.speed_summary import SpeedSummary, write_speed_summary
 from ctlev_core.report.studies.speed_vs_error import SpeedPage
 from data_contracts import tables
@@ -89,10 +88,4 @@ def speed_report(
 
 def publish_speed_report(ref: ManifestRef, home: Path, name: str) -> str:
     """Put the newest page of an experiment, and its table, where a person looks for them; says where the page is."""
-    folder = home / "reports"
-    folder.mkdir(parents=True, exist_ok=True)
-    for source, suffix in ((TABLE, "parquet"), (PAGE, "html")):
-        temporary = folder / f".{name}.{suffix}"
-        shutil.copyfile(ref.path / source, temporary)
-        temporary.replace(folder / f"{name}.{suffix}")
-    return f"speed against error: {folder / f'{name}.html'}"
+    return f"speed against error: {publish_page(ref, TABLE, home, name)}"

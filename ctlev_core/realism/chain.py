@@ -21,8 +21,8 @@ from ctlev_core.realism.distances import estimate_numbers
 from ctlev_core.realism.summary import Summary, summarise_frames
 from ctlev_core.realism.two_sample import C2ST, TwoSampleTest, compare_frames, compare_halves
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, bootstrap_interval
+from data_contracts.training_sets import RECORDED
 
-RECORDED = "recorded"
 NAN = float("nan")
 
 

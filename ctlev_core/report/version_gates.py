@@ -10,10 +10,9 @@ from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts.errors import DataError
 from data_contracts.published import GateCheck
 from data_contracts.regeneration import Gates
+from data_contracts.training_sets import RECORDED, SYNTHETIC
 
 HELD_OUT = "held-out recorded"
-SYNTHETIC = "synthetic"
-RECORDED = "recorded"
 
 
 def check_gates(
@@ -24,7 +23,7 @@ def check_gates(
     Args:
         gates: thresholds; those that are None are left out.
         scores: rows of the table `scores`: distances of `HELD_OUT` and `SYNTHETIC` frames, of equally many; scores of
-            the model trained on recorded frames, subject `REAL`, and of that model on the version's frames; copies;
+            the model trained on recorded frames, subject `RECORDED`, and of that model on the version's frames; copies;
             realism.
         task: of that model; its first score decides.
         labels_of: subject of its scores on the version's frames.
@@ -66,8 +65,7 @@ def _check_realism(gates: Gates, scores: Sequence[dict[str, Any]]) -> list[GateC
         if value is None:
             raise DataError(
                 f"gate max_c2st: needs {MIN_FRAMES} frames of the version and as many held-out recorded ones, of "
-                "several "
-                "recordings"
+                "several recordings"
             )
         score = "area under the ROC curve, told from held-out recorded frames"
         checks.append(_check("max_c2st", score, value, gates.max_c2st))

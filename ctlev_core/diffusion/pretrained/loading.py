@@ -189,6 +189,17 @@ def encode_prompts(base_model: PretrainedModel, prompts: list[str]) -> torch.Ten
     return torch.cat(parts)
 
 
+def encode_posterior(base_model: PretrainedModel, images: Any) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """What the autoencoder makes of images [B, H, W, 3] uint8, not scaled, on its device.
+
+    Returns:
+        Means [B, C, h, w] float32 of the latents, and their standard deviations; None for a code without noise.
+    """
+    tensor = images_to_tensor(images).to(base_model.vae.device, base_model.vae.dtype)
+    posterior = base_model.vae.encode(tensor).latent_dist
+    return posterior.mean.float(), posterior.std.float() if hasattr(posterior, "std") else None
+
+
 @torch.no_grad()
 def decode_latents(base_model: PretrainedModel, latents: torch.Tensor) -> torch.Tensor:
     """Images [B, 3, H, W] float32 of scaled latents [B, C, h, w], not clipped.

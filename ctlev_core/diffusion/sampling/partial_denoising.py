@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import NoiseSchedule, generator_for
-from ctlev_core.diffusion.pretrained.loading import PretrainedModel, images_to_tensor
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, encode_posterior
 from data_contracts.errors import DataError
 
 ENCODING_STREAM, NOISE_STREAM = 2, 3
@@ -50,12 +50,9 @@ def encode_frames(base_model: PretrainedModel, frames: np.ndarray, seeds: Sequen
         frames: [B, H, W, 3] uint8.
         seeds: B non-negative integers, of what is drawn from the posteriors; a code without noise needs none.
     """
-    posterior = base_model.vae.encode(
-        images_to_tensor(frames).to(base_model.vae.device, base_model.vae.dtype)
-    ).latent_dist
-    latents = posterior.mean.float()
-    if hasattr(posterior, "std"):
-        latents = latents + posterior.std.float() * _noise(latents, seeds, ENCODING_STREAM)
+    latents, deviations = encode_posterior(base_model, frames)
+    if deviations is not None:
+        latents = latents + deviations * _noise(latents, seeds, ENCODING_STREAM)
     return latents * base_model.scaling_factor
 
 

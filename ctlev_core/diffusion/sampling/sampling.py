@@ -124,10 +124,8 @@ def guided_predictions(
     controlnet = (
         None if base_model.controlnet is None else EveryKthStep(base_model.controlnet, options.controlnet_every)
     )
-    denoiser, num_timesteps = (
-        Denoiser(base_model.unet, controlnet),
-        base_model.scheduler_config.get("num_train_timesteps", 1000),
-    )
+    denoiser = Denoiser(base_model.unet, controlnet)
+    num_timesteps = base_model.scheduler_config.get("num_train_timesteps", 1000)
 
     def predict(noisy: Tensor, timestep: Tensor) -> Tensor:
         noisy = noisy.to(dtype)

@@ -6,7 +6,6 @@ import functools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +16,8 @@ from ctlev_core.diffusion.denoising import Batch
 from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
     conditions_to_tensor,
+    encode_posterior,
     encode_prompts,
-    images_to_tensor,
 )
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from data_contracts.config import ConditionChoice
@@ -109,21 +108,19 @@ def cache_latents(
         class_names: N; frames of one class may be shown with the prompt of any of them. None = each with its own.
         num_turns: 4 also encodes square frames in their three quarter turns.
     """
-    device = base_model.vae.device
     means, deviations = [], []
 
-    def encode(rows: slice, turn: int) -> Any:
+    def encode(rows: slice, turn: int) -> tuple[Tensor, Tensor | None]:
         turned = np.rot90(frames[rows], turn, axes=(1, 2))
-        images = images_to_tensor(np.ascontiguousarray(turned)).to(device, base_model.vae.dtype)
-        return base_model.vae.encode(images).latent_dist
+        return encode_posterior(base_model, np.ascontiguousarray(turned))
 
     batches = ShrinkingBatches(ENCODE_BATCH)
     with torch.no_grad():
         for turn in range(num_turns):
-            for _, posterior in batches.map(functools.partial(encode, turn=turn), len(frames)):
-                means.append(posterior.mean.float().cpu())
-                if hasattr(posterior, "std"):
-                    deviations.append(posterior.std.float().cpu())
+            for _, (mean, deviation) in batches.map(functools.partial(encode, turn=turn), len(frames)):
+                means.append(mean.cpu())
+                if deviation is not None:
+                    deviations.append(deviation.cpu())
     prompts = sorted(set(conditions.prompts))
     position = {prompt: row for row, prompt in enumerate(prompts)}
     return LatentCache(
@@ -140,13 +137,10 @@ def cache_latents(
 @torch.no_grad()
 def encode_images(base_model: PretrainedModel, images: np.ndarray, generator: torch.Generator) -> Tensor:
     """Scaled latents [B, C, h, w] float32 of images [B, H, W, 3] uint8, drawn from their posteriors."""
-    posterior = base_model.vae.encode(
-        images_to_tensor(images).to(base_model.vae.device, base_model.vae.dtype)
-    ).latent_dist
-    latents = posterior.mean.float()
-    if hasattr(posterior, "std"):
+    latents, deviations = encode_posterior(base_model, images)
+    if deviations is not None:
         noise = torch.randn(latents.shape, generator=generator)
-        latents = latents + posterior.std.float() * noise.to(latents.device)
+        latents = latents + deviations * noise.to(latents.device)
     return latents * base_model.scaling_factor
 
 

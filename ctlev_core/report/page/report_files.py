@@ -28,6 +28,24 @@ def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
     return f"report: {folder / f'{name}.html'}\ntables: {folder / name}"
 
 
+def publish_page(ref: ManifestRef, table: str, home: Path, name: str) -> Path:
+    """Put a page of one file, and its table, where a person looks for them: `<home>/reports/NAME.html` and `.parquet`.
+
+    Args:
+        ref: the artefact; it holds `PAGE` and the table.
+        table: file name of the table.
+        home: of the store.
+        name: of the page.
+    Returns:
+        Where the page is.
+    """
+    folder = home / "reports"
+    folder.mkdir(parents=True, exist_ok=True)
+    _replace(ref.path / table, folder / f"{name}.parquet")
+    _replace(ref.path / PAGE, folder / f"{name}.html")
+    return folder / f"{name}.html"
+
+
 def published_files(folder: Path) -> list[Path]:
     """What a person wants of a report's files."""
     wanted = (PAGE, LATEX, MARKDOWN, PROVENANCE)

@@ -12,10 +12,8 @@ from data_contracts.manifest import Manifest
 _CAPTION = (
     "A distance between small sets is larger than between large ones, even where both show the same. So it stands here "
     "beside distances of equally small halves, whole recordings to one half or the other: of the frames and the "
-    "recorded "
-    "training frames, and of the recorded training frames among themselves, the floor, with the central 95 % over "
-    "random "
-    "halvings in brackets."
+    "recorded training frames, and of the recorded training frames among themselves, the floor, with the central 95 % "
+    "over random halvings in brackets."
 )
 
 

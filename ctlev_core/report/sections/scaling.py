@@ -69,8 +69,7 @@ def scaling_figure(points: Sequence[ScalePoint], metric: str = "score") -> Curve
                 column.append(value)
     caption = (
         "Held-out recorded test data after training on all recorded frames and more and more synthetic ones, in equal "
-        "numbers "
-        "of optimiser steps; bars are 95 % intervals. At 0 there is no synthetic data."
+        "numbers of optimiser steps; bars are 95 % intervals. At 0 there is no synthetic data."
     )
     title = f"{metric} by the amount of synthetic data"
     return Curves(title, series, "synthetic frames for each recorded one", metric, caption=caption, spans=spans)

@@ -17,7 +17,15 @@ from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference, Trainings, paired_difference, read_trainings
-from data_contracts.training_sets import LabelAgreement, TrainingSet
+from data_contracts.training_sets import (
+    LABEL_CONSISTENT,
+    ORACLE,
+    RECORDED,
+    SYNTHETIC,
+    LabelAgreement,
+    TrainingSet,
+    with_recorded,
+)
 
 Row = dict[str, Any]
 ORIGINS = "classes with"
@@ -28,10 +36,10 @@ _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
 _ENOUGH = 5
 """Trainings of a training set from which their spread is known well enough to say no more about it."""
 _SOURCES = {
-    "oracle": "recorded frames of the very poses that synthetic frames are sampled from: the most they can give",
-    "label_consistent": "the synthetic frames whose labels a model trained on recorded frames finds best",
-    "synthetic": "frames of the experiment's own generator",
-    "recorded": "the recorded frames that every generator learnt from",
+    ORACLE: "recorded frames of the very poses that synthetic frames are sampled from: the most they can give",
+    LABEL_CONSISTENT: "the synthetic frames whose labels a model trained on recorded frames finds best",
+    SYNTHETIC: "frames of the experiment's own generator",
+    RECORDED: "the recorded frames that every generator learnt from",
 }
 
 
@@ -83,22 +91,19 @@ def score_tables(rows: list[Row], training_sets: Sequence[str], paired: PairedSc
         found += _one_against_rest(of_task, list(dict.fromkeys(row["subject"] for row in of_task)))
     labels = [row for row in rows if row["task"] != "distance" and is_about_labels(row) and row["group"] == "all"]
     if labels:
-        floor = [{**row, "subject": "held-out recorded (floor)"} for row in trained if row["subject"] == "recorded"]
+        floor = [{**row, "subject": "held-out recorded (floor)"} for row in trained if row["subject"] == RECORDED]
         caption = (
             "The model trained on recorded frames, scored on synthetic frames against the labels they were sampled "
-            "from, "
-            "beside its score on held-out recorded frames. Shuffled: the same frames against labels of others, which "
-            "is "
-            "what frames that show nothing of their labels would score."
+            "from, beside its score on held-out recorded frames. Shuffled: the same frames against labels of others, "
+            "which is what frames that show nothing of their labels would score."
         )
         found.append(_pivot("Do the synthetic frames show their labels?", floor + labels, "frames", caption))
     distances = [row for row in rows if row["task"] == "distance"]
     if distances:
         caption = (
             "Distances to the recorded training frames in the features of a classifier trained on recorded events (fd: "
-            "Frechet distance, which is not FID). They depend on the number of frames, so read them against the row "
-            "of held-out recorded frames; alone they do not tell whether labels are right. In brackets 95 %, from "
-            "halves "
+            "Frechet distance, which is not FID). They depend on the number of frames, so read them against the row of "
+            "held-out recorded frames; alone they do not tell whether labels are right. In brackets 95 %, from halves "
             "by recording."
         )
         counts = ("recorded training frames", "frames compared")
@@ -136,8 +141,8 @@ def baseline_tables(names: Sequence[str], metric: str, paired: PairedScores) -> 
         row: list[Cell] = [other]
         for before, after in (
             (other, own),
-            (f"recorded+{other}", f"recorded+{own}"),
-            ("recorded", f"recorded+{other}"),
+            (with_recorded(other), with_recorded(own)),
+            (RECORDED, with_recorded(other)),
         ):
             difference = paired.difference(before, after, metric)
             if difference is not None and difference.is_certain:
@@ -146,7 +151,12 @@ def baseline_tables(names: Sequence[str], metric: str, paired: PairedScores) -> 
         body.append(row)
     if not body:
         return []
-    columns = ["baseline", f"{own} - baseline", f"recorded+{own} - recorded+baseline", "recorded+baseline - recorded"]
+    columns = [
+        "baseline",
+        f"{own} - baseline",
+        f"{with_recorded(own)} - recorded+baseline",
+        "recorded+baseline - recorded",
+    ]
     caption = (
         f"Differences in `{metric}` ({_direction(metric)} is better), sample by sample on the same held-out frames; in "
         "brackets the 95 % interval over test recordings and trainings. Bold: the interval excludes 0. All generators "
@@ -168,12 +178,12 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
     bold: set[tuple[int, int]] = set()
     for training_set in training_sets:
         of_set = [row for row in rows if row["subject"] == training_set]
-        differences = [paired.difference("recorded", training_set, metric) for metric in metrics]
+        differences = [paired.difference(RECORDED, training_set, metric) for metric in metrics]
         for column, (metric, difference) in enumerate(zip(metrics, differences, strict=True), 1):
             if difference is not None and difference.is_certain:
                 better = (difference.value < 0) == lower_is_better(metric)
                 bold |= {(len(body), column)} if better else set()
-        first = differences[0] if training_set != "recorded" else None
+        first = differences[0] if training_set != RECORDED else None
         if first is not None and first.is_certain:
             bold.add((len(body), len(metrics) + 1))
         cells: list[Cell] = [cell_text([row for row in of_set if row["metric"] == metric]) for metric in metrics]
@@ -183,10 +193,9 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
     columns += ["trainings", "frames trained on"]
     caption = (
         f"Scores on {rows[0]['num_samples']:,} held-out recorded test frames; equal optimiser steps for every row. "
-        "Each "
-        "number is the mean over the row's trainings, which differ in their seeds; in brackets the 95 % interval over "
-        "test recordings and trainings. Bold: better than `recorded`, or a difference from it that is not 0, as the "
-        "interval of the difference says that compares sample by sample."
+        "Each number is the mean over the row's trainings, which differ in their seeds; in brackets the 95 % interval "
+        "over test recordings and trainings. Bold: better than `recorded`, or a difference from it that is not 0, as "
+        "the interval of the difference says that compares sample by sample."
     )
     parsed = [TrainingSet.parse(training_set) for training_set in training_sets]
     notes = [f"`{name}`: {text}" for name, text in _SOURCES.items() if any(name in one.names for one in parsed)]
@@ -197,10 +206,8 @@ def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
     notes += [
         f"`{name}`: {score_text(value)}" for name, value in {row["metric"]: row["value"] for row in chance}.items()
     ]
-    if (
-        min(len({_training(row) for row in rows if row["subject"] == training_set}) for training_set in training_sets)
-        < _ENOUGH
-    ):
+    trainings = [{_training(row) for row in rows if row["subject"] == training_set} for training_set in training_sets]
+    if min(map(len, trainings)) < _ENOUGH:
         notes.append(
             "Intervals cannot cover the spread between trainings where there is one, and cover it poorly where there "
             "are two or three."

@@ -11,7 +11,7 @@ import numpy as np
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
-from data_contracts.training_sets import SYNTHETIC, LabelAgreement
+from data_contracts.training_sets import ORACLE, RECORDED, SYNTHETIC, LabelAgreement, with_recorded
 
 
 def in_range(score: Difference, metric: str) -> Difference:
@@ -54,23 +54,24 @@ def verdict(
     metric = scored[0]["metric"]
     values = _means(rows, metric)
     beside = beside or {}
-    own = {name: values[name] for name in ("recorded", "synthetic", "recorded+synthetic") if name in values}
+    both = with_recorded(SYNTHETIC)
+    own = {name: values[name] for name in (RECORDED, SYNTHETIC, both) if name in values}
     if not own:
         own = {name: values[name] for name in training_sets if name in values}
     sense = f"{'lower' if lower_is_better(metric) else 'higher'} is better"
     summary = f"{metric} ({'; '.join(filter(None, (find_score(metric).meaning, sense)))}) on held-out recorded data: "
     summary += ", ".join(f"{training_set} {score_text(value)}" for training_set, value in own.items()) + "."
-    if "recorded+synthetic" not in values and instead is not None and {"recorded", "synthetic"} <= values.keys():
-        told = _what_it_did(instead, metric, values["recorded"], "Training on synthetic data instead of recorded data")
+    if both not in values and instead is not None and {RECORDED, SYNTHETIC} <= values.keys():
+        told = _what_it_did(instead, metric, values[RECORDED], "Training on synthetic data instead of recorded data")
         return f"{summary} {told} {_labels(values)}".rstrip()
-    if difference is None or "recorded" not in values or "recorded+synthetic" not in values:
+    if difference is None or RECORDED not in values or both not in values:
         return summary
-    sentences = [summary, _what_it_did(difference, metric, values["recorded"])]
-    if oracle is not None and "recorded+oracle" in values:
+    sentences = [summary, _what_it_did(difference, metric, values[RECORDED])]
+    if oracle is not None and with_recorded(ORACLE) in values:
         sentences.append(_oracle(*oracle))
     for name, compared in beside.items():
-        if compared is not None and f"recorded+{name}" in values:
-            sentences.append(_beside(name, values[f"recorded+{name}"], compared, metric))
+        if compared is not None and with_recorded(name) in values:
+            sentences.append(_beside(name, values[with_recorded(name)], compared, metric))
     sentences.append(_labels(values))
     return " ".join(sentence for sentence in sentences if sentence)
 
@@ -107,7 +108,7 @@ def _oracle(gain: Difference, share: Difference | None) -> str:
 
 
 def _beside(name: str, value: float, difference: Difference, metric: str) -> str:
-    sentence = f"With frames of {name} in the place of its own, recorded+{name} is {score_text(value)}"
+    sentence = f"With frames of {name} in the place of its own, {with_recorded(name)} is {score_text(value)}"
     if math.isnan(difference.low):
         return f"{sentence}."
     if not difference.is_certain:

@@ -23,9 +23,18 @@ from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
 from ctlev_core.statistics.pooled_scores import PooledScores, pool_values
-from data_contracts.training_sets import LABEL_CONSISTENT, ORACLE, RECORDED, SYNTHETIC, LabelAgreement, TrainingSet
+from data_contracts.training_sets import (
+    LABEL_CONSISTENT,
+    ORACLE,
+    RECORDED,
+    SYNTHETIC,
+    LabelAgreement,
+    TrainingSet,
+    with_recorded,
+)
 
-BOTH = str(TrainingSet.of(RECORDED, SYNTHETIC))
+BOTH = with_recorded(SYNTHETIC)
+AUGMENTED, SIMULATED = with_recorded("augmentation"), with_recorded("simulator")
 LABELS = str(LabelAgreement(SYNTHETIC))
 _FRAMES = {
     RECORDED: "recorded frames",
@@ -39,15 +48,19 @@ _FRAMES = {
 """What the parts of a training set's name stand for, in reading order."""
 _COMPARED = (
     (RECORDED, BOTH, "recorded and synthetic frames, against recorded frames alone"),
-    ("recorded+augmentation", BOTH, "recorded and synthetic frames, against recorded frames and augmented copies"),
-    ("recorded+augmentation", "recorded+synthetic+augmentation", "synthetic frames on top of augmented copies"),
+    (AUGMENTED, BOTH, "recorded and synthetic frames, against recorded frames and augmented copies"),
+    (
+        AUGMENTED,
+        str(TrainingSet.of(RECORDED, SYNTHETIC, "augmentation")),
+        "synthetic frames on top of augmented copies",
+    ),
     (RECORDED, SYNTHETIC, "synthetic frames alone, against recorded frames alone"),
     ("random_weights", SYNTHETIC, "synthetic frames: pre-trained weights against random weights"),
-    ("recorded+simulator", BOTH, "recorded and synthetic frames, against recorded and simulated frames"),
+    (SIMULATED, BOTH, "recorded and synthetic frames, against recorded and simulated frames"),
 )
 """Before, after, and what the row is called."""
-_WITH_ORACLE = str(TrainingSet.of(RECORDED, ORACLE))
-_LINES = (RECORDED, "recorded+augmentation", BOTH, SYNTHETIC, "recorded+simulator")
+_WITH_ORACLE = with_recorded(ORACLE)
+_LINES = (RECORDED, AUGMENTED, BOTH, SYNTHETIC, SIMULATED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +185,7 @@ def _sentence(group: Group) -> str:
     what = "adding synthetic frames to the recorded ones"
     numbers = f"{group.metric} went from {before} to {after}, a difference of {added.text()}"
     told = f"{group.name}: {_told(added, group.metric, what)}; {numbers}"
-    beside = group.difference("recorded+augmentation", BOTH)
+    beside = group.difference(AUGMENTED, BOTH)
     if beside is None:
         return f"{told}."
     better = made_better(beside, group.metric)
@@ -234,8 +247,7 @@ def _score_table(groups: Sequence[Group]) -> Table:
         body.append([f"label agreement (`{LABELS}`)", *("" if one is None else _score(one) for one in agreed)])
         notes.append(
             f"Label agreement: {metric} of classifiers trained on recorded frames when they are shown synthetic frames "
-            "and "
-            "the labels asked for. It says nothing of test recordings."
+            "and the labels asked for. It says nothing of test recordings."
         )
     sense = "lower" if lower_is_better(metric) else "higher"
     caption = (

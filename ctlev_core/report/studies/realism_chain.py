@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.events.windows import spread
-from ctlev_core.realism.chain import RECORDED
 from ctlev_core.realism.two_sample import C2ST
 from ctlev_core.report.page.html import Folded, ImageGrid, Section, Table
 from ctlev_core.report.page.tables import Cell
 from ctlev_core.statistics.bootstrap import score_text
+from data_contracts.training_sets import RECORDED
 
 Row = dict[str, Any]
 Key = tuple[str, int]

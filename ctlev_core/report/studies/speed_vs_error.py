@@ -251,9 +251,8 @@ class SpeedPage:
             "U-Net, ControlNet: evaluations an image, counted. ms: median time an image, batch by batch in one process "
             f"with the networks loaded and warm, on the machine as busy as it was. {FD}: Frechet distance, to "
             f"{HELD_OUT} with its 95 % interval, and between halves to the reference's samples. Excess: that to "
-            "recorded "
-            f"frames minus the reference's, paired, with its 95 % interval. {KID}: kernel distance times 1,000, which "
-            "has no bias. RMS: grey levels from the converged solution."
+            f"recorded frames minus the reference's, paired, with its 95 % interval. {KID}: kernel distance times "
+            "1,000, which has no bias. RMS: grey levels from the converged solution."
         )
         caption += f" {label}: of a model trained on recorded frames, against the labels asked for." if label else ""
         return Table("Every setting", columns, body, caption=f"{caption} Bold: recommended.", bold=bold)

@@ -17,6 +17,7 @@ from ctlev_core.report.studies.speed_summary import SpeedSummary
 from ctlev_core.report.studies.summary import Figure, Summary
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.paired_differences import Difference
+from data_contracts.training_sets import RECORDED, SYNTHETIC, with_recorded
 
 Row = dict[str, Any]
 _QUESTIONS = (
@@ -26,7 +27,7 @@ _QUESTIONS = (
     ("mpjpe3d", "3D body", paper_numbers.BODY_3D),
 )
 """What an experiment asks, by a score that begins so; the first that any of its scores begins with."""
-_COMPARED = ("recorded", "synthetic", "recorded+synthetic")
+_COMPARED = (RECORDED, SYNTHETIC, with_recorded(SYNTHETIC))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,7 @@ class Part:
     @property
     def compares(self) -> bool:
         """Was anything trained on synthetic frames? If not, it is here for its samples and figures."""
-        return any(training_set != "recorded" for training_set in self.training_sets)
+        return any(training_set != RECORDED for training_set in self.training_sets)
 
     @property
     def heading(self) -> str:
@@ -77,7 +78,7 @@ class Part:
     @cached_property
     def difference(self) -> Difference | None:
         """Trained on recorded and synthetic frames minus on recorded ones alone, in that score."""
-        return self.paired.difference("recorded", "recorded+synthetic", self.metric)
+        return self.paired.difference(RECORDED, with_recorded(SYNTHETIC), self.metric)
 
     @property
     def _asked(self) -> tuple[str, Table | None]:

@@ -486,9 +486,9 @@ def test_demo_has_real_recordings_where_they_are_given():
         load_study("demo", given)
 
 
-def write_study(folder, experiments):
+def write_study(folder, experiments, sets="{}"):
     path = folder / "study.yaml"
-    path.write_text(f"name: one\nexperiments:\n{experiments}")
+    path.write_text(f"name: one\nsets: {sets}\nexperiments:\n{experiments}")
     return str(path)
 
 
@@ -523,19 +523,14 @@ def test_wrong_repetitions_are_refused(tmp_path, experiments, message):
 
 
 def test_experiments_take_groups_of_options_by_name(tmp_path):
-    path = tmp_path / "study.yaml"
-    text = "name: one\nsets: {few: [num_synthetic=3, seed=5]}\nexperiments:\n"
-    path.write_text(
-        text + "  a: {extends: smoke, set: [few, seed=6]}\n  b: {extends: smoke, name: b, set: [seed=6, few]}\n"
-    )
-    study = load_study(str(path), [])
+    few = "{few: [num_synthetic=3, seed=5]}"
+    parts = "  a: {extends: smoke, set: [few, seed=6]}\n  b: {extends: smoke, name: b, set: [seed=6, few]}\n"
+    study = load_study(write_study(tmp_path, parts, few), [])
     assert {name: (one.num_synthetic, one.seed) for name, one in study.experiments.items()} == {
         "a": (3, 6),
         "b": (3, 5),
     }
-    path.write_text(text + "  a: {extends: smoke, set: [fwe]}\n")
     with pytest.raises(PluginError, match=r"experiments.a: set: 'fwe' is neither key=value nor one of `sets`"):
-        load_study(str(path), [])
-    path.write_text(text.replace("[num_synthetic=3, seed=5]", "3") + "  a: {extends: smoke}\n")
+        load_study(write_study(tmp_path, "  a: {extends: smoke, set: [fwe]}\n", few), [])
     with pytest.raises(PluginError, match=r"sets must map names to lists"):
-        load_study(str(path), [])
+        load_study(write_study(tmp_path, "  a: {extends: smoke}\n", "{few: 3}"), [])
