@@ -63,7 +63,7 @@ def sample(
     """One frame per condition row, each from a seed of its own; the labels come along unchanged.
 
     A row whose frame cannot be an event image, beside the training frames among `frames`, is sampled again, in all
-    `max_attempts` times. If the last is refused as well it is kept, and says why. With `rounding`, the encoding of the
+    `max_attempts` times. If the last is rejected too it is kept, and says why. With `rounding`, the encoding of the
     training frames, each frame becomes the rendering of event counts that it is the expectation of.
     """
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
@@ -136,7 +136,7 @@ def simulate(
 
     A frame is the window around the labelled moment, or, where conditions have no motions and so no moment, around the
     middle of the recording that is simulated: all of it with the method `whole`. A row without events becomes an empty
-    frame. What the quality filter of `sample` would refuse says so, but is not simulated again: a body that keeps still
+    frame. What the quality filter of `sample` would reject says so, but is not simulated again: a body that keeps still
     would send no events then either.
 
     A generator that can be calibrated is, on the training recordings; `calibration.json` says with what result.

@@ -1,9 +1,9 @@
 """Refuse generated images that cannot be event images: empty, saturated, or of other colours.
 
-What is refused follows from recorded training frames: for each number below the range of their central 98 %, its odds
+What is rejected follows from recorded training frames: for each number below the range of their central 98 %, its odds
 widened on either side by a factor, so that a recorded frame practically always passes and only gross failures are
-refused. A filter that is any narrower would choose which images are liked, and make scores of the generator better than
-it is.
+rejected. A filter that is any narrower would choose which images are liked, and make scores of the generator better
+than it is.
 
     active_share    pixels whose largest channel is at least 26 of 255
     brightness      mean of the largest channel, over 255
@@ -12,8 +12,8 @@ it is.
                     largest and smallest channel, over the sum of the largest. Recorded frames have 0; what a decoder
                     adds is let pass up to `MAX_OFF_PALETTE`
 
-A refused row is sampled again with a seed that follows from its own (`seed_of_attempt`), so that every row can still be
-made again alone, whatever happened to the others.
+A rejected row is sampled again with a seed that follows from its own (`seed_of_attempt`), so that every row can still
+be made again alone, whatever happened to the others.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class FilteredImages:
         frames: [N, H, W, 3] uint8, the last try of each row.
         seeds: the seed each was made from.
         num_attempts: how often each was sampled.
-        causes: why the last try was refused; empty for those that passed.
+        causes: why the last attempt was rejected; empty for those that passed.
     """
 
     frames: np.ndarray
@@ -109,7 +109,7 @@ def _scale_odds(share: float, factor: float) -> float:
 
 
 def find_causes(frames: np.ndarray, quality_filter: QualityFilter) -> list[str]:
-    """Why each image [N, H, W, 3] uint8 is refused: the first number that is out of its range; empty = it passes."""
+    """Why each image [N, H, W, 3] uint8 is rejected: the first number that is out of its range; empty = it passes."""
     numbers = measure_images(frames, polarity=quality_filter.polarity)
     causes = [""] * len(frames)
     for row in range(len(frames)):

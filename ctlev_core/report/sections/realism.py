@@ -23,7 +23,7 @@ _TITLES = {
     "frames": (
         "How real do the synthetic frames look?",
         "Event images have no time stamps: what compares them is where and how bright their pixels are. Active: value "
-        "of 25 of 255 and more. Speckle: active pixels in chunks of one or two; isolated: without an active one "
+        "of 25 of 255 and more. Speckle: active pixels in groups of one or two; isolated: without an active one "
         "around; hot: 128 and more, and four times those around. Contrast: standard deviation over full scale. c2st: "
         "how well a network tells the two sets apart, 0.5 = not at all.",
     ),

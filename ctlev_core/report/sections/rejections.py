@@ -10,9 +10,9 @@ from ctlev_core.report.page.html import Section, Table
 from data_contracts.manifest import Manifest
 
 _CAPTION = (
-    "A frame is refused where a number of it lies far outside those of recorded training frames: no event image at "
+    "A frame is rejected where a number of it lies far outside those of recorded training frames: no event image at "
     "all. "
-    "Rejected frames are sampled again, from other seeds, until they pass or run out of tries; then they stay."
+    "Rejected frames are sampled again, from other seeds, until they pass or run out of attempts; then they stay."
 )
 
 
@@ -23,7 +23,7 @@ class Rejections:
     Attributes:
         num_rows: frames.
         num_again: that were sampled more than once.
-        num_rejected: whose last try was refused as well.
+        num_rejected: whose last attempt was rejected too.
         causes: how many of those for each cause, most frequent first.
     """
 

@@ -56,7 +56,7 @@ _DIFFERENCE_CAPTION = (
     "intervals over recordings. Bold: the interval excludes 0."
 )
 _MORE_CAPTION = (
-    "Differences, likewise. Speckle: share of active pixels in pieces of one or two; hot: share of pixels of 128 and "
+    "Differences, likewise. Speckle: share of active pixels in groups of one or two; hot: share of pixels of 128 and "
     "more that are more than four times as bright as those around; positive: share of red in red and blue."
 )
 _GRID_CAPTION = (

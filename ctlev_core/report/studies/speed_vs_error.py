@@ -194,7 +194,7 @@ class SpeedPage:
                 "Frechet distance",
                 f"In features of {self.features}, from {count} samples a setting, so that values compare with one "
                 "another only. Hatched: not to be told from the reference. All settings share conditions "
-                "and seeds, and no frame was refused and sampled again.",
+                "and seeds, and no frame was rejected and sampled again.",
             ),
             "Distance to the reference's samples": (
                 lines_of(self.rows, FD + OF_HALVES, REFERENCE),
