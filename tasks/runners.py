@@ -20,6 +20,7 @@ import importlib.util
 import logging
 import os
 import pickle
+import threading
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -32,6 +33,8 @@ KINDS = ("threads", "processes", "dask", "ray")
 ALONE = {"CTLEV_WORKERS": "1", "CTLEV_RUNNER": "threads"}
 """Environment of a process that does our work: it starts none of its own."""
 CONNECT_TIMEOUT_S = 60
+LOOK_UP_S = 0.5
+"""A call to Ray that waits notices within so long that the cluster was closed."""
 
 
 class WorkerError(RuntimeError):
@@ -214,13 +217,33 @@ class Ray(_Cluster):
         ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **own)
         self._compute = ray.remote(num_cpus=1)(_compute)
         self.count = max(int(ray.cluster_resources().get("CPU", 1)), 1)
+        self._closed = False
+        self._waiting = 0
+        self._changed = threading.Condition()
 
     def _reply(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
-        return self._ray.get(self._compute.remote(_environment(), function, arguments))
+        with self._changed:
+            if self._closed:
+                raise WorkerError("the cluster is closed")
+            self._waiting += 1
+        try:
+            # A `get` that waits while another thread shuts Ray down never returns: look up now and then.
+            reply = self._compute.remote(_environment(), function, arguments)
+            while not self._ray.wait([reply], timeout=LOOK_UP_S)[0]:
+                if self._closed:
+                    raise WorkerError("the cluster was closed")
+            return self._ray.get(reply)
+        finally:
+            with self._changed:
+                self._waiting -= 1
+                self._changed.notify_all()
 
     def close(self) -> None:
-        """As Dask's."""
+        """As Dask's, once the calls that wait have been told."""
         super().close()
+        with self._changed:
+            self._closed = True
+            self._changed.wait_for(lambda: not self._waiting, timeout=CONNECT_TIMEOUT_S)
         self._ray.shutdown()
 
 

@@ -4,6 +4,8 @@ import importlib.util
 import json
 import os
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from tasks import runners
 from tasks.runners import WorkerError, asked_runner
 from tasks.stage import planning, stage
 from tasks.store import Store
-from tasks.workers import MAX_GROUP, _groups, current_workers, is_spread, map_shards, together
+from tasks.workers import MAX_GROUP, Workers, _groups, current_workers, is_spread, map_shards, together
 
 KINDS = [
     kind
@@ -120,6 +122,28 @@ def test_a_call_after_the_end_of_a_cluster_is_an_error_and_starts_no_other(kind,
         cluster.close()
         with pytest.raises(WorkerError, match=f"{kind}: a call was lost"):
             cluster.call(abs, -3)
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_calls_that_wait_end_when_the_runner_is_closed(kind, tmp_path, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    runner = runners.asked_cluster(2) or Workers(2, 1)
+    started = [tmp_path / "0", tmp_path / "1"]
+    with ThreadPoolExecutor(2) as threads:
+        waiting = [threads.submit(runner.call, sleep_a_minute, path) for path in started]
+        while not all(path.exists() for path in started):
+            time.sleep(0.05)
+        since = time.monotonic()
+        runner.close()
+        for call in waiting:
+            with pytest.raises(WorkerError):
+                call.result()
+    assert time.monotonic() - since < 30
+
+
+def sleep_a_minute(started):
+    started.touch()
+    time.sleep(60)
 
 
 def number_and_process(shard):
