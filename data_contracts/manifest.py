@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.errors import DataError, TableVersionError
+from data_contracts.image_rows import ImageRows
 from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, History, Labels
 from data_contracts.tables import TABLES, TableSchema, check_table
 
@@ -104,6 +105,10 @@ class Manifest:
         """The array `<name>.npy`, memory-mapped read-only."""
         return np.load(self.path(f"{name}.npy"), mmap_mode="r", allow_pickle=False)
 
+    def images(self, rows: np.ndarray, name: str = "frames") -> ImageRows:
+        """The given rows of the array `<name>.npy`, which stay on disk until they are indexed."""
+        return image_rows([(self, rows)], name)
+
     def attached(self, schema: TableSchema) -> pa.Table:
         """The table `<schema.name>.parquet` that lies beside the manifest, checked."""
         path = self.path(f"{schema.name}.parquet")
@@ -124,6 +129,12 @@ class Manifest:
     def labels(self) -> Labels:
         """The label columns of the table."""
         return labels_of(self.table)
+
+
+def image_rows(parts: Sequence[tuple[Manifest, np.ndarray]], name: str = "frames") -> ImageRows:
+    """The given rows of the array `<name>.npy` of several artefacts, one after another, left on disk."""
+    arrays = [(manifest.array(name), rows) for manifest, rows in parts]
+    return ImageRows.of(arrays, " ".join([name, *(manifest.ref.digest for manifest, _ in parts)]))
 
 
 def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
@@ -290,7 +301,7 @@ def _condition_choice(manifest: Manifest) -> ConditionChoice | None:
 
 def condition_arrays(conditions: Conditions) -> dict[str, np.ndarray]:
     """The arrays to attach to a manifest of conditions, by name, from which `conditions_of` makes them again."""
-    arrays = {} if conditions.images is None else {"images": conditions.images}
+    arrays = {} if conditions.images is None else {"images": np.asarray(conditions.images)}
     if conditions.motions is not None:
         arrays |= {f"{_MOTION_PREFIX}{name}": getattr(conditions.motions, name) for name in _MOTION_ARRAYS}
     return arrays

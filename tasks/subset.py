@@ -12,6 +12,7 @@ from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
+from data_contracts.image_rows import image_chunks
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
@@ -43,7 +44,7 @@ def take_label_consistent(
     plugin, scorer = plugins.load_options(downstream), plugins.load_options(metric)
     if not hasattr(scorer.module, "compute_rows"):
         raise DataError(f"keep_fraction: metric {metric.name!r} has no score of single frames to choose by")
-    prediction: Any = plugin.module.predict(model.ref.path / "model", np.asarray(synthetic.array("frames")))
+    prediction: Any = plugin.module.predict(model.ref.path / "model", synthetic.images(np.arange(len(synthetic))))
     scores = scorer.module.compute_rows(prediction, synthetic.labels, scorer.options)
     # As elsewhere the name of the score decides, which need not be that of the plug-in.
     first = next(iter(scorer.module.compute(prediction, synthetic.labels, scorer.options)))
@@ -59,5 +60,7 @@ def take_label_consistent(
 
 
 def _take(out: Output, synthetic: Manifest, rows: np.ndarray) -> pa.Table:
-    out.write_array("frames", np.asarray(synthetic.array("frames")[rows]))
+    with out.open_array("frames") as written:
+        for images in image_chunks(synthetic.images(rows)):
+            written.append(images)
     return synthetic.table.take(rows)

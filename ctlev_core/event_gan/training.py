@@ -161,16 +161,17 @@ class EventGAN:
     def validate(self) -> None:
         """Judge the averaged generator on the held back pairs and keep it where it is the best so far."""
         network, data, history = self.calibrate_average(), self.validation, self.curves.history
+        real = np.asarray(data.frames)
         frames = sample_frames(
             network, data.conditions, data.palette, data.one_event, SamplingOptions(), seeds=range(len(data.frames))
         )
-        error = local_statistics_error(frames, data.frames)
+        error = local_statistics_error(frames, real)
         if not history.validation_loss or error < min(history.validation_loss):
             self.best = {name: value.clone() for name, value in network.state_dict().items()}
             self.curves.best_step = self.step
         history.validation_step.append(self.step)
         history.validation_loss.append(error)
-        history.shuffled_loss.append(local_statistics_error(np.roll(frames, 1, axis=0), data.frames))
+        history.shuffled_loss.append(local_statistics_error(np.roll(frames, 1, axis=0), real))
 
     def log(self) -> None:
         """A row of the loss curves: the means since the last row."""
