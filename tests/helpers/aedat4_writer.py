@@ -10,7 +10,8 @@ from collections.abc import Iterable, Sequence
 
 XML = """<dv version="2.0"><node name="outInfo" path="/"><node name="0" path="/0/">
 <attr key="compression" type="string">NONE</attr><attr key="typeIdentifier" type="string">EVTS</attr>
-<node name="info" path="/0/info/"><attr key="sizeX" type="int">{width}</attr><attr key="sizeY" type="int">{height}</attr>
+<node name="info" path="/0/info/"><attr key="sizeX" type="int">{width}</attr>
+<attr key="sizeY" type="int">{height}</attr>
 <attr key="source" type="string">x</attr></node></node></node></dv>"""
 
 
