@@ -23,8 +23,8 @@ from data_contracts.errors import DataError
 MAX_BYTES = 2 * 2**30
 """Of one array, as stored and as float64."""
 MAX_NPZ_BYTES = 512 * 2**20
-"""Of all arrays read from an .npz file, as float64: a small file can unpack to a thousand times its size, and eight times
-that from single bytes. The largest body models have 300 MB."""
+"""Of all arrays read from an .npz file, as float64: a small file can unpack to a thousand times its size, and single
+bytes to eight times that. The largest body models have 300 MB."""
 _OBJECT = Marker()
 
 
