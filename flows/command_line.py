@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.processes import num_cores
-from data_contracts.errors import DataError, TrainingError
+from data_contracts.errors import DataError, TrainingError, shortened
 from data_contracts.experiment import Experiment
 from data_contracts.renamed_options import RENAMED_VALUES, name_hint
 from data_contracts.study import Study
@@ -90,7 +90,7 @@ def read_preset(folder: Path, preset: str, heirs: tuple[str, ...] = ()) -> dict[
     if extended is None:
         return values
     if not isinstance(extended, str) or extended in (*heirs, preset):
-        raise PluginError(f"{path}: extends must name another preset, got {extended!r}")
+        raise PluginError(f"{path}: extends must name another preset, got {shortened(repr(extended), 200)}")
     return read_preset(folder, extended, (*heirs, preset)) | values
 
 
@@ -103,7 +103,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
     """
     name, separator, text = override.partition("=")
     if not separator or not name:
-        raise PluginError(f"--set expects key=value, got {override!r}")
+        raise PluginError(f"--set expects key=value, got {shortened(repr(override), 200)}")
     *parents, last = name.split(".")
     target = values
     for parent in parents:
@@ -113,7 +113,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
     try:
         target[last] = load_yaml(text)
     except yaml.YAMLError as error:
-        raise PluginError(f"--set {name}: {text!r} is not YAML: {error}") from None
+        raise PluginError(f"--set {name[:100]}: {shortened(repr(text), 100)} is not YAML: {error}") from None
 
 
 def print_plan(rows: list[PlannedStage]) -> None:
