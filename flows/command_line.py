@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -171,12 +172,14 @@ def main(
         default_preset: used without `--preset`.
 
     Returns:
-        Exit status: 0 done, 2 wrong input, 130 interrupted.
+        Exit status: 0 done, 2 wrong input or the private server was lost, 130 interrupted, 143 ended by SIGTERM.
     """
     if os.environ.get("LOCAL_RANK", "0") != "0":
         return 0  # under `accelerate launch` one process runs the flow; training starts the others itself
     arguments = _parse(flow, default_preset)
     started = time.perf_counter()
+    with contextlib.suppress(ValueError):  # in a thread of another program
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         home = Path(os.environ["CTLEV_HOME"])
         check_home(home)
@@ -194,18 +197,27 @@ def main(
         with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
             result = with_plan(flow, rows, f"preset {arguments.preset}, in {home}")(options)
         described = describe(result, options)
-    except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
+    except (DataError, PluginError, TrainingError, ValidationError, OSError, local_server.ServerLostError) as error:
         if isinstance(error, InputsMissing) and arguments.dry_run:
             print_costs(error.asked)
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("interrupted; finished stages and checkpoints are kept", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as error:
+        how, status = ("ended by SIGTERM", 143) if isinstance(error, _Terminated) else ("interrupted", 130)
+        print(f"{how}; finished stages and checkpoints are kept", file=sys.stderr)
+        return status
     cached = sum(row.cached for row in rows)
     print(described)
     print(f"{len(rows)} stages, {cached} of them cached, in {time.perf_counter() - started:.1f} s")
     return 0
+
+
+class _Terminated(KeyboardInterrupt):
+    """As Ctrl-C, asked for by SIGTERM."""
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise _Terminated
 
 
 def check_home(home: Path) -> None:
