@@ -211,7 +211,7 @@ class Stage:
                     return found, True
                 return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
         store, upstream = Store(), _upstream(arguments)
-        with store.lock(key):
+        with store.lock(key, f"artefact {self.name}/{key}"):
             # Another process may have just finished it.
             found = store.find(self.name, key, upstream, make_room=True)
             if found is not None:

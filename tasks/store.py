@@ -33,6 +33,7 @@ from data_contracts.errors import DataError
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef, file_digest, read_manifest
 from data_contracts.published import kept_versions
 from data_contracts.run_record import RUN_FILE, RunRecord, mark_used, read_run_record, write_run_record
+from tasks import file_locks
 
 KEEP_VERSIONS = 5
 MAX_SYNCS = 16
@@ -128,13 +129,12 @@ class Store:
         return target / f"{folder.name}.{number}"
 
     @contextlib.contextmanager
-    def lock(self, key: str) -> Iterator[None]:
-        """Only one process makes an artefact; a second waits here and then finds it finished."""
+    def lock(self, key: str, what: str = "") -> Iterator[None]:
+        """Only one process makes an artefact; a second waits here, saying so, and then finds it finished."""
         path = self.home / "locks" / key
         path.parent.mkdir(parents=True, exist_ok=True)
         self.use()
-        with path.open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with file_locks.locked(path, what or f"artefact {key}"):
             yield
 
     def use(self) -> None:
@@ -152,7 +152,7 @@ class Store:
                 file = path.open("ab")
             except OSError:
                 return
-            fcntl.flock(file, fcntl.LOCK_SH)
+            file_locks.lock(file, fcntl.LOCK_SH, f"a pruning of {self.home}")
             _used[self.home] = file
 
     @contextlib.contextmanager

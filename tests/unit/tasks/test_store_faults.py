@@ -4,7 +4,12 @@ import errno
 import json
 import os
 import resource
+import signal
+import subprocess
 import sys
+import textwrap
+import threading
+import time
 
 import pytest
 from test_stage import calls, first, run, second
@@ -14,6 +19,7 @@ from data_contracts.config import Windows
 from data_contracts.errors import DataError
 from data_contracts.run_record import read_run_record
 from flows import verify
+from tasks import file_locks
 from tasks.stage import in_one_run, planning
 from tasks.store import Store
 
@@ -211,6 +217,52 @@ def test_a_publishing_that_fails_leaves_no_half_artefact(home, monkeypatch, step
     assert not list((home / "tmp").iterdir())
     run(first, windows=Windows())
     assert Store().artefacts()
+
+
+HOLDER = """
+    import sys, time
+    from pathlib import Path
+    from tasks.store import Store
+    with Store(Path(sys.argv[1])).lock("0a1b"):
+        print("holds", flush=True)
+        sys.stdin.read()
+"""
+
+
+def test_who_waits_for_a_stopped_process_says_so(home, monkeypatch, capsys):
+    monkeypatch.setattr(file_locks, "SAY_AFTER_S", 0.1)
+    command = [sys.executable, "-c", textwrap.dedent(HOLDER), str(home)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None and holder.stdout.readline() == b"holds\n"
+        holder.send_signal(signal.SIGSTOP)
+        try:
+            waiting = threading.Thread(target=wait_for, args=(home,))
+            waiting.start()
+            said = ""
+            deadline = time.monotonic() + 30
+            while "waiting" not in said and time.monotonic() < deadline:
+                said += capsys.readouterr().err
+                time.sleep(0.05)
+        finally:
+            holder.send_signal(signal.SIGCONT)
+            holder.kill()
+        waiting.join(30)
+        assert not waiting.is_alive()
+    assert f"waiting for artefact encode/0a1b: process {holder.pid} on " in said
+    assert f"which is stopped (kill -CONT {holder.pid} lets it go on), holds {home}/locks/0a1b" in said
+
+
+def wait_for(home):
+    with Store(home).lock("0a1b", "artefact encode/0a1b"):
+        pass
+
+
+def test_who_need_not_wait_long_says_nothing(home, capsys):
+    for _ in range(2):
+        with Store(home).lock("0a1b"):
+            pass
+    assert capsys.readouterr().err == ""
+    assert f"process {os.getpid()} on " in (home / "locks" / "0a1b").read_text()
 
 
 def test_in_one_run_a_passing_error_is_not_taken_for_a_missing_artefact(monkeypatch):
