@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 MAX_MESSAGE = 2000
-"""Characters. What a file holds may end up in a message; a few lines of it say as much as all."""
+"""Characters of what may list options or files."""
 
 
 def shortened(text: str, limit: int = MAX_MESSAGE) -> str:
@@ -17,8 +19,17 @@ def shortened(text: str, limit: int = MAX_MESSAGE) -> str:
 class DataError(ValueError):
     """Input data is wrong, missing or damaged."""
 
+    MAX_MESSAGE: ClassVar[int] = 499
+    """What a file holds may end up in a message; the first of it says as much as all."""
+
     def __init__(self, message: str = "") -> None:
-        super().__init__(shortened(message))
+        super().__init__(shortened(message, self.MAX_MESSAGE))
+
+
+class DetailedDataError(DataError):
+    """The message lists what was looked for: the expected tree of a dataset, or what each format missed."""
+
+    MAX_MESSAGE: ClassVar[int] = MAX_MESSAGE
 
 
 class TableVersionError(DataError):

@@ -146,7 +146,7 @@ def _find_columns(file: Any, path: Path) -> Source:
         where = f"{path}: group {name}"
         group = hdf5_files.find_object(file, name, str(path))
         names = hdf5_files.dataset_names(group, where) if hasattr(group, "keys") else []
-        if not event_tables.find_columns(names):
+        if not event_tables.find_columns(names, where):
             continue
         found = event_tables.require_columns(names, where)
         columns = {column: hdf5_files.find_object(group, key, where) for column, key in found.items()}

@@ -1,5 +1,6 @@
 """YAML that is small and means much, or ends in an error of Python's own."""
 
+import pickle
 import time
 
 import pytest
@@ -8,7 +9,7 @@ import yaml
 from ctlev_core.plugins import PluginError
 from ctlev_core.sensor import options as sensor
 from data_contracts import yaml_text
-from data_contracts.errors import DataError, shortened
+from data_contracts.errors import DataError, DetailedDataError, shortened
 from flows.command_line import apply_override, load_experiment
 from flows.studies import load_study
 
@@ -80,4 +81,5 @@ def test_a_message_keeps_its_beginning_and_its_end():
     text = shortened("place: " + "x" * 5_000 + " cause")
     assert len(text) == 2_000 and text.startswith("place: ") and text.endswith(" cause") and " ... " in text
     assert shortened("short") == "short"
-    assert len(str(DataError("x" * 10_000))) == 2_000
+    assert len(str(DataError("x" * 10_000))) == 499
+    assert str(pickle.loads(pickle.dumps(DetailedDataError("x" * 1_000)))) == "x" * 1_000
