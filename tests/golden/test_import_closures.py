@@ -42,7 +42,7 @@ def test_a_changed_formula_concerns_its_metrics(code):
     assert {"metrics frechet", "metrics fd_infinity"} <= set(change.unraised)
     assert "metrics kid" not in change.unraised and "formats evt3" not in change.unraised
     text = import_closures.explain(change)
-    assert "ctlev_core.scoring.frechet" in text and "raise VERSION" in text and "--same-output" in text
+    assert "ctlev_core.scoring.frechet" in text and "raise a plug-in's VERSION" in text and "--same-output" in text
 
 
 def test_a_raised_version_is_enough_but_is_recorded(code):
