@@ -14,6 +14,7 @@ published/<experiment>/    which artefacts are the versions of its synthetic dat
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import itertools
 import os
@@ -150,8 +151,10 @@ class Store:
             try:
                 path.parent.mkdir(exist_ok=True)
                 file = path.open("ab")
-            except OSError:
-                return
+            except OSError as error:
+                if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+                    return
+                raise  # one that passes: unheld, what we find could be pruned
             file_locks.lock(file, fcntl.LOCK_SH, f"a pruning of {self.home}")
             _used[self.home] = file
 

@@ -219,6 +219,17 @@ def test_a_publishing_that_fails_leaves_no_half_artefact(home, monkeypatch, step
     assert Store().artefacts()
 
 
+def test_a_home_that_cannot_be_held_at_the_moment_is_not_used_unheld(home, monkeypatch):
+    Store().folder("first", "0").parent.mkdir(parents=True)
+
+    def fail(*_, **__):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr("pathlib.Path.open", fail)
+    with pytest.raises(OSError, match="Too many open files"):
+        Store().find("first", "0")
+
+
 HOLDER = """
     import sys, time
     from pathlib import Path
