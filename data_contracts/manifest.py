@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import stat
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -22,10 +23,10 @@ from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.errors import DataError, TableVersionError
 from data_contracts.image_rows import ImageRows
 from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, History, Labels
+from data_contracts.run_record import RUN_FILE, read_run_record
 from data_contracts.tables import TABLES, TableSchema, check_table
 
 MANIFEST_FILE = "manifest.parquet"
-RUN_FILE = "run.json"
 _FILES_KEY = b"ctlev.files"
 _SCHEMA_KEY = b"ctlev.schema"
 _MOTION_PREFIX = "motion_"
@@ -112,7 +113,7 @@ class Manifest:
     def attached(self, schema: TableSchema) -> pa.Table:
         """The table `<schema.name>.parquet` that lies beside the manifest, checked."""
         path = self.path(f"{schema.name}.parquet")
-        return check_table(_read_table(path).replace_schema_metadata(None), schema, str(path))
+        return check_table(_read_table(path, path).replace_schema_metadata(None), schema, str(path))
 
     def column(self, name: str) -> list:
         """A column as Python values."""
@@ -147,41 +148,57 @@ def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
     Raises:
         DataError: a file is missing or has changed.
         TableVersionError: the table has another version than the one this code reads.
+        OSError: a file cannot be read now, which says nothing about its content.
     """
     path = ref.path / MANIFEST_FILE
-    if not path.is_file():
-        raise DataError(f"{ref.path}: manifest is missing; run the flow again to make it anew")
-    digest = file_digest(path)
+    try:
+        content = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        raise DataError(f"{ref.path}: manifest is missing; run the flow again to make it anew") from None
+    digest = hashlib.sha256(content).hexdigest()
     if ref.digest and digest != ref.digest:
         raise DataError(f"{path}: content has changed; expected digest {ref.digest[:12]}, got {digest[:12]}")
-    table = _read_table(path)
+    table = _read_table(pa.BufferReader(content), path)
     metadata = table.schema.metadata or {}
     if _SCHEMA_KEY not in metadata or _FILES_KEY not in metadata:
         raise DataError(f"{path}: is not a ctlev manifest; its metadata names no schema")
-    declared = json.loads(metadata[_SCHEMA_KEY])
-    schema = TABLES.get(declared["name"])
+    try:
+        declared, files = json.loads(metadata[_SCHEMA_KEY]), json.loads(metadata[_FILES_KEY])
+        name, version = declared["name"], declared["version"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: is not a ctlev manifest; its metadata cannot be read: {error!r}") from error
+    schema = TABLES.get(name)
     if schema is None:
-        raise DataError(f"{path}: table {declared['name']!r}; this code reads {sorted(TABLES)}")
-    if schema.version != declared["version"]:
-        found = f"table {declared['name']!r} version {declared['version']}"
-        raise TableVersionError(f"{path}: {found}; this code reads version {schema.version}")
-    files = json.loads(metadata[_FILES_KEY])
+        raise DataError(f"{path}: table {name!r}; this code reads {sorted(TABLES)}")
+    if schema.version != version:
+        raise TableVersionError(f"{path}: table {name!r} version {version}; this code reads version {schema.version}")
     for name, expected in files.items():
         _check_file(ref.path / name, expected, full)
     checked = check_table(table.replace_schema_metadata(None), schema, str(path))
     return Manifest(ManifestRef(key=ref.key, path=ref.path, digest=digest, rows=len(checked)), schema, checked, files)
 
 
-def _read_table(path: Path) -> pa.Table:
+def _read_table(source: Path | pa.BufferReader, path: Path) -> pa.Table:
     """One Parquet file. `pq.read_table` would load pyarrow's datasets for it, and those pandas, a third of a second."""
-    with pq.ParquetFile(path) as file:
-        return file.read()
+    try:
+        with pq.ParquetFile(source) as file:
+            return file.read()
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error
+    except pa.ArrowInvalid as error:
+        raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error
 
 
 def _check_file(path: Path, expected: dict, full: bool) -> None:
-    if not path.is_file():
-        raise DataError(f"{path}: file is missing")
-    size = path.stat().st_size
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise DataError(f"{path}: file is missing") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise DataError(f"{path}: is not a file")
+    size = status.st_size
     if size != expected["bytes"]:
         raise DataError(f"{path}: expected {expected['bytes']} bytes, got {size}")
     if full and file_digest(path) != expected["sha256"]:
@@ -292,8 +309,8 @@ def conditions_of(manifest: Manifest) -> Conditions:
 
 def _condition_choice(manifest: Manifest) -> ConditionChoice | None:
     """The plug-in that made a manifest of conditions, if a stage did."""
-    record = manifest.ref.path / RUN_FILE
-    chosen = json.loads(record.read_text())["arguments"].get("condition") if record.exists() else None
+    folder = manifest.ref.path
+    chosen = read_run_record(folder).arguments.get("condition") if (folder / RUN_FILE).exists() else None
     if chosen is None:
         return None
     return ConditionChoice(name=chosen["plugin"].rpartition("/")[2], options=chosen["options"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.processes import num_cores
-from data_contracts.errors import DataError, TrainingError
+from data_contracts.errors import DataError, TrainingError, shortened
 from data_contracts.experiment import Experiment
 from data_contracts.renamed_options import RENAMED_VALUES, name_hint
 from data_contracts.study import Study
@@ -90,7 +91,7 @@ def read_preset(folder: Path, preset: str, heirs: tuple[str, ...] = ()) -> dict[
     if extended is None:
         return values
     if not isinstance(extended, str) or extended in (*heirs, preset):
-        raise PluginError(f"{path}: extends must name another preset, got {extended!r}")
+        raise PluginError(f"{path}: extends must name another preset, got {shortened(repr(extended), 200)}")
     return read_preset(folder, extended, (*heirs, preset)) | values
 
 
@@ -103,7 +104,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
     """
     name, separator, text = override.partition("=")
     if not separator or not name:
-        raise PluginError(f"--set expects key=value, got {override!r}")
+        raise PluginError(f"--set expects key=value, got {shortened(repr(override), 200)}")
     *parents, last = name.split(".")
     target = values
     for parent in parents:
@@ -113,7 +114,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
     try:
         target[last] = load_yaml(text)
     except yaml.YAMLError as error:
-        raise PluginError(f"--set {name}: {text!r} is not YAML: {error}") from None
+        raise PluginError(f"--set {name[:100]}: {shortened(repr(text), 100)} is not YAML: {error}") from None
 
 
 def print_plan(rows: list[PlannedStage]) -> None:
@@ -171,12 +172,14 @@ def main(
         default_preset: used without `--preset`.
 
     Returns:
-        Exit status: 0 done, 2 wrong input, 130 interrupted.
+        Exit status: 0 done, 2 wrong input or the private server was lost, 130 interrupted, 143 ended by SIGTERM.
     """
     if os.environ.get("LOCAL_RANK", "0") != "0":
         return 0  # under `accelerate launch` one process runs the flow; training starts the others itself
     arguments = _parse(flow, default_preset)
     started = time.perf_counter()
+    with contextlib.suppress(ValueError):  # in a thread of another program
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         home = Path(os.environ["CTLEV_HOME"])
         check_home(home)
@@ -194,18 +197,27 @@ def main(
         with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
             result = with_plan(flow, rows, f"preset {arguments.preset}, in {home}")(options)
         described = describe(result, options)
-    except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
+    except (DataError, PluginError, TrainingError, ValidationError, OSError, local_server.ServerLostError) as error:
         if isinstance(error, InputsMissing) and arguments.dry_run:
             print_costs(error.asked)
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("interrupted; finished stages and checkpoints are kept", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as error:
+        how, status = ("ended by SIGTERM", 143) if isinstance(error, _Terminated) else ("interrupted", 130)
+        print(f"{how}; finished stages and checkpoints are kept", file=sys.stderr)
+        return status
     cached = sum(row.cached for row in rows)
     print(described)
     print(f"{len(rows)} stages, {cached} of them cached, in {time.perf_counter() - started:.1f} s")
     return 0
+
+
+class _Terminated(KeyboardInterrupt):
+    """As Ctrl-C, asked for by SIGTERM."""
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise _Terminated
 
 
 def check_home(home: Path) -> None:

@@ -260,11 +260,25 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
                 if not len(rows):
                     continue
             counts = plugin.module.encode(events, local, plugin.options)
+            _tell_full(counts, source.recording["recording_id"], rows)
             frames = plugin.module.render_image(counts, plugin.options)
             own = labels_at_windows(source.track, t_start, t_end) if labels is None else labels.take(rows)
             own = _to_image(own, events.sensor_size, plugin, (frames.shape[2], frames.shape[1]))
             described = _rows(source.recording, part["split"], rows, t_start, t_end, local[:, 1] - local[:, 0])
             yield _Samples(described, counts, frames, own)
+
+
+def _tell_full(counts: np.ndarray, name: str, rows: np.ndarray) -> None:
+    """Warn where a count stopped at what 16 bits hold: a hot pixel, or a window that is too long."""
+    full = np.iinfo(np.uint16).max
+    if counts.dtype != np.uint16 or not counts.size or counts.max() < full:
+        return
+    window = int(np.argmax(counts.reshape(len(counts), -1).max(axis=1)))
+    _, y, x = np.unravel_index(int(np.argmax(counts[window])), counts.shape[1:])
+    logger.warning(
+        "recording %r, window %d: pixel x = %d, y = %d fired %d times or more; counts stop there",
+        name, rows[window], x, y, full,
+    )  # fmt: skip
 
 
 def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iterator[np.ndarray]:

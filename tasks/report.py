@@ -42,7 +42,8 @@ from ctlev_core.report.studies.paper_numbers import paper_section
 from ctlev_core.report.studies.summary import Figure, Summary, write_summary
 from ctlev_core.statistics.paired_differences import share_of_gain
 from data_contracts import tables
-from data_contracts.manifest import RUN_FILE, Manifest
+from data_contracts.manifest import Manifest
+from data_contracts.run_record import read_run_record
 from data_contracts.training_sets import ORACLE, RECORDED, with_recorded
 from tasks.stage import Output, stage
 
@@ -218,8 +219,7 @@ def _score_name(manifest: Manifest) -> str:
 
 def _kind(conditions: Manifest) -> str:
     """Name of the condition plug-in that made them."""
-    record = json.loads((conditions.ref.path / RUN_FILE).read_text())
-    return record["arguments"]["condition"]["plugin"].rpartition("/")[2]
+    return read_run_record(conditions.ref.path).arguments["condition"]["plugin"].rpartition("/")[2]
 
 
 def _samples(scores: list[Manifest], data: list[Manifest]) -> Iterator[tuple[list[Row], pa.Table, str]]:

@@ -41,13 +41,14 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from ctlev_core import plugins
+from ctlev_core.provenance.raw_file_digests import digest_raw_files
 from data_contracts.arrays import ArrayWriter
 from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
 from tasks.runners import asked_runner
-from tasks.store import Store, digest_raw_files
+from tasks.store import Store
 from tasks.workers import current_workers, together
 
 if TYPE_CHECKING:
@@ -210,51 +211,45 @@ class Stage:
                     return found, True
                 return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
         store, upstream = Store(), _upstream(arguments)
-        with store.lock(key):
-            found = self._find(store, key, upstream)  # another process may have just finished it
+        with store.lock(key, f"artefact {self.name}/{key}"):
+            # Another process may have just finished it.
+            found = store.find(self.name, key, upstream, make_room=True)
             if found is not None:
                 return found, True
             return self._compute(store, key, arguments, upstream), False
 
     def find(self, key: str, arguments: dict[str, Any]) -> ManifestRef | None:
         """The artefact, if it is there and was made from inputs of the same content."""
-        return self._find(Store(), key, _upstream(arguments))
-
-    def _find(self, store: Store, key: str, upstream: dict[str, str]) -> ManifestRef | None:
-        found = store.find(self.name, key)
-        if found is None or store.upstream_digests(self.name, key) == upstream:
-            return found
-        store.set_aside(found.path)
-        return None
+        return Store().find(self.name, key, _upstream(arguments))
 
     def _compute(self, store: Store, key: str, arguments: dict[str, Any], upstream: dict[str, str]) -> ManifestRef:
         folder, work = store.temporary_folder(key), store.work_folder(key)
         # We hold the lock of this key: whatever lies here was left by a process that died.
         shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        work.mkdir(parents=True, exist_ok=True)
-        opened = {name: _opened(value) for name, value in arguments.items()}
         started, wall, cpu = time.time(), time.perf_counter(), _cpu_seconds()
         try:
+            folder.mkdir(parents=True)
+            work.mkdir(parents=True, exist_ok=True)
+            opened = {name: _opened(value) for name, value in arguments.items()}
             table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
+            record = {
+                "stage": self.name,
+                "stage_version": self.version,
+                "key": key,
+                "arguments": {name: _material(value) for name, value in arguments.items()},
+                "upstream": upstream,
+                "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
+                "wall_seconds": round(time.perf_counter() - wall, 3),
+                "cpu_seconds": round(_cpu_seconds() - cpu, 3),
+                # Highest of the process so far, which is what decides whether a machine is large enough.
+                "process_peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+                "versions": _versions(),
+            }
+            return store.publish(self.name, key, folder, record)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        record = {
-            "stage": self.name,
-            "stage_version": self.version,
-            "key": key,
-            "arguments": {name: _material(value) for name, value in arguments.items()},
-            "upstream": upstream,
-            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
-            "wall_seconds": round(time.perf_counter() - wall, 3),
-            "cpu_seconds": round(_cpu_seconds() - cpu, 3),
-            # Highest of the process so far, which is what decides whether a machine is large enough.
-            "process_peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            "versions": _versions(),
-        }
-        return store.publish(self.name, key, folder, record)
 
 
 def numbered(label: str, number: int) -> str:

@@ -39,8 +39,8 @@ class Finished:
         return {label: (state, key) for state, label, key in rows}
 
 
-def no_server() -> str:
-    """Stands for the Prefect server that tests share, and that conftest.py starts."""
+def no_server() -> dict[str, str]:
+    """The variables that lead to the Prefect server that tests share, and that conftest.py starts."""
     raise AssertionError("no server is shared")
 
 
@@ -57,7 +57,7 @@ def script(name: str, *arguments: str, home: Path, own_server: bool = False, **p
     command = [sys.executable, str(REPOSITORY / "flows" / f"{name}.py"), "--home", str(home), *arguments]
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PREFECT_")}
     if not own_server:
-        environment["PREFECT_API_URL"] = shared_server()
+        environment |= shared_server()
     return subprocess.Popen(
         command, cwd=home, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen
     )

@@ -15,6 +15,7 @@ from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_base_mo
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.training import trainer
+from ctlev_core.diffusion.training import latent_cache
 from ctlev_core.diffusion.training.distributed import DistributedContext
 from ctlev_core.diffusion.training.entry import train_checkpoint
 from ctlev_core.diffusion.training.finetuning import check_channel_order, fine_tune
@@ -199,8 +200,20 @@ def test_latents_are_encoded_fewer_at_a_time_where_memory_runs_out(monkeypatch):
     torch.testing.assert_close(cache.mean[:4], whole.mean)
 
 
+def with_deviations(base_model, monkeypatch):
+    """The base model's code is without noise; here as if it had some."""
+    encode = latent_cache.encode_posterior
+
+    def encode_with_deviations(base_model, images):
+        mean, _ = encode(base_model, images)
+        return mean, mean.abs() + 1
+
+    monkeypatch.setattr(latent_cache, "encode_posterior", encode_with_deviations)
+    return base_model
+
+
 def test_latents_on_disk_are_those_in_memory_and_are_encoded_once(tmp_path, monkeypatch):
-    base_model = make_base_model()
+    base_model = with_deviations(make_base_model(), monkeypatch)
     whole = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
     stored = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4, folder=tmp_path)
     np.testing.assert_array_equal(stored.mean, whole.mean)
@@ -225,7 +238,7 @@ def test_latents_on_disk_are_those_in_memory_and_are_encoded_once(tmp_path, monk
 
 def test_each_process_encodes_its_share_of_the_frames(tmp_path, monkeypatch):
     """Process 1 of 3 finds the shares of the others, which have been here before; together they are the whole."""
-    base_model, taken = make_base_model(), []
+    base_model, taken = with_deviations(make_base_model(), monkeypatch), []
     whole = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
     encode = base_model.vae.encode
     monkeypatch.setattr(base_model.vae, "encode", lambda images: taken.append(len(images)) or encode(images))

@@ -20,6 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ctlev_core.provenance.raw_file_digests import RawFileDigests, digest_raw_files
 from data_contracts import tables
 from data_contracts.errors import DataError
 from data_contracts.manifest import write_manifest
@@ -27,7 +28,7 @@ from data_contracts.published import StoredArtefact, Version, published_folder, 
 from data_contracts.regeneration import Gates
 from data_contracts.tables import TABLES
 from flows import prune, verify
-from tasks.store import RawFileDigests, Store, StoreInUseError, digest_raw_files
+from tasks.store import Store, StoreInUseError
 
 DAY_S = 86_400
 TABLE = pa.table(
@@ -50,7 +51,11 @@ def add(store, number, *, inputs=(), age_days=0.0, stage="encode", arguments=Non
     np.save(temporary / "frames.npy", np.full(50, number))
     (temporary / "checkpoint" / "weights.bin").write_bytes(bytes([number % 256]) * 100)
     write_manifest(temporary, TABLE, tables.TRAINING)
-    record = {"upstream": {key(i): "0" * 64 for i in inputs}, "arguments": arguments or {}}
+    record = {
+        "stage": stage, "stage_version": 1, "key": key(number), "arguments": arguments or {}, "versions": {},
+        "upstream": {key(i): "0" * 64 for i in inputs}, "started": "2026-01-01T00:00:00Z", "wall_seconds": 0.0,
+        "cpu_seconds": 0.0, "process_peak_memory_mib": 0.0,
+    }  # fmt: skip
     folder = store.publish(stage, key(number), temporary, record).path
     age(folder, age_days)
     return folder
@@ -507,8 +512,9 @@ def test_digests_of_raw_files_are_read_once_and_written_by_many(tmp_path, monkey
     assert not list(tmp_path.glob("*.tmp")) and len(json.loads((tmp_path / "raw_file_digests.json").read_text())) > 0
     everything = [file for files in named for file in files]
     assert digest_raw_files(everything, tmp_path) == [row for rows in found for row in rows]
-    monkeypatch.setattr("tasks.store.json.loads", lambda text: pytest.fail("read again"))
-    monkeypatch.setattr("tasks.store.file_digest", lambda path: pytest.fail("hashed again"))
+    remembering = "ctlev_core.provenance.raw_file_digests"
+    monkeypatch.setattr(f"{remembering}.read_remembered", lambda path: pytest.fail("read again"))
+    monkeypatch.setattr(f"{remembering}.file_digest", lambda path: pytest.fail("hashed again"))
     assert digest_raw_files(everything, tmp_path) == [row for rows in found for row in rows]
 
 
