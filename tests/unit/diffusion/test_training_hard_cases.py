@@ -14,8 +14,7 @@ from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_lo
 from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_base_model
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
-from ctlev_core.diffusion.training import trainer
-from ctlev_core.diffusion.training import latent_cache
+from ctlev_core.diffusion.training import latent_cache, trainer
 from ctlev_core.diffusion.training.distributed import DistributedContext
 from ctlev_core.diffusion.training.entry import train_checkpoint
 from ctlev_core.diffusion.training.finetuning import check_channel_order, fine_tune
