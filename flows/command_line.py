@@ -1,13 +1,13 @@
-"""The command line that every flow script shares: choose a preset, change options, see the plan, run."""
+"""What every command does that runs a flow: read a preset, change options, show the plan, run; `flows.cli` parses."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,15 +24,12 @@ from data_contracts.yaml_text import load_yaml
 from flows import local_server, settings
 from flows.costs import HOW_ESTIMATED, estimate_costs
 from flows.inputs import InputsMissing, check_inputs
+from flows.preset_list import PRESETS, preset_names
+from flows.settings import ScriptFlow
 from tasks.stage import PlannedStage, in_one_run, planning
+from tasks.store import home_folder
 
 X = TypeVar("X", bound=Experiment)
-PRESETS = Path(__file__).resolve().parent / "presets"
-
-
-def preset_names(folder: Path = PRESETS) -> list[str]:
-    """Names of the bundled presets of a folder."""
-    return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
 def load_experiment(preset: str, overrides: list[str], model: type[X] = Experiment) -> X:
@@ -155,47 +152,65 @@ def print_costs(asked: Any) -> None:
         print(f"  {name:{max(map(len, found))}}  {cost}")
 
 
-def main(
-    flow: Any,
-    describe: Callable[[Any, Any], str],
-    *,
-    load: Callable[[str, list[str]], Any] = load_experiment,
-    default_preset: str = "pose",
-) -> int:
-    """Run a flow as a script.
+@dataclass(frozen=True)
+class Command:
+    """What a flow's script does.
 
-    Args:
-        flow: a Prefect flow of one parameter, its options.
+    Attributes:
+        flow: of one parameter, its options.
         describe: from the flow's result and its options to the lines printed at the end.
         load: from a preset's name and overrides to the options.
-        default_preset: used without `--preset`.
+    """
+
+    flow: ScriptFlow[..., Any]
+    describe: Callable[[Any, Any], str]
+    load: Callable[[str, list[str]], Any] = load_experiment
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a person asked of a command.
+
+    Attributes:
+        preset: name of a bundled preset, or path of a .yaml file.
+        overrides: options to change, each as `key=value`.
+        dry_run: print the plan and run nothing.
+        costs: the plan has the time, memory and disk of each stage.
+    """
+
+    preset: str
+    overrides: list[str]
+    dry_run: bool = False
+    costs: bool = False
+
+
+def run_command(command: Command, asked: Asked) -> int:
+    """Run a flow as a script does; `flows.settings.configure` was called.
 
     Returns:
         Exit status: 0 done, 2 wrong input, 130 interrupted.
     """
-    if os.environ.get("LOCAL_RANK", "0") != "0":
-        return 0  # under `accelerate launch` one process runs the flow; training starts the others itself
-    arguments = _parse(flow, default_preset)
     started = time.perf_counter()
+    flow = command.flow
     try:
-        home = Path(os.environ["CTLEV_HOME"])
+        home = home_folder()
         check_home(home)
-        if not arguments.dry_run:
+        if not asked.dry_run:
             local_server.start(home)  # first of all, so that what comes now overlaps with its start-up
-        options = load(arguments.preset, arguments.set)
+        options = command.load(asked.preset, asked.overrides)
         with planning() as rows:
             flow.fn(options)
-        if arguments.dry_run:
+        if asked.dry_run:
             print_plan(rows)
             print_costs(options)
             return 0
         use_cores(rows)
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
-            result = with_plan(flow, rows, f"preset {arguments.preset}, in {home}")(options)
-        described = describe(result, options)
+            result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
+        described = command.describe(result, options)
     except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
-        if isinstance(error, InputsMissing) and arguments.dry_run:
+        if isinstance(error, InputsMissing) and asked.dry_run:
             print_costs(error.asked)
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -221,15 +236,3 @@ def use_cores(rows: list[PlannedStage]) -> None:
     import torch
 
     torch.set_num_threads(num_cores())
-
-
-def _parse(flow: Any, default_preset: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=(flow.__doc__ or "").strip().splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
-    )
-    parser.add_argument("--preset", default=default_preset, help="name of a bundled preset, or path of a .yaml file")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change an option; repeatable")
-    parser.add_argument("--dry-run", action="store_true", help="print the plan and run nothing")
-    parser.add_argument("--home", help="folder of all state [CTLEV_HOME or .ctlev]")
-    parser.add_argument("--verbose", action="store_true", help="show Prefect's log")
-    return parser.parse_args()

@@ -19,7 +19,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
-from ctlev_core.processes import die_with_parent
+from ctlev_core.processes import die_with_parent, module_environment
 
 START_TIMEOUT_S = 300.0
 _QUIET = {
@@ -68,7 +68,7 @@ def start(home: Path) -> None:
     with _log.open("wb") as file:
         _server = subprocess.Popen(
             command,
-            env={**os.environ, **_SERVER},
+            env={**module_environment(os.environ), **_SERVER},
             stdout=file,
             stderr=file,
             stdin=subprocess.DEVNULL,

@@ -33,7 +33,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -50,11 +50,9 @@ from tasks.runners import asked_runner
 from tasks.store import Store, digest_raw_files
 from tasks.workers import current_workers, together
 
-if TYPE_CHECKING:
-    from prefect import Flow
-
 P = ParamSpec("P")
 R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
 RawFiles = Callable[[dict[str, Any]], Sequence[tuple[str, Path]]]
 """From the stage's arguments to (name, path) of the raw files it will read; the names enter the key too."""
 
@@ -110,7 +108,20 @@ def in_one_run() -> Iterator[None]:
         _in_one_run.reset(token)
 
 
-def call_flow(flow: Flow[P, R], *arguments: P.args, **settings: P.kwargs) -> R:
+class AnyFlow(Protocol[P, R_co]):
+    """A flow: called, it is a run of its own; `fn` is the function alone."""
+
+    @property
+    def fn(self) -> Callable[P, R_co]:
+        """What the flow does."""
+        ...
+
+    def __call__(self, *arguments: P.args, **settings: P.kwargs) -> R_co:
+        """Run it."""
+        ...
+
+
+def call_flow(flow: AnyFlow[P, R], *arguments: P.args, **settings: P.kwargs) -> R:
     """Call a Prefect flow, or only its wiring while planning and `in_one_run`."""
     return (flow.fn if _plan.get() is not None or _in_one_run.get() else flow)(*arguments, **settings)
 

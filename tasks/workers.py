@@ -21,10 +21,9 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar, copy_context
-from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
-from ctlev_core.processes import num_cores
+from ctlev_core.processes import module_environment, num_cores
 from tasks.runners import ALONE, Runner, WorkerError, asked_cluster, asked_runner, reply_to, reply_with
 
 R = TypeVar("R")
@@ -47,11 +46,9 @@ class Worker:
     """
 
     def __init__(self, position: int, threads: int) -> None:
-        root = str(Path(__file__).resolve().parents[1])
         environment = {
-            **os.environ,
+            **module_environment(os.environ),
             **ALONE,
-            "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")])),
             "OMP_NUM_THREADS": str(threads),
             "TQDM_POSITION": str(position),
         }
