@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,7 +24,9 @@ from data_contracts.yaml_text import load_yaml
 from flows import local_server, settings
 from flows.costs import HOW_ESTIMATED, estimate_costs
 from flows.inputs import InputsMissing, check_inputs
+from flows.plan_table import print_plan_with_costs
 from flows.preset_list import PRESETS, preset_names
+from flows.run_progress import duration_text, shown
 from flows.settings import ScriptFlow
 from tasks.stage import PlannedStage, in_one_run, planning
 from tasks.store import home_folder
@@ -201,12 +203,12 @@ def run_command(command: Command, asked: Asked) -> int:
         with planning() as rows:
             flow.fn(options)
         if asked.dry_run:
-            print_plan(rows)
+            (partial(print_plan_with_costs, home=home) if asked.costs else print_plan)(rows)
             print_costs(options)
             return 0
         use_cores(rows)
         all_cached = all(row.cached for row in rows)
-        with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
+        with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
             result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
         described = command.describe(result, options)
     except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
@@ -217,9 +219,10 @@ def run_command(command: Command, asked: Asked) -> int:
     except KeyboardInterrupt:
         print("interrupted; finished stages and checkpoints are kept", file=sys.stderr)
         return 130
-    cached = sum(row.cached for row in rows)
     print(described)
-    print(f"{len(rows)} stages, {cached} of them cached, in {time.perf_counter() - started:.1f} s")
+    stages = {row.key: row.cached for row in rows}
+    took = duration_text(time.perf_counter() - started)
+    print(f"{len(stages)} stages, {sum(stages.values())} of them cached, in {took}")
     return 0
 
 

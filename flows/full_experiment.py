@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 from ctlev_core import plugins
-from ctlev_core.report.page.report_files import publish_report
+from ctlev_core.report.page.report_files import publish_report, read_verdict
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from data_contracts.study import Study
@@ -135,7 +135,11 @@ def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -
     return checkpoint, call_flow(synthesize, experiment, dataset, checkpoint, number)
 
 
-COMMAND = Command(full_experiment, lambda made, asked: publish_report(made, home_folder(), asked.name), load=load_study)
+def _describe(made: ManifestRef, name: str) -> str:
+    return "\n".join(filter(None, [read_verdict(made.path), publish_report(made, home_folder(), name)]))
+
+
+COMMAND = Command(full_experiment, lambda made, asked: _describe(made, asked.name), load=load_study)
 
 
 if __name__ == "__main__":

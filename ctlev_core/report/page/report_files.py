@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef
 
 PAGE, LATEX, MARKDOWN, PROVENANCE = "report.html", "tables.tex", "tables.md", "provenance.json"
+_ANSWER = re.compile(r"\b(helped?|did harm|made it (better|worse)|is undecided|changed nothing|too few)\b")
 
 
 def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
@@ -26,6 +28,19 @@ def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
                 _replace(path, folder / name / path.relative_to(ref.path))
     _replace(ref.path / PAGE, folder / f"{name}.html")
     return f"report: {folder / f'{name}.html'}\ntables: {folder / name}"
+
+
+def read_verdict(folder: Path) -> str:
+    """The sentence of a report that says whether synthetic data helped; empty where no report lies in the folder.
+
+    It is the first that says so in the paragraphs above the first table of `tables.md`; of several groups each.
+    """
+    if not (folder / MARKDOWN).is_file():
+        return ""
+    above = (folder / MARKDOWN).read_text(encoding="utf-8").partition("\n## ")[0].replace("\\", "")
+    told = [re.split(r"(?<=[.:?])\s+(?=[A-Z])", paragraph.strip()) for paragraph in above.split("\n\n")[2:]]
+    answers = [next((one for one in sentences if _ANSWER.search(one)), "") for sentences in told]
+    return "\n".join(filter(None, answers)) or (told[0][0] if told else "")
 
 
 def publish_page(ref: ManifestRef, table: str, home: Path, name: str) -> Path:
