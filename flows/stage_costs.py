@@ -116,7 +116,7 @@ def time_left(
 def reference_records(home: Path) -> list[list[Any]]:
     """What `stage_costs.json` holds, from the runs of a home: kind, work, seconds, MiB, bytes; two of each kind."""
     groups: dict[str, list[Measured]] = {}
-    for one in _measured_in(home):
+    for one in _measured_in(home, alone=True):
         groups.setdefault(one.kind, []).append(one)
     rows = []
     for kind, group in sorted(groups.items()):
@@ -204,7 +204,8 @@ def _by_kind(measured: Iterable[Measured]) -> dict[str, list[Measured]]:
     return found
 
 
-def _measured_in(home: Path) -> list[Measured]:
+def _measured_in(home: Path, *, alone: bool = False) -> list[Measured]:
+    """Every stage that was run in a home; `alone`: as fast as if nothing else had used the machine."""
     folders = []
     for stage in (home / "artefacts").glob("*"):
         with contextlib.suppress(OSError):
@@ -213,7 +214,9 @@ def _measured_in(home: Path) -> list[Measured]:
     records = {folder.name: (record, folder) for folder in folders if (record := _read(folder)) is not None}
     amounts = _Amounts({key: record["arguments"] for key, (record, _) in records.items()})
     return [
-        Measured(kind_of(record["stage"], record["arguments"]), amounts.work(key), _cost_of(record, folder))
+        Measured(
+            kind_of(record["stage"], record["arguments"]), amounts.work(key), _cost_of(record, folder, alone=alone)
+        )
         for key, (record, folder) in records.items()
     ]
 
@@ -229,11 +232,17 @@ def _read(folder: Path) -> dict[str, Any] | None:
     """The record of an artefact, None where it cannot be read."""
     try:
         record = json.loads((folder / RUN_FILE).read_text())
-        return record if {"stage", "arguments", "wall_seconds", "process_peak_memory_mib"} <= record.keys() else None
+        return (
+            record
+            if {"stage", "arguments", "wall_seconds", "cpu_seconds", "process_peak_memory_mib"} <= record.keys()
+            else None
+        )
     except (OSError, ValueError, AttributeError):
         return None
 
 
-def _cost_of(record: Mapping[str, Any], folder: Path) -> StageCost:
+def _cost_of(record: Mapping[str, Any], folder: Path, *, alone: bool = False) -> StageCost:
     sizes = (path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    return StageCost(record["wall_seconds"], record["process_peak_memory_mib"], sum(sizes), is_known=True)
+    # A stage that waited for its core took less processor time than wall time.
+    seconds = min(record["wall_seconds"], record["cpu_seconds"]) if alone else record["wall_seconds"]
+    return StageCost(seconds, record["process_peak_memory_mib"], sum(sizes), is_known=True)
