@@ -279,8 +279,8 @@ def _rows(joints: npt.ArrayLike) -> np.ndarray:
 
 
 def _visible(joints: np.ndarray, visible: npt.ArrayLike | None) -> np.ndarray:
-    known = np.isfinite(joints).all(axis=-1)
-    return known if visible is None else np.logical_and(known, np.asarray(visible, bool))
+    known = np.asarray(np.isfinite(joints).all(axis=-1))
+    return known if visible is None else known & np.asarray(visible, bool)
 
 
 def _joint_set(count: int) -> str:

@@ -97,19 +97,19 @@ class RunProgress:
             cost = self.costs.get(key)
             if running is not None and not cached:
                 self._computed.append((now - running.started, None if cost is None else cost.seconds))
-            line = self._line(key, rows, None if running is None else now - running.started)
+            # Of a stage on a cluster nobody hears when it began.
+            took = "cached" if cached else "" if running is None else f"{now - running.started:.1f} s"
+            line = self._line(key, rows, took)
         if not self.is_drawn:
             self._console.print(line, markup=False, soft_wrap=True)
 
-    def _line(self, key: str, rows: int, seconds: float | None) -> str:
+    def _line(self, key: str, rows: int, took: str) -> str:
         count = f"[{len(self._ended):{len(str(len(self.rows)))}}/{len(self.rows)}]"
         label = self.rows[key].label if key in self.rows else key
-        took = "cached" if seconds is None else f"{seconds:.1f} s"
-        return f"{count} {label}  {rows:,} rows  {took}{self._left_text()}"
-
-    def _left_text(self) -> str:
         left = self.seconds_left()
-        return "" if left is None or len(self._ended) == len(self.rows) else f"  about {duration_text(left)} left"
+        is_last = left is None or len(self._ended) == len(self.rows)
+        told = [f"{count} {label}", f"{rows:,} rows", took, "" if is_last else f"about {duration_text(left)} left"]
+        return "  ".join(filter(None, told))
 
     def seconds_left(self) -> float | None:
         """Until the end, by what stages of this run and of earlier ones took; None where nothing is known."""

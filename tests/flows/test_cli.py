@@ -6,9 +6,11 @@ import importlib
 import os
 import pkgutil
 import re
+import shutil
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -147,6 +149,33 @@ def test_files_of_the_users_folder_are_not_imported(tmp_path):
     assert worker.stdout == "True\n", worker.stderr
 
 
+@pytest.mark.slow
+def test_a_wheel_outside_of_the_repository_is_enough(tmp_path):
+    """The command, the presets, the costs and the Python interface, from what `pip` would install."""
+    source = tmp_path / "source"
+    for name in ("ctlev_core", "data_contracts", "flows", "tasks"):
+        shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(REPOSITORY / name, source)
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "-w", str(tmp_path), str(source)], check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "site")
+    shutil.rmtree(source)
+    (entry,) = (tmp_path / "site").glob("*.dist-info/entry_points.txt")
+    assert "ctlev = flows.cli:main" in entry.read_text()
+    place = {"PYTHONPATH": str(tmp_path / "site")}
+    (tmp_path / "tasks.py").write_text("raise AssertionError('a file of the user was imported')")
+    plan = ctlev("plan", "smoke", "--home", "home", cwd=tmp_path, **place)
+    assert plan.returncode == 0 and "about" in plan.stdout.splitlines()[-1], plan.stderr
+    assert "smoke" in ctlev("presets", cwd=tmp_path, **place).stdout
+    code = "import ctlev_core as ctlev; print(ctlev.__file__, ctlev.frechet([[0.0], [1]], [[0.0], [1]]))"
+    used = [sys.executable, "-P", "-c", code]
+    done = subprocess.run(used, cwd=tmp_path, env=os.environ | place, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(tmp_path / "site" / "ctlev_core" / "__init__.py"), "0.0"]
+
+
 IMPORTS = """
 import importlib, os, sys
 import torch, prefect, transformers, diffusers, cv2  # what these do is theirs
@@ -171,6 +200,21 @@ def test_importing_a_module_changes_nothing(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_off_a_terminal_a_run_tells_each_stage_and_then_the_answer(tmp_path):
+    finished = run_script("prepare_dataset", "--preset", "smoke", home=tmp_path)
+    assert finished.status == 0, finished.errors
+    first, *stages = [line for line in finished.errors.splitlines() if line.strip()]
+    total = int(re.match(r"(\d+) stages", first)[1])
+    told = [
+        re.fullmatch(r"\[ *(\d+)/(\d+)\] (\w+).*  ([\d,]+) rows  [\d.]+ s(  about .* left)?", one) for one in stages
+    ]
+    assert all(told), stages
+    assert [int(one[1]) for one in told] == list(range(1, total + 1))
+    assert {one[3] for one in told} == {"ingest", "encode", "condition_frames", "condition_samples", "contact_sheet"}
+    answer = finished.output.splitlines()
+    assert answer[0].startswith("recordings: ") and answer[-1].startswith(f"{total} stages, 0 of them cached, in ")
 
 
 def test_a_script_takes_what_it_took(tmp_path):

@@ -68,6 +68,13 @@ def test_on_a_terminal_there_is_a_line_for_the_run_and_one_for_each_running_stag
     assert re.search(r"encode: b .* 30 s +300 of 600 steps 10/s +loss 0.25", stage)
 
 
+def test_a_stage_of_which_nobody_heard_when_it_began_has_no_time(clock):
+    progress = RunProgress([planned("a"), planned("b")], {}, stream=(stream := io.StringIO()))
+    progress.ended("a", 5, cached=False)
+    progress.ended("b", 5, cached=True)
+    assert stream.getvalue() == "[1/2] encode: a  5 rows\n[2/2] encode: b  5 rows  cached\n"
+
+
 def test_nothing_is_foretold_where_nothing_is_known():
     progress = RunProgress([planned("a")], {"a": None}, stream=(stream := io.StringIO()))
     progress.begin()

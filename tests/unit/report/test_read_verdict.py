@@ -42,5 +42,17 @@ def test_of_a_study_it_is_the_sentence_of_each_group(tmp_path):
     assert read_verdict(tmp_path).startswith("By 95 % intervals") and "More" not in read_verdict(tmp_path)
 
 
+def test_of_several_experiments_each_has_its_heading(tmp_path):
+    words = "\n\n".join(
+        f"2D pose (`{name}`): mpjpe2d_px (lower is better): recorded 6, both 5.5. Adding synthetic data {what}. More."
+        for name, what in (("few_9", "made it better: paired difference -0.5"), ("few_12", "changed nothing"))
+    )
+    (tmp_path / "tables.md").write_text(render_markdown([], title="few", lead="Data.", verdict=words))
+    assert read_verdict(tmp_path).splitlines() == [
+        "2D pose (`few_9`): Adding synthetic data made it better: paired difference -0.5.",
+        "2D pose (`few_12`): Adding synthetic data changed nothing.",
+    ]
+
+
 def test_without_a_report_there_is_none(tmp_path):
     assert read_verdict(tmp_path) == ""
