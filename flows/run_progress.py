@@ -106,9 +106,8 @@ class RunProgress:
     def _line(self, key: str, rows: int, took: str) -> str:
         count = f"[{len(self._ended):{len(str(len(self.rows)))}}/{len(self.rows)}]"
         label = self.rows[key].label if key in self.rows else key
-        left = self.seconds_left()
-        is_last = left is None or len(self._ended) == len(self.rows)
-        told = [f"{count} {label}", f"{rows:,} rows", took, "" if is_last else f"about {duration_text(left)} left"]
+        left = self.seconds_left() if len(self._ended) < len(self.rows) else None
+        told = [f"{count} {label}", f"{rows:,} rows", took, "" if left is None else f"about {duration_text(left)} left"]
         return "  ".join(filter(None, told))
 
     def seconds_left(self) -> float | None:
