@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from ctlev_core import __version__
 from flows import preset_list
 
 app = typer.Typer(
@@ -76,6 +77,21 @@ Run = Annotated[
     str,
     typer.Argument(help="name, key or path of a report", autocompletion=_complete_report, show_default=False),
 ]
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"ctlev {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _ctlev(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version and end")
+    ] = False,
+) -> None:
+    """Labelled event-camera data from a fine-tuned image-diffusion model."""
 
 
 def main() -> NoReturn:

@@ -17,7 +17,7 @@ def print_plan_with_costs(rows: Sequence[PlannedStage], home: Path) -> None:
     stages = {row.key: row for row in rows}
     costs = estimate_stages(rows, home)
     table = [
-        ["cached" if row.cached else "to run", *_cells(costs[key], is_cached=row.cached), key, row.label]
+        ["cached" if row.cached else "to run", *_cells(costs[key], is_cached=row.cached), key[:12], row.label]
         for key, row in stages.items()
     ]
     columns = ["", "time", "memory", "disk", "key", "stage"]

@@ -17,6 +17,7 @@ import pytest
 from flow_scripts import REPOSITORY, run_script
 from typer.testing import CliRunner
 
+from ctlev_core import __version__
 from flows import cli
 from flows.preset_list import preset_names
 
@@ -47,6 +48,10 @@ def test_help_names_every_command():
     assert all(re.search(rf"\b{command}\b", output) for command in COMMANDS)
     for command in COMMANDS:
         assert invoke(command, "--help")[0] == 0
+
+
+def test_version_is_that_of_the_package():
+    assert invoke("--version")[:2] == (0, f"ctlev {__version__}\n")
 
 
 def test_presets_are_told_a_line_each():
