@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from ctlev_core.processes import die_with_parent
+from ctlev_core.processes import die_with_parent, module_environment
 
 START_TIMEOUT_S = 300.0
 LOOK_EVERY_S = 0.5
@@ -89,7 +89,7 @@ def start(home: Path) -> None:
         access = {"PREFECT_SERVER_API_AUTH_STRING": _password, "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": origin}
         _server = subprocess.Popen(
             [sys.executable, "-P", str(Path(__file__).with_name("private_server.py")), str(listening.fileno())],
-            env={**os.environ, **_SERVER, **access},
+            env={**module_environment(os.environ), **_SERVER, **access},
             stdout=file,
             stderr=file,
             stdin=subprocess.DEVNULL,

@@ -7,12 +7,14 @@ import sys
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
-from flows.command_line import main
-from flows.settings import HOME, flow
+from flows.cli import script
+from flows.command_line import Command
+from flows.settings import flow
 from tasks.condition import condition_frames, condition_samples
 from tasks.contact_sheet import contact_sheet, publish_contact_sheet
 from tasks.encode import encode
 from tasks.ingest import ingest
+from tasks.store import home_folder
 
 
 class PreparedDataset(Frozen):
@@ -117,14 +119,15 @@ def condition_asked_samples(
     )
 
 
+COMMAND = Command(
+    prepare_dataset,
+    lambda dataset, experiment: (
+        f"recordings: {dataset.recordings.rows} in {dataset.recordings.path}\n"
+        f"frames:     {dataset.frames.rows} in {dataset.frames.path}\n"
+        + publish_contact_sheet(dataset.contact_sheet, home_folder(), experiment.name)
+    ),
+)
+
+
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            prepare_dataset,
-            lambda dataset, experiment: (
-                f"recordings: {dataset.recordings.rows} in {dataset.recordings.path}\n"
-                f"frames:     {dataset.frames.rows} in {dataset.frames.path}\n"
-                + publish_contact_sheet(dataset.contact_sheet, HOME, experiment.name)
-            ),
-        )
-    )
+    sys.exit(script("prepare"))

@@ -15,6 +15,7 @@ from data_contracts.study import Study
 from flows.command_line import PRESETS, apply_override, load_experiment, read_preset
 from flows.inputs import check_inputs
 from flows.speed_vs_error import speed_vs_error_of
+from flows.sweeps import find_sweeps, looks_like_sweep, study_of
 
 
 def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
@@ -26,6 +27,8 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     that may be missing: it is null where that path is not given. An experiment that says `only_with` some of the paths
     is left out where one of them is not given, and `data_notice` says so.
 
+    Of a preset of one experiment, overrides with several values (`flows.sweeps`) make a study of all combinations.
+
     Args:
         preset: as `load_preset` takes it.
         overrides: likewise; those of a study begin with `experiments.NAME.`, `paths.` or `speed_vs_error.`.
@@ -33,11 +36,20 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     Raises:
         PluginError: as `load_experiment` and `speed_vs_error_of`.
     """
-    values = read_preset(PRESETS, preset)
+    values, where = read_preset(PRESETS, preset), f"preset {preset!r}"
+    if values.get("experiments") is None:
+        sweeps = find_sweeps(values, overrides)
+        if not sweeps:
+            return load_experiment(preset, overrides)
+        study = validate_options(Study, study_of(values, overrides, sweeps), where)
+        check_inputs(study)
+        return study
+    return _load_study(values, overrides, where)
+
+
+def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Study:
+    """The study that a preset with `experiments` describes; see `load_study`."""
     parts, paths, groups = values.get("experiments"), values.pop("paths", {}), values.pop("sets", {})
-    if parts is None:
-        return load_experiment(preset, overrides)
-    where = f"preset {preset!r}"
     if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
         raise PluginError(
             f"{where}: experiments must be a mapping of names to options, got {shortened(repr(parts), 200)}"
@@ -47,6 +59,8 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
             f"{where}: sets must map names to lists of texts key=value, got {shortened(repr(groups), 200)}"
         )
     parts = _repeat(parts, where)
+    if swept := next((override for override in overrides if looks_like_sweep(override.partition("=")[2])), None):
+        raise PluginError(f"--set {swept}: {where} is a study; several values are for presets of one experiment")
     given, others = ([o for o in overrides if o.startswith("paths.") == is_path] for is_path in (True, False))
     for override in given:
         name = override.partition("=")[0].removeprefix("paths.")

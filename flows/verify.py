@@ -5,7 +5,6 @@ python flows/verify.py [--home FOLDER]
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -14,7 +13,8 @@ from tqdm import tqdm
 from ctlev_core.provenance import raw_file_digests
 from data_contracts.errors import DataError, TableVersionError
 from data_contracts.published import kept_versions
-from tasks.store import Store, home_folder
+from flows.cli import script
+from tasks.store import Store
 
 
 def verify(store: Store) -> tuple[int, int]:
@@ -90,11 +90,8 @@ def _check_latest(store: Store) -> int:
     return broken
 
 
-def main() -> int:
+def verify_home(home: Path) -> int:
     """Exit status: 0 all is whole, 1 something was damaged or missing, 2 something cannot be checked or set aside."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--home", type=Path, help="folder of all state [CTLEV_HOME or .ctlev]")
-    home = (parser.parse_args().home or home_folder()).absolute()
     if not home.is_dir():
         print(f"error: {home}: there is no such home folder", file=sys.stderr)
         return 2
@@ -107,4 +104,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(script("verify"))

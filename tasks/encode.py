@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut_chunks, spread
 from ctlev_core.labels.labelling import has_label, labels_at_windows, labels_in_image
+from ctlev_core.progress import ProgressBar
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
@@ -150,7 +150,7 @@ def _encode_in_turn(
 ) -> Iterator[tuple[str, _Samples]]:
     """Some windows at a time, each handed on before the next are read."""
     plugin = plugins.load_options(encoding)
-    for source in tqdm(sources, "encode", unit="recording", leave=False, disable=None):
+    for source in ProgressBar(sources, "encode", unit="recording"):
         for samples in _encode_source(source, plugin, windows):
             yield source.recording["recording_id"], samples
 
@@ -160,7 +160,7 @@ def _encode_spread(
 ) -> Iterator[tuple[str, _Samples]]:
     """The same, several recordings at a time."""
     found = map_shards(partial(_encode_shard, encoding, windows, work), list(enumerate(sources)), max_group=MAX_GROUP)
-    found = tqdm(found, "encode", len(sources), unit="recording", leave=False, disable=None)
+    found = ProgressBar(found, "encode", len(sources), unit="recording")
     for source, chunks in zip(sources, found, strict=True):
         for samples in chunks:
             yield source.recording["recording_id"], samples if isinstance(samples, _Samples) else samples.take_back()

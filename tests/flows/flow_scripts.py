@@ -94,9 +94,8 @@ def _here(name: str, arguments: tuple[str, ...], home: Path, **patches: Any) -> 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CTLEV_HOME", str(home))
         patch.setattr(sys, "argv", [f"{name}.py", "--home", str(home), *arguments])
-        from flows import command_line, local_server, settings  # here, because flows take the home from these
+        from flows import command_line, local_server
 
-        patch.setattr(settings, "HOME", home)
         patch.setattr(local_server, "start", lambda home: None)
         patch.setattr(local_server, "connected", patches.get("connected", _not_reached))
         patch.setattr(command_line, "with_plan", patches.get("with_plan"))
