@@ -177,8 +177,10 @@ def test_yaml_is_part_of_a_preset(block, tmp_path):
     values = yaml.safe_load(block.text)
     if not set(values) & {"experiments", "pooled", "speed_vs_error"}:
         path = tmp_path / "preset.yaml"
-        path.write_text("extends: pose\nname: docs\n" + block.text)
-        check_options(load_preset(Experiment, PRESETS, str(path), []))
+        whole = "extends" in values
+        path.write_text(block.text if whole else "extends: pose\nname: docs\n" + block.text)
+        pictures = ["base_model.pictures.root=R", "generator.options.rehearsal.root=R"] if whole else []
+        check_options(load_preset(Experiment, PRESETS, str(path), pictures))
         return
     parts = {"pose": {"extends": "pose", "name": "docs_pose"}}
     path = tmp_path / "study.yaml"
