@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 
 import ctlev_core as ctlev
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, BUNDLED_OBJECT_MODEL
 from data_contracts.errors import DataError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 KEY = "0" * 32
 
 
-def made_run(home: Path, name: str) -> Path:
-    """A home whose run `name` has the bundled base model as its generator."""
+def made_run(home: Path, name: str, generator: str = "controlnet", base_model: Path = BUNDLED_BASE_MODEL) -> Path:
+    """A home whose run `name` has a bundled base model as its generator."""
     artefact = home / "artefacts" / "finetune" / KEY
     artefact.mkdir(parents=True)
-    (artefact / "checkpoint").symlink_to(BUNDLED_BASE_MODEL)
-    arguments = {"generator": {"plugin": "generators/controlnet", "version": 3, "options": {}}}
+    (artefact / "checkpoint").symlink_to(base_model)
+    arguments = {"generator": {"plugin": f"generators/{generator}", "version": 3, "options": {}}}
     (artefact / "run.json").write_text(json.dumps({"stage": "finetune", "arguments": arguments}))
     record = dict.fromkeys(("started", "digest"), "") | {
         "role": "checkpoint of synthetic", "stage": "finetune", "key": KEY, "arguments": arguments, "versions": {},
@@ -65,6 +65,21 @@ def test_each_line_of_the_quick_start_runs(tmp_path, monkeypatch, random_events)
     assert given["counts"].shape == (4, 2, 24, 32) and given["counts"].sum() == 2000
     assert given["error"] == 5.0 and 0 <= given["share"] <= 1
     assert given["normals"].shape == given["skeleton"].shape == (64, 64, 3)
+    assert given["images"].shape == (1, 64, 64, 3) and given["images"].any()
+
+
+def test_each_line_of_the_readme_runs(tmp_path, monkeypatch, random_events):
+    from ctlev_core.formats import evt2
+
+    (block,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CTLEV_HOME", raising=False)
+    evt2.write(Path("recording.raw"), random_events)
+    made_run(Path(".ctlev").absolute(), "demo_objects", "stable_diffusion", BUNDLED_OBJECT_MODEL)
+    monkeypatch.setattr(ctlev, "EventDataset", lambda folder: [folder])
+    given = {}
+    exec(block, given)
+    assert given["counts"].sum() == 2000 and given["sample"] == "mine"
     assert given["images"].shape == (1, 64, 64, 3) and given["images"].any()
 
 
