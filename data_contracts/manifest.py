@@ -1,19 +1,22 @@
 """Manifests on disk: one Parquet table per artefact, with the digests of all files beside it.
 
 An artefact is a folder. `manifest.parquet` holds its rows and, in the Parquet metadata, size and SHA-256 of every other
-file of the folder, so the digest of the manifest vouches for the whole artefact. Arrays lie beside it as .npy files and
-are memory-mapped; row i of an array belongs to row i of the table.
+file of the folder, so the digest of the manifest vouches for the whole artefact. More than some thousands of files are
+listed in a table of their own, `file_list.parquet`, whose digest is in the metadata. Arrays lie beside it as .npy files
+and are memory-mapped; row i of an array belongs to row i of the table.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +24,14 @@ import pyarrow.parquet as pq
 
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.errors import DataError, TableVersionError
+from data_contracts.file_lists import (
+    FILE_LIST,
+    MAX_LISTED_FILES,
+    file_digest,
+    read_file_list,
+    read_table,
+    write_file_list,
+)
 from data_contracts.image_rows import ImageRows
 from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, History, Labels
 from data_contracts.run_record import RUN_FILE, read_run_record
@@ -49,12 +60,6 @@ class ManifestRef(Frozen):
     rows: int = -1
 
 
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file's content, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def artefact_files(folder: Path) -> list[Path]:
     """Every file of an artefact except the manifest and the provenance record, sorted."""
     special = {folder / MANIFEST_FILE, folder / RUN_FILE}
@@ -71,9 +76,16 @@ def write_manifest(folder: Path, table: pa.Table, schema: TableSchema) -> Manife
         DataError: the table breaks its schema.
     """
     table = check_table(table, schema, str(folder))
+    listed = artefact_files(folder)
+    if folder / FILE_LIST in listed:
+        raise DataError(f"{folder}: no stage may write a file {FILE_LIST}, which lists the others")
+    if len(listed) > MAX_LISTED_FILES:
+        # Parquet's readers refuse metadata above 100 MB, which 700,000 files are.
+        write_file_list(folder, listed)
+        listed = [folder / FILE_LIST]
     files = {
         path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": file_digest(path)}
-        for path in artefact_files(folder)
+        for path in listed
     }
     metadata = {
         _SCHEMA_KEY: json.dumps({"name": schema.name, "version": schema.version}).encode(),
@@ -91,7 +103,7 @@ class Manifest:
     ref: ManifestRef
     schema: TableSchema
     table: pa.Table
-    files: dict[str, dict]
+    files: Mapping[str, Mapping[str, Any]]
 
     def __len__(self) -> int:
         return self.table.num_rows
@@ -99,7 +111,8 @@ class Manifest:
     def path(self, name: str) -> Path:
         """A file of the artefact that the manifest lists."""
         if name not in self.files:
-            raise DataError(f"{self.ref.path}: holds no file {name!r}; it has {sorted(self.files) or 'none'}")
+            known = ", ".join(sorted(itertools.islice(self.files, 20))) or "none"
+            raise DataError(f"{self.ref.path}: holds no file {name!r}; it has {known[:200]}")
         return self.ref.path / name
 
     def array(self, name: str) -> np.ndarray:
@@ -113,7 +126,7 @@ class Manifest:
     def attached(self, schema: TableSchema) -> pa.Table:
         """The table `<schema.name>.parquet` that lies beside the manifest, checked."""
         path = self.path(f"{schema.name}.parquet")
-        return check_table(_read_table(path, path).replace_schema_metadata(None), schema, str(path))
+        return check_table(read_table(path, path).replace_schema_metadata(None), schema, str(path))
 
     def column(self, name: str) -> list:
         """A column as Python values."""
@@ -158,7 +171,7 @@ def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
     digest = hashlib.sha256(content).hexdigest()
     if ref.digest and digest != ref.digest:
         raise DataError(f"{path}: content has changed; expected digest {ref.digest[:12]}, got {digest[:12]}")
-    table = _read_table(pa.BufferReader(content), path)
+    table = read_table(pa.BufferReader(content), path)
     metadata = table.schema.metadata or {}
     if _SCHEMA_KEY not in metadata or _FILES_KEY not in metadata:
         raise DataError(f"{path}: is not a ctlev manifest; its metadata names no schema")
@@ -173,25 +186,16 @@ def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
     if schema.version != version:
         raise TableVersionError(f"{path}: table {name!r} version {version}; this code reads version {schema.version}")
     for name, expected in files.items():
-        _check_file(ref.path / name, expected, full)
+        _check_file(ref.path / name, expected, full or name == FILE_LIST)
+    if FILE_LIST in files:
+        files = read_file_list(ref.path / FILE_LIST)
+        for name, expected in files.items():
+            _check_file(ref.path / name, expected, full)
     checked = check_table(table.replace_schema_metadata(None), schema, str(path))
     return Manifest(ManifestRef(key=ref.key, path=ref.path, digest=digest, rows=len(checked)), schema, checked, files)
 
 
-def _read_table(source: Path | pa.BufferReader, path: Path) -> pa.Table:
-    """One Parquet file. `pq.read_table` would load pyarrow's datasets for it, and those pandas, a third of a second."""
-    try:
-        with pq.ParquetFile(source) as file:
-            return file.read()
-    except OSError as error:
-        if error.errno is not None:
-            raise
-        raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error
-    except pa.ArrowInvalid as error:
-        raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error
-
-
-def _check_file(path: Path, expected: dict, full: bool) -> None:
+def _check_file(path: Path, expected: Mapping[str, Any], full: bool) -> None:
     try:
         status = path.stat()
     except (FileNotFoundError, NotADirectoryError):

@@ -31,7 +31,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from data_contracts.errors import DataError
-from data_contracts.manifest import MANIFEST_FILE, ManifestRef, file_digest, read_manifest
+from data_contracts.file_lists import file_digest
+from data_contracts.manifest import MANIFEST_FILE, ManifestRef, read_manifest
 from data_contracts.published import kept_versions
 from data_contracts.run_record import RUN_FILE, RunRecord, mark_used, read_run_record, write_run_record
 from tasks import file_locks

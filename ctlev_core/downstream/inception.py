@@ -18,8 +18,8 @@ from pydantic import Field
 from ctlev_core.networks import feature_extractors
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
+from data_contracts.file_lists import file_digest
 from data_contracts.image_rows import Images
-from data_contracts.manifest import file_digest
 
 VERSION = 1
 NAME = "inception"

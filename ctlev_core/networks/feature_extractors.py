@@ -16,9 +16,9 @@ import numpy as np
 
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
+from data_contracts.file_lists import file_digest
 from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels
-from data_contracts.manifest import file_digest
 
 if TYPE_CHECKING:
     import torch

@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, TypeAdapter, ValidationError
 
 from data_contracts.errors import DataError
-from data_contracts.manifest import file_digest
+from data_contracts.file_lists import file_digest
 from data_contracts.run_record import Digest, mark_used
 
 FILE = "raw_file_digests.json"

@@ -14,8 +14,8 @@ from torch import nn
 
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.errors import DataError
+from data_contracts.file_lists import file_digest
 from data_contracts.image_rows import ImageRows, Images
-from data_contracts.manifest import file_digest
 
 MODEL_NAME = "model.safetensors"
 CONFIG_NAME = "config.json"
