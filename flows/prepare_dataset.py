@@ -15,6 +15,7 @@ from tasks.contact_sheet import contact_sheet, publish_contact_sheet
 from tasks.encode import encode
 from tasks.ingest import ingest
 from tasks.store import home_folder
+from tasks.subset import take_recorded
 
 
 class PreparedDataset(Frozen):
@@ -44,6 +45,10 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
     frames = encode(
         recordings, encoding=experiment.encoding, windows=experiment.windows, label=experiment.encoding.name
     )
+    if experiment.num_recorded is not None:
+        frames = take_recorded(
+            frames, count=experiment.num_recorded, seed=experiment.seed, label="frames to learn from"
+        )
     poses, target_frames = recordings, None
     if experiment.target is not None:
         poses = ingest(dataset=experiment.target, label=f"{experiment.target.name}, target")
