@@ -15,7 +15,7 @@ import numpy as np
 
 from ctlev_core.body.motion.clip import MotionClip
 from ctlev_core.scoring.score_info import ScoreInfo
-from data_contracts.config import Frozen
+from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.events import Events, SensorSize
 from data_contracts.image_rows import Images
 from data_contracts.labels import BodyMotions, Conditions, History, ImageTrack, Labels, Recording
@@ -233,6 +233,14 @@ class Generator(Protocol):
         self, checkpoint: Path, conditions: Conditions, options: Any, *, seeds: Sequence[int], work: Path
     ) -> np.ndarray:
         """Frames [N, H, W, 3] uint8; row i depends on conditions[i] and seeds[i] alone."""
+        ...
+
+
+class GeneratorFromWeights(Generator, Protocol):
+    """A generator whose base model has a size and perhaps colours of its own."""
+
+    def check_fit(self, options: Any, image_size: tuple[int, int] | None, condition: ConditionChoice) -> None:
+        """Raise `DataError` unless images of `image_size` px (None = not known yet) and conditions fit its weights."""
         ...
 
 

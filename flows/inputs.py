@@ -141,6 +141,21 @@ def _check_classes(experiment: Experiment) -> None:
             check({recording.class_name for recording in recordings if recording.class_name}, plugin.options)
 
 
+def _check_base_models(experiment: Experiment) -> None:
+    """Raise `DataError` where event images or conditions do not fit the weights a generator starts from."""
+    image_size = getattr(plugins.load_options(experiment.encoding).options, "image_size", None)
+    used = [(experiment.generator, experiment.condition)]
+    used += [(baseline.generator, baseline.condition) for baseline in experiment.baselines.values()]
+    for generator, condition in used:
+        plugin = plugins.load_options(generator)
+        check = getattr(plugin.module, "check_fit", None)
+        base_model = getattr(plugin.options, "base_model", None)
+        # What is not there is told by the plan, and what the experiment makes itself is made to fit.
+        if check is None or (base_model is None and experiment.base_model) or (base_model and not base_model.exists()):
+            continue
+        check(plugin.options, image_size, condition)
+
+
 def _conditions(experiment: Experiment) -> dict[str, tuple[ConditionChoice, DatasetChoice | None]]:
     """The conditions of an experiment by their settings, and what else than its own dataset labels are taken from."""
     asked = experiment.poses or experiment.target
@@ -155,4 +170,4 @@ def _has_intensity(dataset: DatasetChoice) -> bool:
     return any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options))
 
 
-CHECKS = (_check_intensity, _check_labels, _check_counts, _check_classes)
+CHECKS = (_check_intensity, _check_labels, _check_counts, _check_classes, _check_base_models)

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.options import FineTuningOptions
-from data_contracts.config import RUN_SETTING
+from data_contracts.config import RUN_SETTING, ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images
 from data_contracts.labels import Conditions, History
@@ -60,6 +60,15 @@ def base_model_folders(options: Options) -> list[Path]:
             except DataError as other:  # neither is there: better said at once
                 raise DataError(f"{error}; {other}") from other
         raise
+
+
+def check_fit(options: Options, image_size: tuple[int, int] | None, condition: ConditionChoice) -> None:
+    """Raise `DataError` where event images or conditions do not fit the base model, before anything is computed."""
+    from ctlev_core.diffusion.pretrained import fit
+    from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
+
+    base_model = options.base_model or BUNDLED_BASE_MODEL
+    fit.check_fit(base_model, image_size, condition, controlnet=options.controlnet, with_controlnet=True)
 
 
 def train(frames: Images, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.options import FineTuningOptions
+from data_contracts.config import ConditionChoice
 from data_contracts.image_rows import Images
 from data_contracts.labels import Conditions, History
 
@@ -42,6 +43,14 @@ def base_model_folders(options: Options) -> list[Path]:
     from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_MODEL, base_model_places
 
     return base_model_places(options.base_model or BUNDLED_OBJECT_MODEL)
+
+
+def check_fit(options: Options, image_size: tuple[int, int] | None, condition: ConditionChoice) -> None:
+    """Raise `DataError` where event images are not of the base model's size, before anything is computed."""
+    from ctlev_core.diffusion.pretrained import fit
+    from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_MODEL
+
+    fit.check_fit(options.base_model or BUNDLED_OBJECT_MODEL, image_size, condition)
 
 
 def train(frames: Images, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:

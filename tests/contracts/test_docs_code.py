@@ -216,7 +216,7 @@ def test_python_compiles_and_its_imports_resolve(block):
 
 
 def _runs_on_the_folder(block: Block) -> bool:
-    # What shows the public interface as a whole is run in tests/unit/test_public_api.py.
+    # What shows the public interface as a whole is run in tests/contracts/test_public_api.py.
     return ('"mine' in block.text or "dataset.read_events" in block.text) and "ctlev.read_events" not in block.text
 
 

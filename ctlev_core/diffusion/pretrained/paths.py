@@ -40,7 +40,7 @@ def read_base_model_files(path: Path, *, controlnet: Path | None = None, with_co
             f"{path}: the base model must be a diffusers folder, or a checkpoint in one file ({', '.join(ENDINGS)}), "
             "but there is no such folder or file"
         )
-    files = read_single_base_model(path) if is_single_file(path) else _read_folder(path)
+    files = read_parts(path)
     parts = dict(files.parts)
     control = find_controlnet(path, controlnet) if with_controlnet else None
     if control is not None:
@@ -52,6 +52,11 @@ def read_base_model_files(path: Path, *, controlnet: Path | None = None, with_co
     for part in files.parts.values():
         check_finite(part.tensors.items())
     return files
+
+
+def read_parts(path: Path) -> ModelFiles:
+    """Configs and tensor tables of a base model's folder or single file, not checked against one another."""
+    return read_single_base_model(path) if is_single_file(path) else _read_folder(path)
 
 
 def check_base_model_folder(folder: Path, *, controlnet: Path | None = None, needs_controlnet: bool = False) -> Path:

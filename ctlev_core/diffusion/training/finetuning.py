@@ -17,8 +17,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
+from ctlev_core.diffusion.pretrained.fit import check_channel_order
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, encode_prompts
 from ctlev_core.diffusion.pretraining.architecture import break_zeros
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
@@ -66,23 +66,6 @@ def forget_weights(base_model: PretrainedModel, seed: int) -> PretrainedModel:
     return replace(base_model, unet=unet, controlnet=controlnet)
 
 
-def check_channel_order(base_model: PretrainedModel, conditions: Conditions) -> None:
-    """Raise `DataError` where the ControlNet exchanges red and blue of normal maps that are drawn so already, or not.
-
-    Nothing else would notice: it learns slowly, from weights that know other colours.
-    """
-    convention = ""
-    if conditions.made_by is not None and conditions.made_by.name == "normals":
-        convention = plugins.load_options(conditions.made_by).options.convention
-    order = "bgr" if base_model.reversed_condition else "rgb"
-    if (convention, order) in (("controlnet", "bgr"), ("controlnet_unreversed", "rgb")):
-        fitting = "controlnet_unreversed" if order == "bgr" else "controlnet"
-        raise DataError(
-            f"condition 'normals': convention {convention!r} does not fit a ControlNet whose channel order is "
-            f"{order!r}; set condition.options.convention={fitting}"
-        )
-
-
 def fine_tune(
     base_model: PretrainedModel,
     frames: Images,
@@ -115,7 +98,7 @@ def fine_tune(
             do not fit one another.
     """
     check_training_data(frames, conditions, base_model.image_size)
-    check_channel_order(base_model, conditions)
+    check_channel_order("bgr" if base_model.reversed_condition else "rgb", conditions.made_by)
     if options.rot90_probability and frames.shape[1] != frames.shape[2]:
         raise DataError(
             f"rot90_probability needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0"

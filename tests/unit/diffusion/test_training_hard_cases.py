@@ -11,13 +11,14 @@ import torch
 from tiny_base_model import CORPUS, make_base_model, make_data, shared_base_model
 
 from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_loss, generator_for
+from ctlev_core.diffusion.pretrained.fit import check_channel_order
 from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_base_model
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.training import latent_cache, trainer
 from ctlev_core.diffusion.training.distributed import DistributedContext
 from ctlev_core.diffusion.training.entry import train_checkpoint
-from ctlev_core.diffusion.training.finetuning import check_channel_order, fine_tune
+from ctlev_core.diffusion.training.finetuning import fine_tune
 from ctlev_core.diffusion.training.latent_cache import cache_latents, check_cache
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.config import ConditionChoice
@@ -171,15 +172,15 @@ def test_empty_and_saturated_frames_can_be_learnt(tmp_path):
 
 
 @pytest.mark.parametrize(("order", "convention"), [("bgr", "controlnet"), ("rgb", "controlnet_unreversed")])
-def test_colours_that_are_exchanged_twice_or_never_are_refused(order, convention):
+def test_colours_that_are_exchanged_twice_or_never_are_refused(tmp_path, order, convention):
     base_model = make_base_model()
     base_model.controlnet.register_to_config(controlnet_conditioning_channel_order=order)
-    asked = Conditions(("a",), made_by=ConditionChoice(name="normals", options={"convention": convention}))
+    asked = ConditionChoice(name="normals", options={"convention": convention})
     with pytest.raises(DataError, match=f"convention '{convention}' does not fit .* '{order}'; set condition.options"):
-        check_channel_order(base_model, asked)
-    base_model.controlnet.register_to_config(controlnet_conditioning_channel_order="bgr" if order == "rgb" else "rgb")
-    check_channel_order(base_model, asked)
-    check_channel_order(base_model, Conditions(("a",), made_by=ConditionChoice(name="skeleton")))
+        tuned(tmp_path, base_model=base_model, conditions=dataclasses.replace(CONDITIONS, made_by=asked))
+    check_channel_order("bgr" if order == "rgb" else "rgb", asked)
+    check_channel_order(order, ConditionChoice(name="skeleton"))
+    check_channel_order(order, None)
 
 
 def test_latents_are_encoded_fewer_at_a_time_where_memory_runs_out(monkeypatch):

@@ -245,15 +245,15 @@ EVENTS = "encoding={name: event_histogram, options: {polarity: false, image_size
 
 @pytest.mark.parametrize("asked", ["stochastic_rounding=true", "export={}"])
 def test_images_without_whole_counts_are_refused_before_anything_runs(asked):
-    what = asked.partition("=")[0]
+    what, small = asked.partition("=")[0], "base_model={image_size: 32}"
     with pytest.raises(
         PluginError, match=rf"{what} needs whole counts .* 32 x 32 px .* 64 x 64 px: .*resampling=events"
     ):
-        check_inputs(smoke(asked, AREA))
-    check_inputs(smoke(asked, EVENTS))
+        check_inputs(smoke(asked, AREA, small))
+    check_inputs(smoke(asked, EVENTS, small))
     check_inputs(smoke(asked))
     check_inputs(smoke(asked, AREA.replace("32", "64")))
-    check_inputs(smoke(AREA))
+    check_inputs(smoke(AREA, small))
 
 
 def test_frames_without_whole_counts_are_refused_before_they_are_sampled():

@@ -18,7 +18,7 @@ from ctlev_core.provenance.raw_file_digests import digest_raw_files, read_rememb
 from data_contracts.config import Windows
 from data_contracts.errors import DataError
 from data_contracts.run_record import read_run_record
-from flows import verify
+from flows import cli
 from tasks import file_locks
 from tasks.stage import in_one_run, planning
 from tasks.store import Store
@@ -31,7 +31,9 @@ def _home(home):
 
 def verified(monkeypatch, home):
     monkeypatch.setattr(sys, "argv", ["verify", "--home", str(home)])
-    return verify.main()
+    with pytest.raises(SystemExit) as end:
+        cli.script("verify")
+    return end.value.code
 
 
 def plan():
