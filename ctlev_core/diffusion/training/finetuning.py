@@ -40,7 +40,7 @@ from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 from ctlev_core.pictures.image_moves import move_image
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
-from data_contracts.image_rows import ImageRows, Images
+from data_contracts.image_rows import Images, as_image_rows
 from data_contracts.labels import Conditions
 
 Tune = Literal["unet", "controlnet", "both"]
@@ -266,8 +266,6 @@ def _identity(
     made_by = conditions.made_by.model_dump(mode="json") if conditions.made_by and options.rot90_probability else None
     digest = hashlib.sha256(json.dumps([material, tune, seed, conditions.prompts, named, made_by]).encode())
     for array in (frames, conditions.images):
-        if isinstance(array, ImageRows):
-            digest.update(array.digest().encode())
-        elif array is not None:
-            digest.update(np.ascontiguousarray(array).data)
+        if array is not None:
+            digest.update(as_image_rows(array).digest().encode())
     return digest.hexdigest()

@@ -163,8 +163,10 @@ def _latents_on_disk(
 ) -> tuple[Images, Images | None]:
     """The latents of all frames and turns, of which each process writes those of a share of the frames."""
     folder.mkdir(parents=True, exist_ok=True)
-    cuts = np.linspace(0, len(frames), min(distributed.count, len(frames)) + 1).round().astype(int).tolist()
-    shares = [range(start, stop) for start, stop in itertools.pairwise(cuts)]
+    # Whole batches: however many processes there are, latents are the same to the last bit.
+    batches = -(-len(frames) // ENCODE_BATCH)
+    cuts = np.linspace(0, batches, min(distributed.count, batches) + 1).round().astype(int) * ENCODE_BATCH
+    shares = [range(start, stop) for start, stop in itertools.pairwise(np.minimum(cuts, len(frames)).tolist())]
     name = f"latents_{_latents_digest(base_model, frames, num_turns, len(shares))}"
     paths = [{kind: folder / f"{name}_{kind}_{share}.npy" for kind in ("mean", "std")} for share in range(len(shares))]
     if distributed.rank < len(shares) and not paths[distributed.rank]["mean"].is_file():

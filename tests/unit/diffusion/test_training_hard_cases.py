@@ -238,6 +238,7 @@ def test_latents_on_disk_are_those_in_memory_and_are_encoded_once(tmp_path, monk
 
 def test_each_process_encodes_its_share_of_the_frames(tmp_path, monkeypatch):
     """Process 1 of 3 finds the shares of the others, which have been here before; together they are the whole."""
+    monkeypatch.setattr(latent_cache, "ENCODE_BATCH", 1)
     base_model, taken = with_deviations(make_base_model(), monkeypatch), []
     whole = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
     encode = base_model.vae.encode
