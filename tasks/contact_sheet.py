@@ -16,7 +16,7 @@ from tasks.stage import Output, stage
 PAGE = "contact_sheet.html"
 
 
-@stage(version=1, schema=tables.REPORT)
+@stage(version=2, schema=tables.REPORT)
 def contact_sheet(
     out: Output, frames: Manifest, frame_conditions: Manifest, sample_conditions: Manifest, *, title: str, notice: str
 ) -> pa.Table:

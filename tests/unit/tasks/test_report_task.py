@@ -38,7 +38,7 @@ def test_the_page_says_first_what_data_it_is_then_the_verdict_then_what_was_done
     places = [page.index(text) for text in texts]
     places += [page.index(f"{text}</h2>") for text in ("Does synthetic data help?", "where does it help?")]
     places += [page.index(f"{text}</h2>") for text in ("Asked for, and sampled", "by the amount of synthetic data")]
-    folded = ("Where the time went", "The paper&#x27;s own numbers, on other data")
+    folded = ("Where the time went", "The paper&#39;s own numbers, on other data")
     places += [page.index(f"{text}</h2></summary>") for text in folded]
     assert places == sorted(places)
     for expected in ("recorded+oracle", "synthetic ones give 50% [", "15.00 on them with shuffled labels"):
