@@ -104,7 +104,39 @@ class Links:
     pages: Sequence[tuple[str, str]]
 
 
-Section = Text | Table | ImageGrid | Curves | Animation | Links
+@dataclass(frozen=True)
+class Box:
+    """A box of a diagram: place of its upper left corner, heading, a line below it, and where it leads."""
+
+    x: float
+    y: float
+    heading: str
+    line: str
+    href: str
+
+
+@dataclass(frozen=True)
+class Diagram:
+    """Boxes with arrows between them.
+
+    Attributes:
+        title: heading of the section.
+        boxes: what is drawn.
+        arrows: as paths of SVG.
+        size: (width, height) of the drawing.
+        box_size: of a box.
+        caption: what the reader sees.
+    """
+
+    title: str
+    boxes: Sequence[Box]
+    arrows: Sequence[str]
+    size: tuple[float, float]
+    box_size: tuple[float, float]
+    caption: str = ""
+
+
+Section = Text | Table | ImageGrid | Curves | Animation | Links | Diagram
 
 
 @dataclass(frozen=True)
@@ -147,6 +179,36 @@ class Step:
     follows: bool = False
 
 
+@dataclass(frozen=True)
+class Answer:
+    """Whether it helped, as a word and an interval on a line.
+
+    Attributes:
+        word: `Helped`, `Did harm`, `Undecided` ...
+        tone: `good`, `bad` or `open`.
+        text: the difference with its interval, and unit, as the score counts.
+        value: the same with better being positive.
+        low: lower end of the interval, likewise; NaN = unknown.
+        high: upper end.
+    """
+
+    word: str
+    tone: str
+    text: str
+    value: float
+    low: float
+    high: float
+
+    def line(self) -> dict[str, float] | None:
+        """Places from 0 (worse) to 100 (better) of zero, value and ends; None where the interval is not known."""
+        known = np.array([self.low, self.value, self.high])
+        reach = float(np.abs(known).max()) * 1.15
+        if not np.isfinite(reach) or not reach:
+            return None
+        low, value, high = (round(50 + 50 * number / reach, 1) for number in known.tolist())
+        return {"low": low, "value": value, "high": high}
+
+
 def render_report(
     *,
     title: str,
@@ -156,6 +218,9 @@ def render_report(
     overview: Table | None = None,
     footer: str = "",
     steps: Sequence[Step] = (),
+    answer: Answer | None = None,
+    plain: Sequence[tuple[str, str]] = (),
+    colours: Colours = (),
 ) -> str:
     """The page as text, to be written as UTF-8.
 
@@ -167,6 +232,9 @@ def render_report(
         overview: the numbers behind the verdict, right below it.
         footer: where the numbers come from.
         steps: what was done, in pictures; below the verdict.
+        answer: the verdict as a word and a drawn interval.
+        plain: what was done and what it means, (heading, paragraph) each, for a reader who knows nothing of events.
+        colours: legend of the pictures of `steps`.
     Returns:
         One HTML document. Equal arguments give equal text.
     Raises:
@@ -180,8 +248,11 @@ def render_report(
             chapters[-1] = Chapter("", [*chapters[-1].sections, section])
         else:
             chapters.append(Chapter("", [section]))
-    given = {"title": title, "lead": lead, "verdict": verdict, "overview": overview, "footer": footer, "steps": steps}
-    return _templates().get_template("page.html.j2").render(given, chapters=chapters, facts=Markup(FACTS))
+    given = {
+        "title": title, "lead": lead, "verdict": verdict, "overview": overview, "footer": footer, "steps": steps,
+        "answer": answer, "plain": plain, "colours": colours, "chapters": chapters, "facts": Markup(FACTS),
+    }  # fmt: skip
+    return _templates().get_template("page.html.j2").render(given)
 
 
 @functools.cache

@@ -39,6 +39,8 @@ class Table:
         caption: what the reader must know to read it.
         footnotes: one line each, below.
         bold: (row, column) of cells to emphasise.
+        folded: closed until the reader opens it.
+        anchor: what links in the page lead to it by; empty = none do.
     """
 
     title: str
@@ -47,6 +49,8 @@ class Table:
     caption: str = ""
     footnotes: Sequence[str] = ()
     bold: Collection[tuple[int, int]] = ()
+    folded: bool = False
+    anchor: str = ""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+from ctlev_core.report.page.display_names import Name, metric_heading, metric_name, subject_name
 from ctlev_core.report.page.html import Folded, Section, Text
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import PairedScores, cell_text, score_tables, trained_rows
@@ -15,7 +16,7 @@ from ctlev_core.report.sections.verdict import made_better
 from ctlev_core.report.studies import paper_numbers
 from ctlev_core.report.studies.speed_summary import SpeedSummary
 from ctlev_core.report.studies.summary import Figure, Summary
-from ctlev_core.scoring.score_info import find_score, lower_is_better
+from ctlev_core.scoring.score_info import find_score
 from ctlev_core.statistics.paired_differences import Difference
 from data_contracts.training_sets import RECORDED, SYNTHETIC, with_recorded
 
@@ -58,7 +59,8 @@ class Part:
     @property
     def heading(self) -> str:
         """How the sections about it begin."""
-        return f"{self.question} (`{self.name}`)"
+        name = self.name.replace("_", " ")
+        return f"{self.question} ({name})" if name != self.question else name
 
     @property
     def question(self) -> str:
@@ -86,7 +88,7 @@ class Part:
         for start, question, published in _QUESTIONS:
             if any(metric.startswith(start) for metric in metrics):
                 return question, published
-        return self.name, None
+        return self.name.replace("_", " "), None
 
 
 def study_words(parts: Sequence[Part]) -> str:
@@ -110,8 +112,7 @@ def study_overview(parts: Sequence[Part]) -> Table:
             if made_better(difference, part.metric):
                 bold.add((len(body), 4))
         told = "" if difference is None else difference.text()
-        direction = "↓" if lower_is_better(part.metric) else "↑"
-        body.append([part.heading, f"{part.metric} {direction}", *map(cell_text, by_set.values()), told])
+        body.append([part.heading, metric_heading(part.metric), *map(cell_text, by_set.values()), told])
         if find_score(part.metric).meaning:
             explained[part.metric] = find_score(part.metric).meaning
     caption = (
@@ -120,7 +121,7 @@ def study_overview(parts: Sequence[Part]) -> Table:
         "whose interval excludes 0, and scores that are better for it."
     )
     columns = ["experiment", "score", "recorded", "synthetic", "both", "both minus recorded"]
-    notes = [f"`{metric}`: {words}" for metric, words in explained.items()]
+    notes = [f"{metric_name(metric)}: {words}" for metric, words in explained.items()]
     return Table("Do synthetic frames help?", columns, body, caption=caption, bold=bold, footnotes=notes)
 
 
@@ -143,13 +144,8 @@ def study_tables(parts: Sequence[Part]) -> list[list[Table]]:
     found = []
     for part in parts:
         tables = score_tables(part.rows, part.training_sets, part.paired) if part.compares else []
-        found.append([replace(table, title=f"{part.heading}: {table.title}") for table in tables if _answers(table)])
+        found.append([replace(table, title=f"{part.heading}: {table.title}") for table in tables])
     return [*found, [distances_table(parts)]]
-
-
-def _answers(table: Table) -> bool:
-    """Is it about models tested on recorded frames? What else was scored is on the experiment's own page."""
-    return table.columns[0] in ("trained on", "classes")
 
 
 def study_sections(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> list[Section | Folded]:
@@ -206,7 +202,7 @@ def distances_table(parts: Sequence[Part]) -> Table:
     distances = [_first_distance(part.rows) for part in parts]
     training_sets = list(dict.fromkeys(row["subject"] for rows in distances for row in rows))
     body: list[list[Cell]] = [
-        [training_set, *(cell_text([row for row in rows if row["subject"] == training_set]) for rows in distances)]
+        [subject_name(training_set), *(cell_text([row for row in rows if row["subject"] == training_set]) for rows in distances)]
         for training_set in training_sets
     ]
     caption = (
@@ -215,4 +211,4 @@ def distances_table(parts: Sequence[Part]) -> Table:
         "for each experiment, so that only numbers below one another compare. Lower is nearer; the row of held-out "
         "recorded frames is the floor. In brackets 95 %."
     )
-    return Table("Quality of the frames", ["frames", *(f"{part.name} ↓" for part in parts)], body, caption=caption)
+    return Table("Quality of the frames", ["frames", *(Name(f"{part.heading} ↓", part.name) for part in parts)], body, caption=caption)
