@@ -148,8 +148,9 @@ def _bodies() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _in_a_flow(home: Path, run: Callable[[], Any]) -> Any:
     """What a script does around its flow."""
     from flows import local_server
-    from flows.settings import flow  # before Prefect, which reads its settings when it is imported
+    from flows.settings import configure, flow
 
+    configure(home)
     local_server.start(home)
     with local_server.connected():
         return flow(name="benchmark")(run)()

@@ -17,6 +17,7 @@ from ctlev_core.body.motion.clip import MotionClip
 from ctlev_core.scoring.score_info import ScoreInfo
 from data_contracts.config import Frozen
 from data_contracts.events import Events, SensorSize
+from data_contracts.image_rows import Images
 from data_contracts.labels import BodyMotions, Conditions, History, ImageTrack, Labels, Recording
 
 
@@ -223,7 +224,7 @@ class Generator(Protocol):
         ...
 
     def train(
-        self, frames: np.ndarray, conditions: Conditions, options: Any, *, seed: int, out: Path, work: Path
+        self, frames: Images, conditions: Conditions, options: Any, *, seed: int, out: Path, work: Path
     ) -> History:
         """Write a checkpoint folder to `out`; keep resumable state in `work`."""
         ...
@@ -282,7 +283,7 @@ class Downstream(Protocol):
 
     def train(
         self,
-        frames: np.ndarray,
+        frames: Images,
         labels: Labels,
         options: Any,
         *,
@@ -299,7 +300,7 @@ class Downstream(Protocol):
         """
         ...
 
-    def predict(self, model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+    def predict(self, model: Path, frames: Images) -> Mapping[str, np.ndarray]:
         """Named predictions, one row a frame."""
         ...
 
@@ -321,7 +322,7 @@ class DownstreamOfSequences(Downstream, Protocol):
 
     def train_sequences(
         self,
-        frames: np.ndarray,
+        frames: Images,
         labels: Labels,
         options: Any,
         *,
@@ -338,7 +339,7 @@ class DownstreamOfSequences(Downstream, Protocol):
         """
         ...
 
-    def predict_sequences(self, model: Path, frames: np.ndarray, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+    def predict_sequences(self, model: Path, frames: Images, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
         """As `predict`, with the recording of each row; still one row a frame."""
         ...
 
@@ -346,9 +347,7 @@ class DownstreamOfSequences(Downstream, Protocol):
 class DownstreamOfRecordings(Downstream, Protocol):
     """A model that learns from single frames, and whose answers about the frames of a recording may be joined."""
 
-    def predict_recordings(
-        self, model: Path, frames: np.ndarray, recordings: Sequence[str]
-    ) -> Mapping[str, np.ndarray]:
+    def predict_recordings(self, model: Path, frames: Images, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
         """As `predict`, with the recording of each row; still one row a frame."""
         ...
 
@@ -364,7 +363,7 @@ class DownstreamWithFiles(Downstream, Protocol):
 class FeatureExtractor(Downstream, Protocol):
     """A model in whose features images are compared."""
 
-    def features(self, model: Path, frames: np.ndarray) -> np.ndarray:
+    def features(self, model: Path, frames: Images) -> np.ndarray:
         """Features [N, D] float32 of frames [N, H, W, 3] uint8."""
         ...
 

@@ -9,6 +9,7 @@ import importlib
 import importlib.util
 import pkgutil
 import re
+import reprlib
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from data_contracts.config import Choice
-from data_contracts.errors import DataError
+from data_contracts.errors import MAX_MESSAGE, DataError, shortened
 from data_contracts.renamed_options import RENAMED_VALUES, name_hint
 
 KINDS = ("datasets", "formats", "motions", "encodings", "conditions", "generators", "downstream", "metrics")
@@ -28,6 +29,9 @@ KINDS = ("datasets", "formats", "motions", "encodings", "conditions", "generator
 
 class PluginError(ValueError):
     """An unknown plug-in or a wrong option."""
+
+    def __init__(self, message: str = "", limit: int = MAX_MESSAGE) -> None:
+        super().__init__(shortened(message, limit))
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,7 @@ def load(kind: str, name: str) -> ModuleType:
 def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: str) -> Any:
     """Validate `values` against an options model; every problem becomes one line of one error."""
     try:
-        return model(**values)
+        return model.model_validate(dict(values))
     except ValidationError as error:
         lines = []
         for problem in error.errors():
@@ -121,10 +125,18 @@ def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: s
                 hint = name_hint(str(problem["loc"][-1]), known)
                 lines.append(f"unknown option {option!r}{hint}; known: {', '.join(known)}")
             elif problem["type"] == "path_type":
-                lines.append(f"option {option!r} must be a path, got {problem['input']!r}; --set ...{option}=PATH")
+                lines.append(f"option {option!r} must be a path, got {_show(problem['input'])}; --set ...{option}=PATH")
             else:
-                lines.append(f"option {option!r}: {problem['msg'].lower()}, got {problem['input']!r}{_hint(problem)}")
+                lines.append(
+                    f"option {option!r}: {problem['msg'].lower()[:300]}, got {_show(problem['input'])}{_hint(problem)}"
+                )
         raise PluginError(f"{where}: " + "; ".join(lines)) from None
+
+
+_repr = reprlib.Repr()
+_repr.maxstring = _repr.maxother = 200
+_show = _repr.repr
+"""As `repr`, of as much of a value as a message has room for."""
 
 
 def _hint(problem: Any) -> str:

@@ -6,6 +6,7 @@ import ctypes
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
@@ -16,6 +17,16 @@ def die_with_parent() -> None:
     """Ask the Linux kernel to end the calling process when its parent ends, even by SIGKILL; a no-op elsewhere."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG = 1
+
+
+def module_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """An environment in which `python -m` runs a module of ours, though the working directory has one of that name.
+
+    Else Python looks there first, and a `tasks.py` of the user's would run in its place.
+    """
+    root = str(Path(__file__).resolve().parents[1])
+    path = os.pathsep.join(filter(None, [root, environment.get("PYTHONPATH", "")]))
+    return {**environment, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
 
 
 def num_cores(limit: Path = CPU_LIMIT) -> int:

@@ -14,6 +14,9 @@ from data_contracts.errors import DataError
 SensorSize = tuple[int, int]
 """(width, height) in pixels."""
 
+MAX_SENSOR_PIXELS = 2**24
+"""The largest event cameras have 2^20. A corrupt file that states another size asks for gigabytes a window."""
+
 POLARITY_CHANNELS = ("positive", "negative")
 """Channel order of every array with a polarity axis: channel 0 = ON (p = 1), channel 1 = OFF (p = 0)."""
 
@@ -49,6 +52,18 @@ class Events:
         return Events(self.t[start:stop], self.x[start:stop], self.y[start:stop], self.p[start:stop], self.sensor_size)
 
 
+def check_sensor_size(size: SensorSize, where: str) -> SensorSize:
+    """The size; raises `DataError` where no sensor has it."""
+    width, height = size
+    if width < 1 or height < 1:
+        raise DataError(f"{where}: sensor_size must be at least 1 x 1 px, got {width} x {height}")
+    if width * height > MAX_SENSOR_PIXELS:
+        raise DataError(
+            f"{where}: sensor_size must be of {MAX_SENSOR_PIXELS} px at most, got {width} x {height} = {width * height}"
+        )
+    return size
+
+
 EVENT_DTYPES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 
 
@@ -62,9 +77,7 @@ def check_events(events: Events, where: str) -> Events:
     Returns:
         The same object, so that a reader can end in `return check_events(...)`.
     """
-    width, height = events.sensor_size
-    if width < 1 or height < 1:
-        raise DataError(f"{where}: sensor_size must be at least 1 x 1 px, got {width} x {height}")
+    width, height = check_sensor_size(events.sensor_size, where)
     for name, dtype in EVENT_DTYPES.items():
         column = getattr(events, name)
         if column.ndim != 1 or column.dtype != dtype:

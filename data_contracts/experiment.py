@@ -90,6 +90,12 @@ class Experiment(Frozen):
         "labelled", description="bodies to sample from as their own camera sees them, or from new, random sides"
     )
     windows: Windows = Windows()
+    num_recorded: int | None = Field(
+        None,
+        ge=1,
+        description="training frames that generator and downstream models learn from, spread evenly over subjects and "
+        "classes; null = all",
+    )
     encoding: EncodingChoice
     condition: ConditionChoice
     base_model: dict[str, Any] | None = Field(

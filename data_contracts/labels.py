@@ -11,6 +11,7 @@ import numpy as np
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
+from data_contracts.image_rows import Images
 
 SPLITS = ("train", "validation", "test", "condition")
 """`condition`: labels without events, used only as conditions to sample from. Fixed at ingest."""
@@ -248,7 +249,7 @@ class Conditions:
     """
 
     prompts: tuple[str, ...]
-    images: np.ndarray | None = None
+    images: Images | None = None
     motions: BodyMotions | None = None
     class_names: tuple[str, ...] | None = None
     made_by: ConditionChoice | None = None

@@ -1,18 +1,22 @@
 """Manifests on disk: one Parquet table per artefact, with the digests of all files beside it.
 
 An artefact is a folder. `manifest.parquet` holds its rows and, in the Parquet metadata, size and SHA-256 of every other
-file of the folder, so the digest of the manifest vouches for the whole artefact. Arrays lie beside it as .npy files and
-are memory-mapped; row i of an array belongs to row i of the table.
+file of the folder, so the digest of the manifest vouches for the whole artefact. More than some thousands of files are
+listed in a table of their own, `file_list.parquet`, whose digest is in the metadata. Arrays lie beside it as .npy files
+and are memory-mapped; row i of an array belongs to row i of the table.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
-from collections.abc import Iterable
+import stat
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,11 +24,20 @@ import pyarrow.parquet as pq
 
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.errors import DataError, TableVersionError
+from data_contracts.file_lists import (
+    FILE_LIST,
+    MAX_LISTED_FILES,
+    file_digest,
+    read_file_list,
+    read_table,
+    write_file_list,
+)
+from data_contracts.image_rows import ImageRows
 from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, History, Labels
+from data_contracts.run_record import RUN_FILE, read_run_record
 from data_contracts.tables import TABLES, TableSchema, check_table
 
 MANIFEST_FILE = "manifest.parquet"
-RUN_FILE = "run.json"
 _FILES_KEY = b"ctlev.files"
 _SCHEMA_KEY = b"ctlev.schema"
 _MOTION_PREFIX = "motion_"
@@ -47,12 +60,6 @@ class ManifestRef(Frozen):
     rows: int = -1
 
 
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file's content, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def artefact_files(folder: Path) -> list[Path]:
     """Every file of an artefact except the manifest and the provenance record, sorted."""
     special = {folder / MANIFEST_FILE, folder / RUN_FILE}
@@ -69,9 +76,16 @@ def write_manifest(folder: Path, table: pa.Table, schema: TableSchema) -> Manife
         DataError: the table breaks its schema.
     """
     table = check_table(table, schema, str(folder))
+    listed = artefact_files(folder)
+    if folder / FILE_LIST in listed:
+        raise DataError(f"{folder}: no stage may write a file {FILE_LIST}, which lists the others")
+    if len(listed) > MAX_LISTED_FILES:
+        # Parquet's readers refuse metadata above 100 MB, which 700,000 files are.
+        write_file_list(folder, listed)
+        listed = [folder / FILE_LIST]
     files = {
         path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": file_digest(path)}
-        for path in artefact_files(folder)
+        for path in listed
     }
     metadata = {
         _SCHEMA_KEY: json.dumps({"name": schema.name, "version": schema.version}).encode(),
@@ -89,7 +103,7 @@ class Manifest:
     ref: ManifestRef
     schema: TableSchema
     table: pa.Table
-    files: dict[str, dict]
+    files: Mapping[str, Mapping[str, Any]]
 
     def __len__(self) -> int:
         return self.table.num_rows
@@ -97,17 +111,22 @@ class Manifest:
     def path(self, name: str) -> Path:
         """A file of the artefact that the manifest lists."""
         if name not in self.files:
-            raise DataError(f"{self.ref.path}: holds no file {name!r}; it has {sorted(self.files) or 'none'}")
+            known = ", ".join(sorted(itertools.islice(self.files, 20))) or "none"
+            raise DataError(f"{self.ref.path}: holds no file {name!r}; it has {known[:200]}")
         return self.ref.path / name
 
     def array(self, name: str) -> np.ndarray:
         """The array `<name>.npy`, memory-mapped read-only."""
         return np.load(self.path(f"{name}.npy"), mmap_mode="r", allow_pickle=False)
 
+    def images(self, rows: np.ndarray, name: str = "frames") -> ImageRows:
+        """The given rows of the array `<name>.npy`, which stay on disk until they are indexed."""
+        return image_rows([(self, rows)], name)
+
     def attached(self, schema: TableSchema) -> pa.Table:
         """The table `<schema.name>.parquet` that lies beside the manifest, checked."""
         path = self.path(f"{schema.name}.parquet")
-        return check_table(_read_table(path).replace_schema_metadata(None), schema, str(path))
+        return check_table(read_table(path, path).replace_schema_metadata(None), schema, str(path))
 
     def column(self, name: str) -> list:
         """A column as Python values."""
@@ -126,6 +145,12 @@ class Manifest:
         return labels_of(self.table)
 
 
+def image_rows(parts: Sequence[tuple[Manifest, np.ndarray]], name: str = "frames") -> ImageRows:
+    """The given rows of the array `<name>.npy` of several artefacts, one after another, left on disk."""
+    arrays = [(manifest.array(name), rows) for manifest, rows in parts]
+    return ImageRows.of(arrays, " ".join([name, *(manifest.ref.digest for manifest, _ in parts)]))
+
+
 def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
     """Open an artefact and verify it.
 
@@ -136,41 +161,48 @@ def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
     Raises:
         DataError: a file is missing or has changed.
         TableVersionError: the table has another version than the one this code reads.
+        OSError: a file cannot be read now, which says nothing about its content.
     """
     path = ref.path / MANIFEST_FILE
-    if not path.is_file():
-        raise DataError(f"{ref.path}: manifest is missing; run the flow again to make it anew")
-    digest = file_digest(path)
+    try:
+        content = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        raise DataError(f"{ref.path}: manifest is missing; run the flow again to make it anew") from None
+    digest = hashlib.sha256(content).hexdigest()
     if ref.digest and digest != ref.digest:
         raise DataError(f"{path}: content has changed; expected digest {ref.digest[:12]}, got {digest[:12]}")
-    table = _read_table(path)
+    table = read_table(pa.BufferReader(content), path)
     metadata = table.schema.metadata or {}
     if _SCHEMA_KEY not in metadata or _FILES_KEY not in metadata:
         raise DataError(f"{path}: is not a ctlev manifest; its metadata names no schema")
-    declared = json.loads(metadata[_SCHEMA_KEY])
-    schema = TABLES.get(declared["name"])
+    try:
+        declared, files = json.loads(metadata[_SCHEMA_KEY]), json.loads(metadata[_FILES_KEY])
+        name, version = declared["name"], declared["version"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: is not a ctlev manifest; its metadata cannot be read: {error!r}") from error
+    schema = TABLES.get(name)
     if schema is None:
-        raise DataError(f"{path}: table {declared['name']!r}; this code reads {sorted(TABLES)}")
-    if schema.version != declared["version"]:
-        found = f"table {declared['name']!r} version {declared['version']}"
-        raise TableVersionError(f"{path}: {found}; this code reads version {schema.version}")
-    files = json.loads(metadata[_FILES_KEY])
+        raise DataError(f"{path}: table {name!r}; this code reads {sorted(TABLES)}")
+    if schema.version != version:
+        raise TableVersionError(f"{path}: table {name!r} version {version}; this code reads version {schema.version}")
     for name, expected in files.items():
-        _check_file(ref.path / name, expected, full)
+        _check_file(ref.path / name, expected, full or name == FILE_LIST)
+    if FILE_LIST in files:
+        files = read_file_list(ref.path / FILE_LIST)
+        for name, expected in files.items():
+            _check_file(ref.path / name, expected, full)
     checked = check_table(table.replace_schema_metadata(None), schema, str(path))
     return Manifest(ManifestRef(key=ref.key, path=ref.path, digest=digest, rows=len(checked)), schema, checked, files)
 
 
-def _read_table(path: Path) -> pa.Table:
-    """One Parquet file. `pq.read_table` would load pyarrow's datasets for it, and those pandas, a third of a second."""
-    with pq.ParquetFile(path) as file:
-        return file.read()
-
-
-def _check_file(path: Path, expected: dict, full: bool) -> None:
-    if not path.is_file():
-        raise DataError(f"{path}: file is missing")
-    size = path.stat().st_size
+def _check_file(path: Path, expected: Mapping[str, Any], full: bool) -> None:
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise DataError(f"{path}: file is missing") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise DataError(f"{path}: is not a file")
+    size = status.st_size
     if size != expected["bytes"]:
         raise DataError(f"{path}: expected {expected['bytes']} bytes, got {size}")
     if full and file_digest(path) != expected["sha256"]:
@@ -281,8 +313,8 @@ def conditions_of(manifest: Manifest) -> Conditions:
 
 def _condition_choice(manifest: Manifest) -> ConditionChoice | None:
     """The plug-in that made a manifest of conditions, if a stage did."""
-    record = manifest.ref.path / RUN_FILE
-    chosen = json.loads(record.read_text())["arguments"].get("condition") if record.exists() else None
+    folder = manifest.ref.path
+    chosen = read_run_record(folder).arguments.get("condition") if (folder / RUN_FILE).exists() else None
     if chosen is None:
         return None
     return ConditionChoice(name=chosen["plugin"].rpartition("/")[2], options=chosen["options"])
@@ -290,7 +322,7 @@ def _condition_choice(manifest: Manifest) -> ConditionChoice | None:
 
 def condition_arrays(conditions: Conditions) -> dict[str, np.ndarray]:
     """The arrays to attach to a manifest of conditions, by name, from which `conditions_of` makes them again."""
-    arrays = {} if conditions.images is None else {"images": conditions.images}
+    arrays = {} if conditions.images is None else {"images": np.asarray(conditions.images)}
     if conditions.motions is not None:
         arrays |= {f"{_MOTION_PREFIX}{name}": getattr(conditions.motions, name) for name in _MOTION_ARRAYS}
     return arrays

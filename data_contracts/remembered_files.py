@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from data_contracts.manifest import file_digest
+from data_contracts.file_lists import file_digest
 
 
 def remembered_digest(path: Path) -> str:

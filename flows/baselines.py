@@ -10,7 +10,8 @@ from ctlev_core.report.sections.rejections import count_rejections
 from data_contracts.config import Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef, read_manifest
-from flows.command_line import main
+from flows.cli import script
+from flows.command_line import Command
 from flows.prepare_dataset import (
     PreparedDataset,
     condition_asked_samples,
@@ -79,14 +80,15 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
     return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)
 
 
+COMMAND = Command(
+    baselines,
+    lambda made, _: "\n".join(
+        f"{name}: {count_rejections(read_manifest(frames.synthetic))}, in {frames.synthetic.path}"
+        for name, sets in made.items()
+        for frames in sets
+    ),
+)
+
+
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            baselines,
-            lambda made, _: "\n".join(
-                f"{name}: {count_rejections(read_manifest(frames.synthetic))}, in {frames.synthetic.path}"
-                for name, sets in made.items()
-                for frames in sets
-            ),
-        )
-    )
+    sys.exit(script("baselines"))

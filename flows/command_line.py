@@ -1,13 +1,15 @@
-"""The command line that every flow script shares: choose a preset, change options, see the plan, run."""
+"""What every command does that runs a flow: read a preset, change options, show the plan, run; `flows.cli` parses."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.processes import num_cores
-from data_contracts.errors import DataError, TrainingError
+from data_contracts.errors import DataError, TrainingError, shortened
 from data_contracts.experiment import Experiment
 from data_contracts.renamed_options import RENAMED_VALUES, name_hint
 from data_contracts.study import Study
@@ -24,15 +26,14 @@ from data_contracts.yaml_text import load_yaml
 from flows import local_server, settings
 from flows.costs import HOW_ESTIMATED, estimate_costs
 from flows.inputs import InputsMissing, check_inputs
+from flows.plan_table import print_plan_with_costs
+from flows.preset_list import PRESETS, preset_names
+from flows.run_progress import duration_text, shown
+from flows.settings import ScriptFlow
 from tasks.stage import PlannedStage, in_one_run, planning
+from tasks.store import home_folder
 
 X = TypeVar("X", bound=Experiment)
-PRESETS = Path(__file__).resolve().parent / "presets"
-
-
-def preset_names(folder: Path = PRESETS) -> list[str]:
-    """Names of the bundled presets of a folder."""
-    return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
 def load_experiment(preset: str, overrides: list[str], model: type[X] = Experiment) -> X:
@@ -90,7 +91,7 @@ def read_preset(folder: Path, preset: str, heirs: tuple[str, ...] = ()) -> dict[
     if extended is None:
         return values
     if not isinstance(extended, str) or extended in (*heirs, preset):
-        raise PluginError(f"{path}: extends must name another preset, got {extended!r}")
+        raise PluginError(f"{path}: extends must name another preset, got {shortened(repr(extended), 200)}")
     return read_preset(folder, extended, (*heirs, preset)) | values
 
 
@@ -103,7 +104,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
     """
     name, separator, text = override.partition("=")
     if not separator or not name:
-        raise PluginError(f"--set expects key=value, got {override!r}")
+        raise PluginError(f"--set expects key=value, got {shortened(repr(override), 200)}")
     *parents, last = name.split(".")
     target = values
     for parent in parents:
@@ -113,7 +114,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
     try:
         target[last] = load_yaml(text)
     except yaml.YAMLError as error:
-        raise PluginError(f"--set {name}: {text!r} is not YAML: {error}") from None
+        raise PluginError(f"--set {name[:100]}: {shortened(repr(text), 100)} is not YAML: {error}") from None
 
 
 def print_plan(rows: list[PlannedStage]) -> None:
@@ -155,57 +156,87 @@ def print_costs(asked: Any) -> None:
         print(f"  {name:{max(map(len, found))}}  {cost}")
 
 
-def main(
-    flow: Any,
-    describe: Callable[[Any, Any], str],
-    *,
-    load: Callable[[str, list[str]], Any] = load_experiment,
-    default_preset: str = "pose",
-) -> int:
-    """Run a flow as a script.
+@dataclass(frozen=True)
+class Command:
+    """What a flow's script does.
 
-    Args:
-        flow: a Prefect flow of one parameter, its options.
+    Attributes:
+        flow: of one parameter, its options.
         describe: from the flow's result and its options to the lines printed at the end.
         load: from a preset's name and overrides to the options.
-        default_preset: used without `--preset`.
+    """
+
+    flow: ScriptFlow[..., Any]
+    describe: Callable[[Any, Any], str]
+    load: Callable[[str, list[str]], Any] = load_experiment
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a person asked of a command.
+
+    Attributes:
+        preset: name of a bundled preset, or path of a .yaml file.
+        overrides: options to change, each as `key=value`.
+        dry_run: print the plan and run nothing.
+        costs: the plan has the time, memory and disk of each stage.
+    """
+
+    preset: str
+    overrides: list[str]
+    dry_run: bool = False
+    costs: bool = False
+
+
+def run_command(command: Command, asked: Asked) -> int:
+    """Run a flow as a script does; `flows.settings.configure` was called.
 
     Returns:
-        Exit status: 0 done, 2 wrong input, 130 interrupted.
+        Exit status: 0 done, 2 wrong input or the private server was lost, 130 interrupted, 143 ended by SIGTERM.
     """
-    if os.environ.get("LOCAL_RANK", "0") != "0":
-        return 0  # under `accelerate launch` one process runs the flow; training starts the others itself
-    arguments = _parse(flow, default_preset)
     started = time.perf_counter()
+    with contextlib.suppress(ValueError):  # in a thread of another program
+        signal.signal(signal.SIGTERM, _terminate)
+    flow = command.flow
     try:
-        home = Path(os.environ["CTLEV_HOME"])
+        home = home_folder()
         check_home(home)
-        if not arguments.dry_run:
+        if not asked.dry_run:
             local_server.start(home)  # first of all, so that what comes now overlaps with its start-up
-        options = load(arguments.preset, arguments.set)
+        options = command.load(asked.preset, asked.overrides)
         with planning() as rows:
             flow.fn(options)
-        if arguments.dry_run:
-            print_plan(rows)
+        if asked.dry_run:
+            (partial(print_plan_with_costs, home=home) if asked.costs else print_plan)(rows)
             print_costs(options)
             return 0
         use_cores(rows)
         all_cached = all(row.cached for row in rows)
-        with local_server.connected(), in_one_run() if all_cached else contextlib.nullcontext():
-            result = with_plan(flow, rows, f"preset {arguments.preset}, in {home}")(options)
-        described = describe(result, options)
-    except (DataError, PluginError, TrainingError, ValidationError, OSError) as error:
-        if isinstance(error, InputsMissing) and arguments.dry_run:
+        with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
+            result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
+        described = command.describe(result, options)
+    except (DataError, PluginError, TrainingError, ValidationError, OSError, local_server.ServerLostError) as error:
+        if isinstance(error, InputsMissing) and asked.dry_run:
             print_costs(error.asked)
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("interrupted; finished stages and checkpoints are kept", file=sys.stderr)
-        return 130
-    cached = sum(row.cached for row in rows)
+    except KeyboardInterrupt as error:
+        how, status = ("ended by SIGTERM", 143) if isinstance(error, _Terminated) else ("interrupted", 130)
+        print(f"{how}; finished stages and checkpoints are kept", file=sys.stderr)
+        return status
     print(described)
-    print(f"{len(rows)} stages, {cached} of them cached, in {time.perf_counter() - started:.1f} s")
+    stages = {row.key: row.cached for row in rows}
+    took = duration_text(time.perf_counter() - started)
+    print(f"{len(stages)} stages, {sum(stages.values())} of them cached, in {took}")
     return 0
+
+
+class _Terminated(KeyboardInterrupt):
+    """As Ctrl-C, asked for by SIGTERM."""
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise _Terminated
 
 
 def check_home(home: Path) -> None:
@@ -221,15 +252,3 @@ def use_cores(rows: list[PlannedStage]) -> None:
     import torch
 
     torch.set_num_threads(num_cores())
-
-
-def _parse(flow: Any, default_preset: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=(flow.__doc__ or "").strip().splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
-    )
-    parser.add_argument("--preset", default=default_preset, help="name of a bundled preset, or path of a .yaml file")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change an option; repeatable")
-    parser.add_argument("--dry-run", action="store_true", help="print the plan and run nothing")
-    parser.add_argument("--home", help="folder of all state [CTLEV_HOME or .ctlev]")
-    parser.add_argument("--verbose", action="store_true", help="show Prefect's log")
-    return parser.parse_args()

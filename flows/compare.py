@@ -8,8 +8,6 @@ report, of its folder, or of a file in it. Of one name the newest report is in `
 
 from __future__ import annotations
 
-import argparse
-import os
 import re
 import sys
 from pathlib import Path
@@ -18,7 +16,9 @@ from ctlev_core.report.page.html import render_report
 from ctlev_core.report.page.tables import Table, markdown_table
 from ctlev_core.report.studies.run_comparison import Run, compare_runs, find_run, read_run
 from data_contracts.errors import DataError
-from flows.settings import HOME, flow
+from flows.cli import script
+from flows.settings import flow
+from tasks.store import home_folder
 
 
 @flow(name="compare")
@@ -30,7 +30,7 @@ def compare(run_a: str, run_b: str, home: str | None = None) -> Path:
         run_b: of another.
         home: folder of all state; by default that of the process.
     """
-    folder = Path(home).absolute() if home else HOME
+    folder = Path(home).absolute() if home else home_folder()
     return write_comparison(*_read_runs(run_a, run_b, folder), folder)[0]
 
 
@@ -65,16 +65,10 @@ def _summary(found: list[Table]) -> str:
     return f"{len(scores.bold)} of {compared} scores differ for certain. Differences: {counts}."
 
 
-def main() -> int:
-    """Exit status: 0 done, 2 a run cannot be read."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("run_a", metavar="RUN_A", help="name, key or path of a report")
-    parser.add_argument("run_b", metavar="RUN_B", help="of another")
-    parser.add_argument("--home", help="folder of all state [CTLEV_HOME or .ctlev]")
-    arguments = parser.parse_args()
-    home = Path(os.environ["CTLEV_HOME"])
+def print_comparison(run_a: str, run_b: str, home: Path) -> int:
+    """Write the page and print its tables; exit status: 0 done, 2 a run cannot be read."""
     try:
-        path, found = write_comparison(*_read_runs(arguments.run_a, arguments.run_b, home), home)
+        path, found = write_comparison(*_read_runs(run_a, run_b, home), home)
     except (DataError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -86,4 +80,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(script("compare"))

@@ -13,9 +13,11 @@ from typing import Any
 from ctlev_core import plugins
 from data_contracts.experiment import Experiment
 
-FLOPS = 790e12
+FLOPS = {"bfloat16": 790e12, "float16": 790e12, "float32": 50e12}
+"""Operations a second by precision: what one H200 reaches at best; in float32 its tensor cores stand idle."""
 HOW_ESTIMATED = (
-    "by calculation, at 790 TFLOP/s, what one H200 reaches at best in bfloat16; expect twice as many hours or more:"
+    "by calculation, at 790 TFLOP/s in bfloat16 and 50 in float32, what one H200 reaches at best; expect twice as many "
+    "hours or more:"
 )
 PIXELS = 3
 _TERA = 1e12
@@ -74,10 +76,12 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
     samples = experiment.num_synthetic * experiment.num_generators
     return Costs(
         images_trained=images,
-        training_s=images * backward / FLOPS,
+        training_s=images * backward / FLOPS[options["precision"]],
         num_samples=samples,
         num_steps=sampled["num_inference_steps"],
-        sampling_s=samples * (evaluations * forward + _operations("decoding", width, height)) / FLOPS,
+        sampling_s=samples
+        * (evaluations * forward + _operations("decoding", width, height))
+        / FLOPS[sampled["precision"]],
         frames_bytes=samples * width * height * PIXELS,
     )
 

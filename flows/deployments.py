@@ -6,9 +6,7 @@ CTLEV_HOME, else `.ctlev` in the folder that was deployed. The flows are those o
 
 from __future__ import annotations
 
-import functools
 import inspect
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ from typing import Any
 from prefect import Flow
 from prefect.logging import get_run_logger
 
-from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
 from ctlev_core.report.page.report_files import publish_report
 from flows import baselines as of_baselines
 from flows import compare as of_compare
@@ -30,8 +27,8 @@ from flows import regenerate as of_regenerate
 from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
-from flows.command_line import PRESETS, check_home, load_experiment, load_preset, publish_plan, use_cores
-from flows.settings import HOME, flow
+from flows.command_line import check_home, load_experiment, publish_plan, use_cores
+from flows.settings import ScriptFlow, configure, flow
 from flows.studies import load_study
 from tasks.chain_report import publish_chain_report
 from tasks.contact_sheet import publish_contact_sheet
@@ -49,7 +46,7 @@ Args:
 
 
 def _deployable(
-    script_flow: Flow[..., Any],
+    script_flow: ScriptFlow[..., Any],
     *,
     default_preset: str = "pose",
     load: Callable[[str, list[str]], Any] = load_experiment,
@@ -65,10 +62,9 @@ def _deployable(
     """
 
     def run(preset: str = default_preset, overrides: tuple[str, ...] = (), home: str | None = None) -> Any:
-        folder = Path(home).absolute() if home else HOME
+        folder = configure(Path(home) if home else None)  # this process runs this one flow, and stages look there
         folder.mkdir(parents=True, exist_ok=True)
         check_home(folder)
-        os.environ["CTLEV_HOME"] = str(folder)  # this process runs this one flow, and stages look there
         options = load(preset, list(overrides))
         with planning() as rows:
             script_flow.fn(options)
@@ -81,7 +77,7 @@ def _deployable(
 
     run.__name__ = script_flow.fn.__name__
     run.__doc__ = (inspect.getdoc(script_flow.fn) or "") + _ARGUMENTS
-    return flow(name=script_flow.name)(run)
+    return flow(name=script_flow.name)(run).of_prefect
 
 
 full_experiment = _deployable(
@@ -96,7 +92,7 @@ synthesize = _deployable(of_synthesize.synthesize, load=of_synthesize.load_synth
 regenerate = _deployable(of_regenerate.regenerate, load=of_regenerate.load_regeneration)
 baselines = _deployable(of_baselines.baselines)
 evaluate = _deployable(of_evaluate.evaluate)
-compare = of_compare.compare
+compare = of_compare.compare.of_prefect
 export_events = _deployable(of_export_events.export_streams, publish=publish_events)
 speed_vs_error = _deployable(
     of_speed_vs_error.speed_vs_error, load=of_speed_vs_error.load_speed_vs_error, publish=publish_speed_report
@@ -107,5 +103,5 @@ realism_chain = _deployable(
 pretrain = _deployable(
     of_pretrain.pretrain,
     default_preset="small",
-    load=functools.partial(load_preset, PretrainingOptions, PRESETS / "pretraining"),
+    load=of_pretrain.load_pretraining,
 )

@@ -19,7 +19,8 @@ from data_contracts.training_sets import (
     TrainingSource,
 )
 from flows.baselines import BaselineFrames, baselines
-from flows.command_line import main
+from flows.cli import script
+from flows.command_line import Command
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from flows.synthesize import synthesize
@@ -161,5 +162,8 @@ def _distances(
     return extractor, scores
 
 
+COMMAND = Command(evaluate, lambda evaluation, _: "\n".join(f"scores: {ref.path}" for ref in evaluation.scores))
+
+
 if __name__ == "__main__":
-    sys.exit(main(evaluate, lambda evaluation, _: "\n".join(f"scores: {ref.path}" for ref in evaluation.scores)))
+    sys.exit(script("evaluate"))

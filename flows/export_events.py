@@ -7,13 +7,15 @@ import sys
 from data_contracts.event_export import EventExport
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
-from flows.command_line import main
+from flows.cli import script
+from flows.command_line import Command
 from flows.inputs import check_whole_counts
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
-from flows.settings import HOME, flow
+from flows.settings import flow
 from flows.synthesize import synthesize
 from tasks.export_events import export_events, publish_events
 from tasks.stage import call_flow
+from tasks.store import home_folder
 
 
 @flow(name="export-events")
@@ -36,5 +38,8 @@ def export_streams(
     )
 
 
+COMMAND = Command(export_streams, lambda made, experiment: publish_events(made, home_folder(), experiment.name))
+
+
 if __name__ == "__main__":
-    sys.exit(main(export_streams, lambda made, experiment: publish_events(made, HOME, experiment.name)))
+    sys.exit(script("export-events"))

@@ -10,16 +10,17 @@ from collections.abc import Callable
 from functools import partial
 
 from ctlev_core import plugins
-from ctlev_core.report.page.report_files import publish_report
+from ctlev_core.report.page.report_files import publish_report, read_verdict
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from data_contracts.study import Study
 from flows.baselines import baselines
-from flows.command_line import main
+from flows.cli import script
+from flows.command_line import Command
 from flows.evaluate import evaluate
 from flows.export_events import export_streams
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
-from flows.settings import HOME, flow
+from flows.settings import flow
 from flows.speed_vs_error import speed_vs_error, speed_vs_error_of
 from flows.studies import load_study
 from flows.synthesize import synthesize
@@ -30,6 +31,7 @@ from tasks.nearest_seen import nearest_seen
 from tasks.realism import realism
 from tasks.report import report
 from tasks.stage import call_flow, call_together
+from tasks.store import home_folder
 from tasks.study_report import study_report
 
 
@@ -133,12 +135,12 @@ def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -
     return checkpoint, call_flow(synthesize, experiment, dataset, checkpoint, number)
 
 
+def _describe(made: ManifestRef, name: str) -> str:
+    return "\n".join(filter(None, [read_verdict(made.path), publish_report(made, home_folder(), name)]))
+
+
+COMMAND = Command(full_experiment, lambda made, asked: _describe(made, asked.name), load=load_study)
+
+
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            full_experiment,
-            lambda made, asked: publish_report(made, HOME, asked.name),
-            load=load_study,
-            default_preset="demo",
-        )
-    )
+    sys.exit(script("run"))

@@ -24,7 +24,9 @@ class InputsMissing(PluginError):
     def __init__(self, problems: list[str], asked: Experiment | Study) -> None:
         self.asked = asked
         listed = "".join("\n  - " + problem.replace("\n", "\n    ") for problem in problems)
-        super().__init__(problems[0] if len(problems) == 1 else f"{len(problems)} inputs are missing or wrong:{listed}")
+        # Each is short; of a study there may be many, and all are to be seen at once.
+        all_of_them = problems[0] if len(problems) == 1 else f"{len(problems)} inputs are missing or wrong:{listed}"
+        super().__init__(all_of_them, limit=len(all_of_them))
 
 
 def check_inputs(asked: Experiment | Study, *, thoroughly: bool = False) -> None:

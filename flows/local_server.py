@@ -2,7 +2,11 @@
 
 Prefect would start such a server itself, but only when the first flow is called, with a 20 s limit that a busy
 machine exceeds, and it outlives a killed script. Here it starts before anything heavy is imported, so that its start-up
-overlaps ours, and it dies with the script, whatever ends the script.
+overlaps ours, and it dies with the script, whatever ends the script. Where it ends before, the script ends too: Prefect
+would ask it again and again.
+
+It answers nobody but this script: other users of the machine and web pages in a browser on it lack the password, which
+is made for each server, and pages of another origin or host are refused.
 """
 
 from __future__ import annotations
@@ -10,18 +14,25 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
+import secrets
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
-from ctlev_core.processes import die_with_parent
+from ctlev_core.processes import die_with_parent, module_environment
 
 START_TIMEOUT_S = 300.0
+LOOK_EVERY_S = 0.5
+END_TIMEOUT_S = 8.0
+"""After its server has ended, a script has so long to end by itself."""
 _QUIET = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
@@ -38,13 +49,25 @@ _SERVER = {
 }
 _server: subprocess.Popen[bytes] | None = None
 _url = ""
+_password = ""
 _log = Path()
+
+
+class ServerLostError(RuntimeError):
+    """The private server ended before the run did."""
+
+
+def environment() -> dict[str, str]:
+    """Variables with which another process reaches the private server."""
+    return {"PREFECT_API_URL": _url, "PREFECT_API_AUTH_STRING": _password}
 
 
 def configure(home: Path, *, verbose: bool) -> None:
     """Point Prefect at `home` and keep it quiet. Must run before Prefect is imported; what the user set stays."""
     with contextlib.suppress(OSError):  # `main` says clearly that the home cannot be written
         (home / "prefect").mkdir(parents=True, exist_ok=True)
+        for path in (home / "prefect").glob("prefect.db*"):  # made by earlier versions for all to read
+            path.chmod(0o600)
     settings = {"PREFECT_HOME": str(home / "prefect"), "PREFECT_LOGGING_LEVEL": "INFO" if verbose else "CRITICAL"}
     for name, value in {**_QUIET, **settings}.items():
         os.environ.setdefault(name, value)
@@ -55,27 +78,26 @@ def configure(home: Path, *, verbose: bool) -> None:
 
 def start(home: Path) -> None:
     """Start the private server in the background, unless the user named a server in PREFECT_API_URL."""
-    global _server, _url, _log
+    global _server, _url, _password, _log
     if os.environ.get("PREFECT_API_URL"):
         return
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     _log = home / "logs" / "prefect_server.log"
     _log.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]
-    command += ["--host", "127.0.0.1", "--port", str(port), "--log-level", "error", "--timeout-keep-alive", "30"]
-    with _log.open("wb") as file:
+    _password = f"ctlev:{secrets.token_urlsafe(32)}"
+    with _private(_log) as file, socket.create_server(("127.0.0.1", 0)) as listening:
+        origin = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        access = {"PREFECT_SERVER_API_AUTH_STRING": _password, "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": origin}
         _server = subprocess.Popen(
-            command,
-            env={**os.environ, **_SERVER},
+            [sys.executable, "-P", str(Path(__file__).with_name("private_server.py")), str(listening.fileno())],
+            env={**module_environment(os.environ), **_SERVER, **access},
             stdout=file,
             stderr=file,
             stdin=subprocess.DEVNULL,
+            pass_fds=[listening.fileno()],
             preexec_fn=_detached,
         )
     atexit.register(stop)
-    _url = f"http://127.0.0.1:{port}/api"
+    _url = f"{origin}/api"
 
 
 @contextlib.contextmanager
@@ -84,16 +106,58 @@ def connected() -> Iterator[None]:
 
     Raises:
         RuntimeError: it ended or did not answer in time; the message names its log.
+        ServerLostError: it ended while the block ran.
     """
     if _server is None:
         yield
         return
     _wait(_server)
-    from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+    from prefect.settings import (
+        PREFECT_API_AUTH_STRING,
+        PREFECT_API_URL,
+        PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
+        temporary_settings,
+    )
 
     # Heartbeats tell a server that outlives its runs that they crashed; this one does not, and each costs 0.7 s.
-    with temporary_settings({PREFECT_API_URL: _url, PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
-        yield
+    ended = threading.Event()
+    threading.Thread(target=_watch, args=(_server, ended), daemon=True).start()
+    try:
+        with temporary_settings(
+            {PREFECT_API_URL: _url, PREFECT_API_AUTH_STRING: _password, PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
+        ):
+            yield
+    except BaseException as error:
+        # What Prefect raises where nobody answers says less, and may come before the server is known to have ended.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            _server.wait(2 * LOOK_EVERY_S if isinstance(error, Exception) else 0)
+        if _server.poll() is None:
+            raise
+        raise ServerLostError(_lost(_server)) from error
+    finally:
+        ended.set()
+
+
+def _lost(server: subprocess.Popen[bytes]) -> str:
+    return (
+        f"the local Prefect server ended with code {server.returncode} in the middle of the run; finished stages and "
+        f"checkpoints are kept, so run it again; its log is {_log}"
+    )
+
+
+def _watch(server: subprocess.Popen[bytes], ended: threading.Event) -> None:
+    """Interrupt the run where the server ends before it does, and end it where it does not mind."""
+    while not ended.wait(LOOK_EVERY_S):
+        if server.poll() is None:
+            continue
+        with contextlib.suppress(OSError):
+            os.kill(os.getpid(), signal.SIGINT)
+        told = ended.wait(END_TIMEOUT_S / 2)
+        # Also where the run has ended: threads of Prefect's that a script waits for go on asking.
+        time.sleep(END_TIMEOUT_S / 2)
+        if not told:
+            print(f"error: {_lost(server)}", file=sys.stderr, flush=True)
+        os._exit(2)
 
 
 def _wait(server: subprocess.Popen[bytes]) -> None:
@@ -120,6 +184,12 @@ def stop() -> None:
         except subprocess.TimeoutExpired:
             _server.kill()
     _server = None
+
+
+def _private(path: Path) -> IO[bytes]:
+    """A new file that only its owner may read."""
+    path.unlink(missing_ok=True)
+    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
 
 
 def _detached() -> None:

@@ -7,12 +7,15 @@ import sys
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
-from flows.command_line import main
-from flows.settings import HOME, flow
+from flows.cli import script
+from flows.command_line import Command
+from flows.settings import flow
 from tasks.condition import condition_frames, condition_samples
 from tasks.contact_sheet import contact_sheet, publish_contact_sheet
 from tasks.encode import encode
 from tasks.ingest import ingest
+from tasks.store import home_folder
+from tasks.subset import take_recorded
 
 
 class PreparedDataset(Frozen):
@@ -42,6 +45,10 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
     frames = encode(
         recordings, encoding=experiment.encoding, windows=experiment.windows, label=experiment.encoding.name
     )
+    if experiment.num_recorded is not None:
+        frames = take_recorded(
+            frames, count=experiment.num_recorded, seed=experiment.seed, label="frames to learn from"
+        )
     poses, target_frames = recordings, None
     if experiment.target is not None:
         poses = ingest(dataset=experiment.target, label=f"{experiment.target.name}, target")
@@ -117,14 +124,15 @@ def condition_asked_samples(
     )
 
 
+COMMAND = Command(
+    prepare_dataset,
+    lambda dataset, experiment: (
+        f"recordings: {dataset.recordings.rows} in {dataset.recordings.path}\n"
+        f"frames:     {dataset.frames.rows} in {dataset.frames.path}\n"
+        + publish_contact_sheet(dataset.contact_sheet, home_folder(), experiment.name)
+    ),
+)
+
+
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            prepare_dataset,
-            lambda dataset, experiment: (
-                f"recordings: {dataset.recordings.rows} in {dataset.recordings.path}\n"
-                f"frames:     {dataset.frames.rows} in {dataset.frames.path}\n"
-                + publish_contact_sheet(dataset.contact_sheet, HOME, experiment.name)
-            ),
-        )
-    )
+    sys.exit(script("prepare"))

@@ -5,14 +5,17 @@ python flows/pretrain.py [--set training.num_steps=...] [--set max_seconds=null]
 
 from __future__ import annotations
 
-import functools
 import sys
+from typing import TYPE_CHECKING
 
-from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
 from data_contracts.manifest import ManifestRef
-from flows.command_line import PRESETS, load_preset, main
+from flows.cli import script
+from flows.command_line import PRESETS, Command, load_preset
 from flows.settings import flow
 from tasks.pretrain import pretrain as pretrain_stage
+
+if TYPE_CHECKING:  # torch and diffusers, which read the environment when they are imported
+    from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
 
 
 @flow(name="pretrain")
@@ -21,15 +24,21 @@ def pretrain(options: PretrainingOptions) -> ManifestRef:
     return pretrain_stage(options=options)
 
 
+def load_pretraining(preset: str, overrides: list[str]) -> PretrainingOptions:
+    """The options that a preset of `flows/presets/pretraining` describes."""
+    from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
+
+    return load_preset(PretrainingOptions, PRESETS / "pretraining", preset, overrides)
+
+
+COMMAND = Command(
+    pretrain,
+    lambda made, _: (
+        f"base model: {made.path / 'base_model'}\nuse it: --set generator.options.base_model={made.path / 'base_model'}"
+    ),
+    load=load_pretraining,
+)
+
+
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            pretrain,
-            lambda made, _: (
-                f"base model: {made.path / 'base_model'}\n"
-                f"use it: --set generator.options.base_model={made.path / 'base_model'}"
-            ),
-            load=functools.partial(load_preset, PretrainingOptions, PRESETS / "pretraining"),
-            default_preset="small",
-        )
-    )
+    sys.exit(script("pretrain"))

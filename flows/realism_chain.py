@@ -14,14 +14,16 @@ from ctlev_core.plugins import PluginError
 from data_contracts.config import SamplingChoice
 from data_contracts.manifest import ManifestRef
 from data_contracts.realism_chain import Link, RealismChain
-from flows.command_line import load_experiment, main
+from flows.cli import script
+from flows.command_line import Command, load_experiment
 from flows.prepare_dataset import prepare_dataset
-from flows.settings import HOME, flow
+from flows.settings import flow
 from flows.train_generator import train_generator
 from tasks.chain_report import chain_report, publish_chain_report
 from tasks.condition import condition_some_frames
 from tasks.realism_chain import chain_frames, chain_realism
 from tasks.stage import call_flow
+from tasks.store import home_folder
 
 _OF_THE_SOLVER = ("scheduler", "num_inference_steps", "timestep_spacing", "noise")
 """Sampling options that only whole sampling depends on."""
@@ -113,11 +115,12 @@ def realism_chain(asked: RealismChain) -> ManifestRef:
     )
 
 
+COMMAND = Command(
+    realism_chain,
+    lambda made, asked: publish_chain_report(made, home_folder(), asked.name),
+    load=load_realism_chain,
+)
+
+
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            realism_chain,
-            lambda made, asked: publish_chain_report(made, HOME, asked.name),
-            load=load_realism_chain,
-        )
-    )
+    sys.exit(script("realism-chain"))

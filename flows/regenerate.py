@@ -20,7 +20,8 @@ from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.published import StoredArtefact, Version, published_folder, version_file
 from data_contracts.regeneration import Regeneration
 from data_contracts.training_sets import RECORDED, SYNTHETIC, LabelAgreement
-from flows.command_line import load_experiment, main
+from flows.cli import script
+from flows.command_line import Command, load_experiment
 from flows.prepare_dataset import PreparedDataset, condition_asked_samples, prepare_dataset
 from flows.settings import flow
 from flows.train_generator import train_generator
@@ -219,11 +220,8 @@ def load_regeneration(preset: str, overrides: list[str]) -> Regeneration:
     return load_experiment(preset, overrides, Regeneration)
 
 
+COMMAND = Command(regenerate, lambda version, _: f"{version}\nrecord: {_record(version)}", load=load_regeneration)
+
+
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            regenerate,
-            lambda version, _: f"{version}\nrecord: {_record(version)}",
-            load=load_regeneration,
-        )
-    )
+    sys.exit(script("regenerate"))

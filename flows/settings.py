@@ -1,4 +1,7 @@
-"""Environment of every flow, set before Prefect is imported: `from flows.settings import flow`.
+"""Environment of every flow: which folder holds all state, and what libraries are told. Importing it changes nothing.
+
+Entry points call `configure` before anything imports Prefect, which reads its settings when it is imported; flows are
+therefore made by the decorator here, which imports Prefect when the first one is called.
 
 All state lies under one folder: `--home`, else the variable CTLEV_HOME, else `.ctlev` in the working directory.
 Nothing here reaches out: telemetry and update checks are off, and model hubs are never asked.
@@ -6,13 +9,20 @@ Nothing here reaches out: telemetry and update checks are off, and model hubs ar
 
 from __future__ import annotations
 
-import argparse
+import functools
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Generic, ParamSpec, TypeVar
 
 from flows import local_server
 
+if TYPE_CHECKING:
+    from prefect import Flow
+
+P = ParamSpec("P")
+R = TypeVar("R")
 _ENVIRONMENT = {
     # Idle OpenMP threads that spin cost a busy machine most of its speed: 30 training steps of the pose network with
     # two threads took 44 s spinning and 11 s sleeping while another process had one of the two cores.
@@ -26,24 +36,57 @@ _ENVIRONMENT = {
 }
 
 
-def _configure() -> Path:
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--home", type=Path)
-    parser.add_argument("--verbose", action="store_true")
-    known, _ = parser.parse_known_args(sys.argv[1:])
-    home = (known.home or Path(os.environ.get("CTLEV_HOME", ".ctlev"))).absolute()
+def configure(home: Path | None = None, *, verbose: bool = False) -> Path:
+    """Set the environment of this process and those it starts; must be called before Prefect is imported.
+
+    Args:
+        home: folder of all state; None = CTLEV_HOME, else `.ctlev` in the working directory.
+        verbose: show Prefect's log.
+
+    Returns:
+        The home, absolute. It is made where it is not there and can be.
+    """
+    home = (home or Path(os.environ.get("CTLEV_HOME") or ".ctlev")).expanduser().absolute()
     os.environ["CTLEV_HOME"] = str(home)
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    local_server.configure(home, verbose=known.verbose)
-    # `python flows/full_experiment.py` puts this folder on the path, where evaluate.py would hide a package.
-    folder = str(Path(__file__).resolve().parent)
-    sys.path[:] = [entry for entry in sys.path if not entry or str(Path(entry).resolve()) != folder]
+    local_server.configure(home, verbose=verbose)
     return home
 
 
-HOME = _configure()
+class ScriptFlow(Generic[P, R]):
+    """A function that is run as a flow of Prefect; made by the decorator `flow`.
 
-from prefect import flow  # noqa: E402  (Prefect reads its settings when it is imported)
+    Attributes:
+        fn: the function alone.
+        name: of the flow.
+    """
 
-__all__ = ["HOME", "flow"]
+    def __init__(self, function: Callable[P, R], name: str) -> None:
+        self.fn, self.name = function, name
+        self.__doc__ = function.__doc__
+
+    @functools.cached_property
+    def of_prefect(self) -> Flow[P, R]:
+        """The same as Prefect knows it."""
+        from prefect import flow as prefect_flow
+
+        return prefect_flow(name=self.name)(self.fn)
+
+    def __call__(self, *arguments: P.args, **settings: P.kwargs) -> R:
+        """A run of the flow; what it returns or raises is that of the function."""
+        return self.of_prefect(*arguments, **settings)
+
+
+def flow(name: str) -> Callable[[Callable[P, R]], ScriptFlow[P, R]]:
+    """Make a function a flow of this name."""
+    return lambda function: ScriptFlow(function, name)
+
+
+def leave_script_folder() -> None:
+    """Take the folder of the flow scripts off the path, where `python flows/evaluate.py` puts it.
+
+    There `evaluate.py` would hide a package of that name.
+    """
+    folder = Path(__file__).resolve().parent
+    sys.path[:] = [entry for entry in sys.path if not entry or Path(entry).resolve() != folder]

@@ -19,14 +19,16 @@ from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from data_contracts.speed_vs_error import KEEP_PRECISION, SamplerLine, SamplerSetting, SpeedVsErrorOptions
 from data_contracts.study import Study
-from flows.command_line import PRESETS, load_experiment, load_preset, main
+from flows.cli import script
+from flows.command_line import PRESETS, Command, load_experiment, load_preset
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
-from flows.settings import HOME, flow
+from flows.settings import flow
 from flows.train_generator import train_generator
 from tasks.downstream import train_downstream
 from tasks.speed_report import publish_speed_report, speed_report
 from tasks.speed_vs_error import exact_score_errors, precision_errors, sample_timed, sampling_errors
 from tasks.stage import call_flow
+from tasks.store import home_folder
 
 _OF_EXPERIMENT = "experiment."
 
@@ -212,11 +214,12 @@ def _name(sampling: SamplingChoice) -> str:
     return f"{options.scheduler} in {options.num_inference_steps} steps"
 
 
+COMMAND = Command(
+    speed_vs_error,
+    lambda made, measured: publish_speed_report(made, home_folder(), measured.name),
+    load=load_speed_vs_error,
+)
+
+
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            speed_vs_error,
-            lambda made, measured: publish_speed_report(made, HOME, measured.name),
-            load=load_speed_vs_error,
-        )
-    )
+    sys.exit(script("speed-vs-error"))

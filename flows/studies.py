@@ -8,12 +8,14 @@ from copy import deepcopy
 from typing import Any
 
 from ctlev_core.plugins import PluginError, validate_options
+from data_contracts.errors import shortened
 from data_contracts.experiment import Experiment
 from data_contracts.renamed_options import name_hint
 from data_contracts.study import Study
 from flows.command_line import PRESETS, apply_override, load_experiment, read_preset
 from flows.inputs import check_inputs
 from flows.speed_vs_error import speed_vs_error_of
+from flows.sweeps import find_sweeps, looks_like_sweep, study_of
 
 
 def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
@@ -25,6 +27,8 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     that may be missing: it is null where that path is not given. An experiment that says `only_with` some of the paths
     is left out where one of them is not given, and `data_notice` says so.
 
+    Of a preset of one experiment, overrides with several values (`flows.sweeps`) make a study of all combinations.
+
     Args:
         preset: as `load_preset` takes it.
         overrides: likewise; those of a study begin with `experiments.NAME.`, `paths.` or `speed_vs_error.`.
@@ -32,16 +36,31 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     Raises:
         PluginError: as `load_experiment` and `speed_vs_error_of`.
     """
-    values = read_preset(PRESETS, preset)
+    values, where = read_preset(PRESETS, preset), f"preset {preset!r}"
+    if values.get("experiments") is None:
+        sweeps = find_sweeps(values, overrides)
+        if not sweeps:
+            return load_experiment(preset, overrides)
+        study = validate_options(Study, study_of(values, overrides, sweeps), where)
+        check_inputs(study)
+        return study
+    return _load_study(values, overrides, where)
+
+
+def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Study:
+    """The study that a preset with `experiments` describes; see `load_study`."""
     parts, paths, groups = values.get("experiments"), values.pop("paths", {}), values.pop("sets", {})
-    if parts is None:
-        return load_experiment(preset, overrides)
-    where = f"preset {preset!r}"
     if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
-        raise PluginError(f"{where}: experiments must be a mapping of names to options, got {parts!r}")
+        raise PluginError(
+            f"{where}: experiments must be a mapping of names to options, got {shortened(repr(parts), 200)}"
+        )
     if not isinstance(groups, dict) or not all(_are_texts(group) for group in groups.values()):
-        raise PluginError(f"{where}: sets must map names to lists of texts key=value, got {groups!r}")
+        raise PluginError(
+            f"{where}: sets must map names to lists of texts key=value, got {shortened(repr(groups), 200)}"
+        )
     parts = _repeat(parts, where)
+    if swept := next((override for override in overrides if looks_like_sweep(override.partition("=")[2])), None):
+        raise PluginError(f"--set {swept}: {where} is a study; several values are for presets of one experiment")
     given, others = ([o for o in overrides if o.startswith("paths.") == is_path] for is_path in (True, False))
     for override in given:
         name = override.partition("=")[0].removeprefix("paths.")
@@ -76,7 +95,9 @@ def _repeat(parts: dict[str, Any], where: str) -> dict[str, Any]:
     for template, part in parts.items():
         repeated = part.get("for", {})
         if not isinstance(repeated, dict) or not all(isinstance(values, list) for values in repeated.values()):
-            raise PluginError(f"{where}, experiments.{template}: for must map names to lists, got {repeated!r}")
+            raise PluginError(
+                f"{where}, experiments.{template}: for must map names to lists, got {shortened(repr(repeated), 200)}"
+            )
         for values in itertools.product(*repeated.values()):
             chosen = dict(zip(repeated, values, strict=True))
             name, one = _with_values([template, {key: value for key, value in part.items() if key != "for"}], chosen)
@@ -108,7 +129,7 @@ def _leave_out(parts: dict[str, Any], paths: dict[str, Any], where: str) -> dict
         if not isinstance(needed, list) or not set(needed) <= set(paths):
             raise PluginError(
                 f"{where}, experiments.{name}: only_with must be a list of the preset's paths, "
-                f"{', '.join(paths) or 'none'}; got {needed!r}"
+                f"{', '.join(paths) or 'none'}; got {shortened(repr(needed), 200)}"
             )
         if any(paths[path] is None for path in needed):
             needs = " ".join(f"--set paths.{path}=..." for path in needed)
@@ -121,12 +142,14 @@ def _part(part: dict[str, Any], paths: dict[str, Any], groups: dict[str, list[st
     """The options of one experiment of a study."""
     extended, changes = part.pop("extends", None), part.pop("set", [])
     if not _are_texts(changes):
-        raise PluginError(f"{where}: set must be a list of texts key=value, got {changes!r}")
+        raise PluginError(f"{where}: set must be a list of texts key=value, got {shortened(repr(changes), 200)}")
     values = ({} if extended is None else read_preset(PRESETS, str(extended), (where,))) | part
     for entry in changes:
         if "=" not in entry and entry not in groups:
             hint = name_hint(entry, groups)
-            raise PluginError(f"{where}: set: {entry!r} is neither key=value nor one of `sets`{hint}")
+            raise PluginError(
+                f"{where}: set: {shortened(repr(entry), 200)} is neither key=value nor one of `sets`{hint}"
+            )
         for change in groups.get(entry, [entry]):
             apply_override(values, _with_paths(change, paths, where))
     return values
@@ -139,7 +162,8 @@ def _are_texts(changes: Any) -> bool:
 def _with_paths(change: str, paths: dict[str, Any], where: str) -> str:
     def place(match: re.Match[str]) -> str:
         if match[1] not in paths:
-            raise PluginError(f"{where}: {change!r} names no path of this preset; it has {', '.join(paths) or 'none'}")
+            known = ", ".join(paths) or "none"
+            raise PluginError(f"{where}: {shortened(repr(change), 200)} names no path of this preset; it has {known}")
         given = paths[match[1]]
         if given is None and match[2]:
             return "null"

@@ -12,7 +12,8 @@ from ctlev_core.report.sections.rejections import count_rejections
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.synthesis import Synthesis
-from flows.command_line import load_experiment, main
+from flows.cli import script
+from flows.command_line import Command, load_experiment
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from flows.train_generator import train_generator
@@ -82,5 +83,8 @@ def _describe(made: ManifestRef, synthesis: Synthesis) -> str:
     return "\n".join(lines)
 
 
+COMMAND = Command(synthesize, _describe, load=load_synthesis)
+
+
 if __name__ == "__main__":
-    sys.exit(main(synthesize, _describe, load=load_synthesis))
+    sys.exit(script("synthesize"))

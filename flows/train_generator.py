@@ -10,7 +10,8 @@ from ctlev_core.plugins import validate_options
 from data_contracts.config import GeneratorChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
-from flows.command_line import main
+from flows.cli import script
+from flows.command_line import Command
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from tasks.finetune import finetune
@@ -60,5 +61,8 @@ def base_model_options(experiment: Experiment) -> PretrainingOptions:
     return options
 
 
+COMMAND = Command(train_generator, lambda checkpoint, _: f"checkpoint: {checkpoint.path / 'checkpoint'}")
+
+
 if __name__ == "__main__":
-    sys.exit(main(train_generator, lambda checkpoint, _: f"checkpoint: {checkpoint.path / 'checkpoint'}"))
+    sys.exit(script("train"))

@@ -5,15 +5,16 @@ python flows/verify.py [--home FOLDER]
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
 from tqdm import tqdm
 
+from ctlev_core.provenance import raw_file_digests
 from data_contracts.errors import DataError, TableVersionError
 from data_contracts.published import kept_versions
-from tasks.store import Store, home_folder
+from flows.cli import script
+from tasks.store import Store
 
 
 def verify(store: Store) -> tuple[int, int]:
@@ -31,13 +32,10 @@ def verify(store: Store) -> tuple[int, int]:
         for item in artefacts:
             try:
                 store.check(item.folder)
-            except PermissionError as error:
-                failed += 1
-                tqdm.write(f"error: {item.name}: cannot be read: {error}", file=sys.stderr)
             except TableVersionError as error:
                 outdated += 1
                 tqdm.write(f"outdated, made anew when needed: {item.name}: {error}")
-            except (ValueError, OSError) as error:
+            except DataError as error:
                 damaged += 1
                 tqdm.write(f"damaged: {item.name}: {error}")
                 try:
@@ -45,10 +43,34 @@ def verify(store: Store) -> tuple[int, int]:
                 except OSError as cause:
                     failed += 1
                     tqdm.write(f"error: {item.name}: is damaged and cannot be set aside: {cause}", file=sys.stderr)
+            except OSError as error:
+                # Too many open files, a permission: it passes, and says nothing about what is in the artefact.
+                failed += 1
+                tqdm.write(f"error: {item.name}: cannot be read: {error}", file=sys.stderr)
             progress.update(item.size_bytes)
     counted = f"{len(artefacts)} artefacts, {damaged} of them damaged" + (f", {outdated} outdated" if outdated else "")
     print(counted + ("; run the flow again" if damaged else ""))
-    return damaged + _check_latest(store), failed
+    digests_damaged, digests_failed = _check_raw_file_digests(store)
+    return damaged + digests_damaged + _check_latest(store), failed + digests_failed
+
+
+def _check_raw_file_digests(store: Store) -> tuple[int, int]:
+    """Set a damaged file of remembered digests aside; the next run hashes its raw files again."""
+    path = store.home / raw_file_digests.FILE
+    try:
+        raw_file_digests.read_remembered(path)
+        return 0, 0
+    except DataError as error:
+        print(f"damaged: {error}")
+    except OSError as error:
+        print(f"error: {path}: cannot be read: {error}", file=sys.stderr)
+        return 0, 1
+    try:
+        print(f"  now in {store.set_aside(path)}; the next run hashes its raw files again")
+        return 1, 0
+    except OSError as error:
+        print(f"error: {path}: is damaged and cannot be set aside: {error}", file=sys.stderr)
+        return 1, 1
 
 
 def _check_latest(store: Store) -> int:
@@ -68,17 +90,18 @@ def _check_latest(store: Store) -> int:
     return broken
 
 
-def main() -> int:
+def verify_home(home: Path) -> int:
     """Exit status: 0 all is whole, 1 something was damaged or missing, 2 something cannot be checked or set aside."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--home", type=Path, help="folder of all state [CTLEV_HOME or .ctlev]")
-    home = (parser.parse_args().home or home_folder()).absolute()
     if not home.is_dir():
         print(f"error: {home}: there is no such home folder", file=sys.stderr)
         return 2
-    damaged, failed = verify(Store(home))
+    try:
+        damaged, failed = verify(Store(home))
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     return 2 if failed else int(damaged > 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(script("verify"))

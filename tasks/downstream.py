@@ -12,7 +12,7 @@ from ctlev_core.supervised.frame_sequences import name_recordings
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
 from data_contracts.errors import DataError
-from data_contracts.manifest import Manifest, concat_labels, history_table
+from data_contracts.manifest import Manifest, concat_labels, history_table, image_rows
 from tasks.stage import Output, input_files_of, stage
 
 
@@ -30,7 +30,7 @@ def train_downstream(
     if not any(len(chosen) for chosen in rows):
         folders = ", ".join(str(manifest.ref.path) for manifest in training_sets)
         raise DataError(f"{folders}: no rows in split 'train' to learn from")
-    frames = np.concatenate([m.array("frames")[r] for m, r in zip(training_sets, rows, strict=True)])
+    frames = image_rows(list(zip(training_sets, rows, strict=True)))
     # Bodies of another dataset may carry more labels than the frames do.
     labels = concat_labels([m.labels.take(r) for m, r in zip(training_sets, rows, strict=True)], common=True)
     train = plugin.module.train

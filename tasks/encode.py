@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut_chunks, spread
 from ctlev_core.labels.labelling import has_label, labels_at_windows, labels_in_image
+from ctlev_core.progress import ProgressBar
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
@@ -150,7 +150,7 @@ def _encode_in_turn(
 ) -> Iterator[tuple[str, _Samples]]:
     """Some windows at a time, each handed on before the next are read."""
     plugin = plugins.load_options(encoding)
-    for source in tqdm(sources, "encode", unit="recording", leave=False, disable=None):
+    for source in ProgressBar(sources, "encode", unit="recording"):
         for samples in _encode_source(source, plugin, windows):
             yield source.recording["recording_id"], samples
 
@@ -160,7 +160,7 @@ def _encode_spread(
 ) -> Iterator[tuple[str, _Samples]]:
     """The same, several recordings at a time."""
     found = map_shards(partial(_encode_shard, encoding, windows, work), list(enumerate(sources)), max_group=MAX_GROUP)
-    found = tqdm(found, "encode", len(sources), unit="recording", leave=False, disable=None)
+    found = ProgressBar(found, "encode", len(sources), unit="recording")
     for source, chunks in zip(sources, found, strict=True):
         for samples in chunks:
             yield source.recording["recording_id"], samples if isinstance(samples, _Samples) else samples.take_back()
@@ -260,11 +260,25 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
                 if not len(rows):
                     continue
             counts = plugin.module.encode(events, local, plugin.options)
+            _tell_full(counts, source.recording["recording_id"], rows)
             frames = plugin.module.render_image(counts, plugin.options)
             own = labels_at_windows(source.track, t_start, t_end) if labels is None else labels.take(rows)
             own = _to_image(own, events.sensor_size, plugin, (frames.shape[2], frames.shape[1]))
             described = _rows(source.recording, part["split"], rows, t_start, t_end, local[:, 1] - local[:, 0])
             yield _Samples(described, counts, frames, own)
+
+
+def _tell_full(counts: np.ndarray, name: str, rows: np.ndarray) -> None:
+    """Warn where a count stopped at what 16 bits hold: a hot pixel, or a window that is too long."""
+    full = np.iinfo(np.uint16).max
+    if counts.dtype != np.uint16 or not counts.size or counts.max() < full:
+        return
+    window = int(np.argmax(counts.reshape(len(counts), -1).max(axis=1)))
+    _, y, x = np.unravel_index(int(np.argmax(counts[window])), counts.shape[1:])
+    logger.warning(
+        "recording %r, window %d: pixel x = %d, y = %d fired %d times or more; counts stop there",
+        name, rows[window], x, y, full,
+    )  # fmt: skip
 
 
 def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iterator[np.ndarray]:

@@ -81,7 +81,7 @@ def score_model(
         raise DataError(f"{data.ref.path}: no rows in split {split!r} to score on")
     _refuse_overlap(data, rows, training_sets, split)
     predict = _predict_of(plugin.module, data, rows)
-    prediction = predict(model.ref.path / "model", np.asarray(data.array("frames")[rows]))
+    prediction = predict(model.ref.path / "model", data.images(rows))
     labels = data.labels.take(rows)
     of_labels = LabelAgreement.parse(subject)
     if of_labels is not None and of_labels.shuffled:
@@ -287,7 +287,7 @@ def score_distance(
     for data, rows in (compared, learnt):
         if len(rows) == 0:
             raise DataError(f"{data.ref.path}: no rows in split {split if data is other else 'train'!r} to compare")
-        features.append(plugin.module.features(folder, np.asarray(data.array("frames")[rows])))
+        features.append(plugin.module.features(folder, data.images(rows)))
         groups.append(np.array(data.column("recording_id"))[rows])
     named: dict[str, DistanceEstimate] = {}
     for choice in distances:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
@@ -20,6 +19,7 @@ from ctlev_core.events.image_grid import check_whole_counts, count_size, pixel_b
 from ctlev_core.events.windows import spread
 from ctlev_core.postprocessing.event_streams import TimeModel, fit_times, sample_streams
 from ctlev_core.postprocessing.image_counts import CountModel, estimate_counts, fit_counts
+from ctlev_core.progress import ProgressBar
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
@@ -61,7 +61,7 @@ def export_events(
     folder.mkdir()
     rows: list[dict[str, Any]] = []
     made = _streams(generated, counts, times, export, rows)
-    streams = iter(tqdm(made, "export events", total=len(generated), unit="stream", leave=False, disable=None))
+    streams = iter(ProgressBar(made, "export events", len(generated), unit="stream"))
     if export.one_file:
         _write_together(folder / f"events{_suffix(export.format, writer)}", streams, rows, export, writer)
     else:

@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pyarrow as pa
-from tqdm import tqdm
 
 from ctlev_core.export.dataset_card import Card, render_card
+from ctlev_core.progress import ProgressBar
 from ctlev_core.provenance.records import Record, read_provenance, read_records, write_provenance
 from data_contracts.errors import DataError
 from data_contracts.image_folder import (
@@ -208,7 +208,7 @@ def _write_shards(partial: Path, names: Sequence[str], write: WriteFile) -> None
     for number, name in enumerate(names):
         shards.setdefault(name.rpartition("/")[0], []).append(number)
     kind = names[0].partition("/")[0]
-    with tqdm(total=len(names), desc=f"export {kind}", unit="file", leave=False, disable=None) as progress:
+    with ProgressBar(total=len(names), desc=f"export {kind}", unit="file") as progress:
         for shard, numbers in shards.items():
             place = partial / shard
             if not place.exists():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
@@ -44,7 +43,7 @@ def finetune(
     if base_model is not None:
         options = options.model_copy(update={"base_model": base_model.ref.path / "base_model"})
     history = plugin.module.train(
-        np.asarray(frames.array("frames")[rows]),
+        frames.images(rows),
         conditions_of(conditions),
         options,
         seed=seed,

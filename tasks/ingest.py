@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
 from ctlev_core.plugins import Plugin
+from ctlev_core.progress import ProgressBar
 from data_contracts import tables
 from data_contracts.config import DatasetChoice
 from data_contracts.errors import DataError
@@ -79,7 +79,7 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     recordings = _list_recordings(plugin)
     # Readers and the simulator release the interpreter lock, so that threads serve.
     results = map_shards(partial(_ingest_recording, dataset, out), recordings)
-    ingested = list(tqdm(results, "ingest", len(recordings), unit="recording", leave=False, disable=None))
+    ingested = list(ProgressBar(results, "ingest", len(recordings), unit="recording"))
     out.write_table(pa.Table.from_pylist([p for i in ingested for p in i.parts], tables.PARTS.arrow()), tables.PARTS)
     out.write_table(_window_table(recordings, ingested), tables.WINDOWS)
     synonyms = plugin.module.read_synonyms(plugin.options) if hasattr(plugin.module, "read_synonyms") else {}
@@ -132,7 +132,7 @@ def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str
     def watched(chunks: Iterable[Events]) -> Iterator[Events]:
         # Only a recording that takes long gets a bar of its own.
         label = recording.recording_id
-        with tqdm(desc=label, unit="event", unit_scale=True, delay=5, leave=False, disable=None) as bar:
+        with ProgressBar(desc=label, unit="event", unit_scale=True, delay=5) as bar:
             for chunk in chunks:
                 yield chunk
                 bar.update(len(chunk))

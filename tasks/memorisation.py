@@ -14,6 +14,7 @@ from ctlev_core.scoring.memorisation import CLOSEST_PAIRS, MemorisationCheck, ch
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
@@ -50,7 +51,7 @@ def memorisation(
             f"memorisation: needs training, other recorded and generated frames, got {len(learnt)}, {len(other)} "
             f"and {len(made)}"
         )
-    ways: dict[str, Callable[[np.ndarray], np.ndarray]] = {PICTURES: small_pictures}
+    ways: dict[str, Callable[[Images], np.ndarray]] = {PICTURES: small_pictures}
     if extractor is not None and downstream is not None:
         plugin, folder = plugins.load_options(downstream), extractor.ref.path / "model"
         ways[f"features of {plugin.name}"] = lambda images: plugin.module.features(folder, images)
@@ -58,9 +59,9 @@ def memorisation(
     pairs: list[dict[str, Any]] = []
     for name, features_of in ways.items():
         found = check_memorisation(
-            features_of(np.asarray(generated.array("frames")[made])),
-            features_of(np.asarray(frames.array("frames")[learnt])),
-            features_of(np.asarray(frames.array("frames")[other])),
+            features_of(generated.images(made)),
+            features_of(frames.images(learnt)),
+            features_of(frames.images(other)),
             training_recordings=recordings[learnt],
             real_recordings=recordings[other],
         )

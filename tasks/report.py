@@ -47,7 +47,8 @@ from ctlev_core.report.studies.paper_numbers import paper_section
 from ctlev_core.report.studies.summary import Summary, write_summary
 from ctlev_core.statistics.paired_differences import share_of_gain
 from data_contracts import tables
-from data_contracts.manifest import RUN_FILE, Manifest
+from data_contracts.manifest import Manifest
+from data_contracts.run_record import read_run_record
 from data_contracts.training_sets import ORACLE, RECORDED, with_recorded
 from tasks.stage import Output, stage
 
@@ -251,7 +252,7 @@ def _score_name(manifest: Manifest) -> str:
 
 def _condition(conditions: Manifest) -> tuple[str, dict[str, Any]]:
     """Name and options of the condition plug-in that made them."""
-    made_by = json.loads((conditions.ref.path / RUN_FILE).read_text())["arguments"]["condition"]
+    made_by = read_run_record(conditions.ref.path).arguments["condition"]
     return made_by["plugin"].rpartition("/")[2], made_by["options"]
 
 

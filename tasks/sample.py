@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from tqdm import tqdm
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
@@ -28,6 +27,7 @@ from ctlev_core.postprocessing.quality_filter import (
     sample_until_accepted,
 )
 from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
+from ctlev_core.progress import ProgressBar
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
@@ -154,7 +154,7 @@ def simulate(
     paths = map_shards(partial(_simulate_shard, asked), shards)
     with (
         out.open_array("frames") as written,
-        tqdm(total=count, desc=plugin.name, unit="frame", leave=False, disable=None) as progress,
+        ProgressBar(total=count, desc=plugin.name, unit="frame") as progress,
     ):
         for path in paths:
             made = np.load(path, allow_pickle=False)

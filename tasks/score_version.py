@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
@@ -44,11 +43,11 @@ def score_beside_real(
             f"got {len(learnt)}, {len(held_out)} and {len(made)}"
         )
     compared = ((HELD_OUT, frames, held_out), (SYNTHETIC, generated, made))
-    real = plugin.module.features(folder, np.asarray(frames.array("frames")[learnt]))
+    real = plugin.module.features(folder, frames.images(learnt))
     rows = []
     for subject, data, members in compared:
         chosen = members[spread(len(members), count)]
-        features = plugin.module.features(folder, np.asarray(data.array("frames")[chosen]))
+        features = plugin.module.features(folder, data.images(chosen))
         for choice in distances:
             metric = plugins.load_options(choice)
             if metric.module.INPUT != "features":

@@ -33,7 +33,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -41,20 +41,20 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from ctlev_core import plugins
+from ctlev_core.progress import Progress, current_report, reporting_to
+from ctlev_core.provenance.raw_file_digests import digest_raw_files
 from data_contracts.arrays import ArrayWriter
 from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
 from tasks.runners import asked_runner
-from tasks.store import Store, digest_raw_files
+from tasks.store import Store
 from tasks.workers import current_workers, together
-
-if TYPE_CHECKING:
-    from prefect import Flow
 
 P = ParamSpec("P")
 R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
 RawFiles = Callable[[dict[str, Any]], Sequence[tuple[str, Path]]]
 """From the stage's arguments to (name, path) of the raw files it will read; the names enter the key too."""
 
@@ -67,6 +67,20 @@ class PlannedStage:
     label: str
     key: str
     cached: bool
+    arguments: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
+    """As in the record of the artefact."""
+
+
+class Watcher(Protocol):
+    """Is told of stages while they run, from several threads."""
+
+    def progressed(self, key: str, progress: Progress) -> None:
+        """A stage has begun, or is so far."""
+        ...
+
+    def ended(self, key: str, rows: int, *, cached: bool) -> None:
+        """A stage has made its table of so many rows, or found it."""
+        ...
 
 
 @dataclasses.dataclass
@@ -75,6 +89,7 @@ class _Plan:
 
 
 _plan: ContextVar[_Plan | None] = ContextVar("ctlev_plan", default=None)
+_watcher: ContextVar[Watcher | None] = ContextVar("ctlev_watcher", default=None)
 _in_one_run: ContextVar[bool] = ContextVar("ctlev_in_one_run", default=False)
 _being_made: dict[str, threading.Lock] = {}
 """By key. Locks of this process, before those of the store, which hold against all."""
@@ -110,7 +125,30 @@ def in_one_run() -> Iterator[None]:
         _in_one_run.reset(token)
 
 
-def call_flow(flow: Flow[P, R], *arguments: P.args, **settings: P.kwargs) -> R:
+@contextlib.contextmanager
+def watched_by(watcher: Watcher) -> Iterator[None]:
+    """Inside this block a watcher is told of every stage that runs."""
+    token = _watcher.set(watcher)
+    try:
+        yield
+    finally:
+        _watcher.reset(token)
+
+
+class AnyFlow(Protocol[P, R_co]):
+    """A flow: called, it is a run of its own; `fn` is the function alone."""
+
+    @property
+    def fn(self) -> Callable[P, R_co]:
+        """What the flow does."""
+        ...
+
+    def __call__(self, *arguments: P.args, **settings: P.kwargs) -> R_co:
+        """Run it."""
+        ...
+
+
+def call_flow(flow: AnyFlow[P, R], *arguments: P.args, **settings: P.kwargs) -> R:
     """Call a Prefect flow, or only its wiring while planning and `in_one_run`."""
     return (flow.fn if _plan.get() is not None or _in_one_run.get() else flow)(*arguments, **settings)
 
@@ -173,12 +211,13 @@ class Stage:
         arguments = dict(list(bound.arguments.items())[1:])
         self.check(arguments)
         store = Store()
-        key = self.key(arguments, store)
+        materials = {name: _material(value) for name, value in arguments.items()}
+        key = self._key(arguments, materials, store)
         label = f"{self.name}: {label}" if label else self.name
         plan = _plan.get()
         if plan is not None:
             cached = store.find(self.name, key) is not None
-            plan.rows.append(PlannedStage(self.name, label, key, cached))
+            plan.rows.append(PlannedStage(self.name, label, key, cached, materials))
             return ManifestRef(key=key, path=store.folder(self.name, key))
         found = self.find(key, arguments) if _in_one_run.get() else None
         return found or _run_as_task(self, label, key, arguments)
@@ -188,8 +227,11 @@ class Stage:
 
     def key(self, arguments: dict[str, Any], store: Store) -> str:
         """The cache key: 32 hexadecimal digits of a SHA-256."""
+        return self._key(arguments, {name: _material(value) for name, value in arguments.items()}, store)
+
+    def _key(self, arguments: dict[str, Any], materials: dict[str, Any], store: Store) -> str:
         material: dict[str, Any] = {"stage": self.name, "version": self.version, "table": self.schema.version}
-        material["arguments"] = {name: _material(value) for name, value in arguments.items()}
+        material["arguments"] = materials
         if self.raw_files is not None:
             material["raw_files"] = digest_raw_files(self.raw_files(arguments), store.home)
             if material["raw_files"]:
@@ -198,6 +240,15 @@ class Stage:
 
     def run(self, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
         """Return the artefact and whether it was already there."""
+        watcher = _watcher.get()
+        if watcher is None:
+            return self._run(key, arguments)
+        with reporting_to(functools.partial(watcher.progressed, key)):
+            ref, cached = self._run(key, arguments)
+        watcher.ended(key, ref.rows, cached=cached)
+        return ref, cached
+
+    def _run(self, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
         found = self.find(key, arguments)
         if found is not None:
             return found, True
@@ -210,51 +261,47 @@ class Stage:
                     return found, True
                 return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
         store, upstream = Store(), _upstream(arguments)
-        with store.lock(key):
-            found = self._find(store, key, upstream)  # another process may have just finished it
+        with store.lock(key, f"artefact {self.name}/{key}"):
+            # Another process may have just finished it.
+            found = store.find(self.name, key, upstream, make_room=True)
             if found is not None:
                 return found, True
             return self._compute(store, key, arguments, upstream), False
 
     def find(self, key: str, arguments: dict[str, Any]) -> ManifestRef | None:
         """The artefact, if it is there and was made from inputs of the same content."""
-        return self._find(Store(), key, _upstream(arguments))
-
-    def _find(self, store: Store, key: str, upstream: dict[str, str]) -> ManifestRef | None:
-        found = store.find(self.name, key)
-        if found is None or store.upstream_digests(self.name, key) == upstream:
-            return found
-        store.set_aside(found.path)
-        return None
+        return Store().find(self.name, key, _upstream(arguments))
 
     def _compute(self, store: Store, key: str, arguments: dict[str, Any], upstream: dict[str, str]) -> ManifestRef:
+        if (report := current_report()) is not None:
+            report(Progress())  # until now it waited for its inputs, a free process, or another run
         folder, work = store.temporary_folder(key), store.work_folder(key)
         # We hold the lock of this key: whatever lies here was left by a process that died.
         shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        work.mkdir(parents=True, exist_ok=True)
-        opened = {name: _opened(value) for name, value in arguments.items()}
         started, wall, cpu = time.time(), time.perf_counter(), _cpu_seconds()
         try:
+            folder.mkdir(parents=True)
+            work.mkdir(parents=True, exist_ok=True)
+            opened = {name: _opened(value) for name, value in arguments.items()}
             table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
+            record = {
+                "stage": self.name,
+                "stage_version": self.version,
+                "key": key,
+                "arguments": {name: _material(value) for name, value in arguments.items()},
+                "upstream": upstream,
+                "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
+                "wall_seconds": round(time.perf_counter() - wall, 3),
+                "cpu_seconds": round(_cpu_seconds() - cpu, 3),
+                # Highest of the process so far, which is what decides whether a machine is large enough.
+                "process_peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+                "versions": _versions(),
+            }
+            return store.publish(self.name, key, folder, record)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        record = {
-            "stage": self.name,
-            "stage_version": self.version,
-            "key": key,
-            "arguments": {name: _material(value) for name, value in arguments.items()},
-            "upstream": upstream,
-            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
-            "wall_seconds": round(time.perf_counter() - wall, 3),
-            "cpu_seconds": round(_cpu_seconds() - cpu, 3),
-            # Highest of the process so far, which is what decides whether a machine is large enough.
-            "process_peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            "versions": _versions(),
-        }
-        return store.publish(self.name, key, folder, record)
 
 
 def numbered(label: str, number: int) -> str:

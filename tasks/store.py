@@ -14,9 +14,9 @@ published/<experiment>/    which artefacts are the versions of its synthetic dat
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import itertools
-import json
 import os
 import re
 import shutil
@@ -28,11 +28,14 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import IO, Any
 
 from data_contracts.errors import DataError
-from data_contracts.manifest import RUN_FILE, ManifestRef, file_digest, read_manifest
+from data_contracts.file_lists import file_digest
+from data_contracts.manifest import MANIFEST_FILE, ManifestRef, read_manifest
 from data_contracts.published import kept_versions
+from data_contracts.run_record import RUN_FILE, RunRecord, mark_used, read_run_record, write_run_record
+from tasks import file_locks
 
 KEEP_VERSIONS = 5
 MAX_SYNCS = 16
@@ -85,20 +88,38 @@ class Store:
         """Where an artefact is put together, on the same disk as its final place."""
         return self.home / "tmp" / key
 
-    def find(self, stage: str, key: str) -> ManifestRef | None:
-        """The finished artefact, or None. A damaged one is moved aside, so that it is made anew."""
+    def find(
+        self, stage: str, key: str, upstream: dict[str, str] | None = None, *, make_room: bool = False
+    ) -> ManifestRef | None:
+        """The finished artefact, or None where there is none, it is damaged, or was made from other inputs.
+
+        Args:
+            stage: that makes it.
+            key: its cache key.
+            upstream: digests of the manifests it must have been made from, by their keys; None for whichever.
+            make_room: move what cannot be used aside, so that it can be made anew. Only for who holds `lock(key)`:
+                else it may be what another process has just made in its place.
+
+        Raises:
+            OSError: the artefact cannot be read now, for reasons that say nothing about its content.
+        """
         self.use()
         folder = self.folder(stage, key)
-        if not folder.exists():
+        try:
+            folder.lstat()
+        except (FileNotFoundError, NotADirectoryError):
             return None
         try:
-            record = json.loads((folder / RUN_FILE).read_text())
-            ref = read_manifest(ManifestRef(key=key, path=folder, digest=record["digest"])).ref
-            _touch(folder)
-            return ref
-        except (DataError, OSError, KeyError, ValueError):
+            record = read_run_record(folder)
+            ref = read_manifest(ManifestRef(key=key, path=folder, digest=record.digest)).ref
+            if upstream is None or record.upstream == upstream:
+                mark_used(folder)
+                return ref
+        except DataError:
+            pass
+        if make_room:
             self.set_aside(folder)
-            return None
+        return None
 
     def set_aside(self, folder: Path) -> Path:
         """Move a damaged or outdated artefact out of the way without deleting it; returns its new place."""
@@ -109,18 +130,13 @@ class Store:
             folder.rename(target / f"{folder.name}.{number}")
         return target / f"{folder.name}.{number}"
 
-    def upstream_digests(self, stage: str, key: str) -> dict[str, str]:
-        """Digests of the manifests a finished artefact was made from."""
-        return json.loads((self.folder(stage, key) / RUN_FILE).read_text())["upstream"]
-
     @contextlib.contextmanager
-    def lock(self, key: str) -> Iterator[None]:
-        """Only one process makes an artefact; a second waits here and then finds it finished."""
+    def lock(self, key: str, what: str = "") -> Iterator[None]:
+        """Only one process makes an artefact; a second waits here, saying so, and then finds it finished."""
         path = self.home / "locks" / key
         path.parent.mkdir(parents=True, exist_ok=True)
         self.use()
-        with path.open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with file_locks.locked(path, what or f"artefact {key}"):
             yield
 
     def use(self) -> None:
@@ -136,9 +152,11 @@ class Store:
             try:
                 path.parent.mkdir(exist_ok=True)
                 file = path.open("ab")
-            except OSError:
-                return
-            fcntl.flock(file, fcntl.LOCK_SH)
+            except OSError as error:
+                if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+                    return
+                raise  # one that passes: unheld, what we find could be pruned
+            file_locks.lock(file, fcntl.LOCK_SH, f"a pruning of {self.home}")
             _used[self.home] = file
 
     @contextlib.contextmanager
@@ -163,8 +181,8 @@ class Store:
 
         What is under its final name is whole, and still there after a power failure once this has returned.
         """
-        record["digest"] = file_digest(temporary / "manifest.parquet")
-        (temporary / RUN_FILE).write_text(json.dumps(record, indent=2, sort_keys=True, default=str) + "\n")
+        digest = file_digest(temporary / MANIFEST_FILE)
+        write_run_record(temporary, RunRecord(**record, digest=digest))
         _share_as_the_record(temporary)
         folder = self.folder(stage, key)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -174,7 +192,7 @@ class Store:
         temporary.rename(folder)
         _sync(folder.parent)
         shutil.rmtree(self.work_folder(key), ignore_errors=True)
-        return read_manifest(ManifestRef(key=key, path=folder, digest=record["digest"])).ref
+        return read_manifest(ManifestRef(key=key, path=folder, digest=digest)).ref
 
     def artefacts(self) -> list[Stored]:
         """All finished artefacts, by stage and key. Links are not followed."""
@@ -189,13 +207,9 @@ class Store:
         Raises:
             DataError: it is damaged: a file is missing or has changed, or is a link to something outside the artefact.
             TableVersionError: it is of an older or newer version of the code; its files were not hashed.
-            OSError: it cannot be read.
+            OSError: it cannot be read now, which says nothing about its content.
         """
-        try:
-            record = json.loads((folder / RUN_FILE).read_text())
-            ref = ManifestRef(key=folder.name, path=folder, digest=record["digest"])
-        except (FileNotFoundError, IsADirectoryError, KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{folder / RUN_FILE}: is not a provenance record: {error!r}") from error
+        ref = ManifestRef(key=folder.name, path=folder, digest=read_run_record(folder).digest)
         for path in (path for path in folder.rglob("*") if path.is_symlink()):
             if not path.resolve().is_relative_to(folder.resolve()):
                 raise DataError(f"{path}: is a link to something outside the artefact")
@@ -257,79 +271,6 @@ class StoreInUseError(RuntimeError):
     """The store cannot be pruned because a run uses it."""
 
 
-def digest_raw_files(files: Sequence[tuple[str, Path]], home: Path) -> list[list[str]]:
-    """[name, SHA-256 of the content] of each named file. What was read before is known by path, size and time.
-
-    Planning an experiment hashes its raw recordings; a second plan must not read them again.
-    """
-    if not files:
-        return []
-    digests = RawFileDigests(home)
-    found = [[name, digests.digest(path)] for name, path in files]
-    digests.save()
-    return found
-
-
-class RawFileDigests:
-    """SHA-256 of raw input files, remembered by path, size and modification time."""
-
-    _read: ClassVar[dict[Path, tuple[tuple[int, int], dict[str, list]]]] = {}
-    """What a process has read of a home, until somebody writes it anew: of a million files it takes seconds."""
-
-    def __init__(self, home: Path) -> None:
-        """Read what the home remembers."""
-        self.path = home / "raw_file_digests.json"
-        self.artefacts = home.resolve() / "artefacts"
-        self.known: dict[str, list] = {}
-        with contextlib.suppress(OSError, ValueError):
-            written = _identity(self.path)
-            before, known = self._read.get(self.path, (None, {}))
-            self.known = known if before == written else json.loads(self.path.read_text())
-            self._read[self.path] = (written, self.known)
-        self.changed = False
-
-    def digest(self, path: Path) -> str:
-        """SHA-256 of the file's content."""
-        status = path.stat()
-        identity = [status.st_size, status.st_mtime_ns, status.st_ino]
-        resolved = path.resolve()
-        name = str(resolved)
-        if resolved.is_relative_to(self.artefacts):  # a base model that was trained here, say
-            _touch(self.artefacts.joinpath(*resolved.relative_to(self.artefacts).parts[:2]))
-        entry = self.known.get(name)
-        if entry is None or entry[:3] != identity:
-            entry = [*identity, file_digest(path)]
-            self.known[name] = entry
-            self.changed = True
-        return entry[3]
-
-    def save(self) -> None:
-        """Write what was learnt, atomically."""
-        if not self.changed:
-            return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.path.with_suffix(f".{uuid.uuid4().hex}.tmp")  # threads, and containers that count alike
-        temporary.write_text(json.dumps(dict(self.known)))
-        written = _identity(temporary)
-        temporary.replace(self.path)
-        self._read[self.path] = (written, self.known)
-        self.changed = False
-
-
-def _identity(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_ino, status.st_mtime_ns
-
-
-def _touch(folder: Path) -> None:
-    """Note that an artefact is used, as the modification time of its provenance record.
-
-    A time stamp needs no file or lock of its own, moves with the artefact, and no digest covers it.
-    """
-    with contextlib.suppress(OSError):  # not ours to write; reading goes on
-        os.utime(folder / RUN_FILE)
-
-
 def _share_as_the_record(folder: Path) -> None:
     """Who may read the provenance record may read every file beside it: safetensors makes its own private (0600)."""
     mode = stat.S_IMODE((folder / RUN_FILE).stat().st_mode)
@@ -363,8 +304,8 @@ def _stored(kind: str, name: str, folder: Path) -> Stored:
 def _keys_in(record: Path) -> set[str]:
     """Whatever looks like a key in a provenance record: its inputs, and artefacts whose path an option names."""
     try:
+        read_run_record(record.parent)
         text = record.read_text()
-        json.loads(text)
     except (OSError, ValueError) as error:
         raise DataError(f"{record}: cannot be read, so its inputs are unknown; run flows/verify.py first") from error
     return set(re.findall(r"(?<![0-9a-f])[0-9a-f]{32}(?![0-9a-f])", text))

@@ -1,4 +1,4 @@
-"""Parts of a set of synthetic frames: the first ones, or those that show best what their labels say."""
+"""Parts of a set of frames: so many recorded ones, the first synthetic ones, or those that show their labels best."""
 
 from __future__ import annotations
 
@@ -8,12 +8,36 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.labels.label_sampling import spread_choice
 from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
+from data_contracts.image_rows import image_chunks
 from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
+
+
+@stage(version=1, schema=tables.FRAMES)
+def take_recorded(out: Output, frames: Manifest, *, count: int, seed: int) -> pa.Table:
+    """`count` training frames, spread evenly over subjects and classes and their recordings; all other splits whole.
+
+    Raises:
+        DataError: there are fewer training frames.
+    """
+    splits, learnt = np.array(frames.column("split")), frames.rows_where(split="train")
+    if len(learnt) < count:
+        raise DataError(
+            f"num_recorded: {count} training frames were asked for, the recordings give {len(learnt)}; lower it, or "
+            f"raise windows.max_windows"
+        )
+    columns = [np.array(frames.column(name))[learnt].tolist() for name in ("subject", "class_name", "recording_id")]
+    groups = [f"{subject}/{class_name}" for subject, class_name in zip(*columns[:2], strict=True)]
+    chosen = learnt[spread_choice(groups, columns[2], count, seed)]
+    rows = np.sort(np.concatenate([chosen, np.flatnonzero(splits != "train")]))
+    for name in ("histograms", "frames"):
+        _copy_rows(out, frames, rows, name)
+    return frames.table.take(rows)
 
 
 @stage(version=1, schema=tables.SYNTHETIC)
@@ -43,7 +67,7 @@ def take_label_consistent(
     plugin, scorer = plugins.load_options(downstream), plugins.load_options(metric)
     if not hasattr(scorer.module, "compute_rows"):
         raise DataError(f"keep_fraction: metric {metric.name!r} has no score of single frames to choose by")
-    prediction: Any = plugin.module.predict(model.ref.path / "model", np.asarray(synthetic.array("frames")))
+    prediction: Any = plugin.module.predict(model.ref.path / "model", synthetic.images(np.arange(len(synthetic))))
     scores = scorer.module.compute_rows(prediction, synthetic.labels, scorer.options)
     # As elsewhere the name of the score decides, which need not be that of the plug-in.
     first = next(iter(scorer.module.compute(prediction, synthetic.labels, scorer.options)))
@@ -59,5 +83,11 @@ def take_label_consistent(
 
 
 def _take(out: Output, synthetic: Manifest, rows: np.ndarray) -> pa.Table:
-    out.write_array("frames", np.asarray(synthetic.array("frames")[rows]))
+    _copy_rows(out, synthetic, rows, "frames")
     return synthetic.table.take(rows)
+
+
+def _copy_rows(out: Output, source: Manifest, rows: np.ndarray, name: str) -> None:
+    with out.open_array(name) as written:
+        for images in image_chunks(source.images(rows, name)):
+            written.append(images)

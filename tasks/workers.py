@@ -21,10 +21,10 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar, copy_context
-from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
-from ctlev_core.processes import num_cores
+from ctlev_core.processes import module_environment, num_cores
+from ctlev_core.progress import Progress, Report, current_report, reporting_to
 from tasks.runners import ALONE, Runner, WorkerError, asked_cluster, asked_runner, reply_to, reply_with
 
 R = TypeVar("R")
@@ -42,18 +42,14 @@ class Worker:
     """One process that is handed calls.
 
     Args:
-        position: of its progress bar, lines below the cursor.
         threads: for torch and others.
     """
 
-    def __init__(self, position: int, threads: int) -> None:
-        root = str(Path(__file__).resolve().parents[1])
+    def __init__(self, threads: int) -> None:
         environment = {
-            **os.environ,
+            **module_environment(os.environ),
             **ALONE,
-            "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")])),
             "OMP_NUM_THREADS": str(threads),
-            "TQDM_POSITION": str(position),
         }
         command = [sys.executable, "-m", "tasks.workers"]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
@@ -69,7 +65,10 @@ class Worker:
         try:
             self._process.stdin.write(request)
             self._process.stdin.flush()
-            succeeded, result = pickle.load(self._process.stdout)
+            while isinstance(received := pickle.load(self._process.stdout), Progress):
+                if (report := current_report()) is not None:
+                    report(received)
+            succeeded, result = received
         except (EOFError, BrokenPipeError, pickle.UnpicklingError) as error:
             code = self._process.wait()
             ended = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
@@ -118,7 +117,7 @@ class Workers:
             with self._lock:
                 if self._closed:
                     raise WorkerError("the processes that run stages are closed")
-                worker = self._workers[number] = self._workers[number] or Worker(number, self._threads)
+                worker = self._workers[number] = self._workers[number] or Worker(self._threads)
             return worker.call(function, *arguments)
         finally:
             self._free.put(number)
@@ -212,7 +211,7 @@ def map_shards(
         pending: deque[Future[list[R]]] = deque()
         try:
             for group in _groups(shards, runner.count, max_group):
-                pending.append(threads.submit(runner.call, _call_each, function, group))
+                pending.append(threads.submit(_call_each_on, runner, current_report(), function, group))
                 if len(pending) > WAITING * runner.count:
                     yield from pending.popleft().result()
             while pending:
@@ -237,6 +236,12 @@ def _groups(shards: Sequence[S], count: int, max_group: int = MAX_GROUP) -> Iter
         size = min(max((len(shards) - start) // (2 * count), 1), max_group)
         yield shards[start : start + size]
         start += size
+
+
+def _call_each_on(runner: Runner, report: Report | None, function: Callable[[S], R], shards: Sequence[S]) -> list[R]:
+    """In a thread, which does not know by itself to whom it reports."""
+    with reporting_to(report):
+        return runner.call(_call_each, function, shards)
 
 
 def _call_each(function: Callable[[S], R], shards: Sequence[S]) -> list[R]:
@@ -279,6 +284,13 @@ def _serve() -> None:
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started us decides
     signal.signal(signal.SIGTERM, _give_up)
+    sending = threading.Lock()
+
+    def send(reply: bytes) -> None:
+        with sending:
+            replies.write(reply)
+            replies.flush()
+
     calls: queue.SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]] | Exception] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(sys.stdin.buffer, calls), daemon=True).start()
     while True:
@@ -286,11 +298,11 @@ def _serve() -> None:
             received = calls.get()
             if isinstance(received, Exception):
                 raise received
-            reply = reply_to(*received)
+            with reporting_to(lambda progress: send(pickle.dumps(progress))):
+                reply = reply_to(*received)
         except Exception as error:
             reply = reply_with(error)
-        replies.write(reply)
-        replies.flush()
+        send(reply)
 
 
 def _give_up(number: int, frame: object) -> None:

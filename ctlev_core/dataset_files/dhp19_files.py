@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctlev_core.safe_files import hdf5_files
 from data_contracts.errors import DataError
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ VICON_JOINTS = (
 MAX_SPECIAL_EVENTS = 5
 FRAME_WIDTHS = (344, 346)
 FRAMES_A_BLOCK = 16
+MAX_LABEL_BYTES = 2**30
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,9 +239,13 @@ def read_frame_labels(path: Path, frames_path: Path | None = None) -> np.ndarray
     Raises:
         DataError: not such a file, or it has not one label a frame.
     """
-    positions = _read_dataset(path, "XYZ", lambda data: data[:] if data.ndim == 3 else data[()])
-    if positions.ndim != 3 or positions.shape[1:] != (3, len(VICON_JOINTS)):
-        raise DataError(f"{path}: /XYZ must be [N, 3, {len(VICON_JOINTS)}], got {positions.shape}")
+
+    def positions_of(data: h5py.Dataset) -> np.ndarray:
+        if data.ndim != 3 or data.shape[1:] != (3, len(VICON_JOINTS)):
+            raise DataError(f"{path}: /XYZ must be [N, 3, {len(VICON_JOINTS)}], got {data.shape}")
+        return hdf5_files.check_dataset(data, f"{path}: /XYZ", MAX_LABEL_BYTES)[:]
+
+    positions = _read_dataset(path, "XYZ", positions_of)
     num_frames = (
         len(positions) if frames_path is None else _read_dataset(frames_path, "DVS", lambda data: data.shape[0])
     )
@@ -298,11 +304,10 @@ def _read_dataset(path: Path, name: str, read: Callable[[Any], Any]) -> Any:
         raise DataError(f"{path}: no such file")
     try:
         with h5py.File(path, "r") as file:
-            data = file.get(name)
+            data = hdf5_files.find_object(file, name, str(path))
             if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "fiu":
-                raise DataError(
-                    f"{path}: expected numbers in /{name}, got {data!r}; it holds {', '.join(file) or 'nothing'}"
-                )
-            return read(data)
-    except OSError as error:
+                held = ", ".join(file)[:200] or "nothing"
+                raise DataError(f"{path}: expected numbers in /{name}, got {data!r}; it holds {held}")
+            return read(hdf5_files.check_dataset(data, f"{path}: /{name}"))
+    except (OSError, RuntimeError) as error:
         raise DataError(f"{path}: expected an HDF5 file: {error}") from error

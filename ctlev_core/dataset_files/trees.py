@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from data_contracts.errors import DataError
+from data_contracts.errors import DataError, DetailedDataError
 
 T = TypeVar("T")
 
@@ -27,26 +27,26 @@ def check_root(root: Path, tree: str, is_root: Callable[[Path], bool]) -> Path:
         tree: the expected tree, for the error.
         is_root: does a folder look like the root?
     Raises:
-        DataError: no such folder, or it is not the root: one level too high or too low, not unpacked, or something
-            else; the message says which, and shows the tree.
+        DetailedDataError: no such folder, or it is not the root: one level too high or too low, not unpacked, or
+            something else; the message says which, and shows the tree.
     """
     if not root.is_dir():
         problem = "a file, not a folder" if root.exists() else "no such folder"
-        raise DataError(f"{root}: {problem}; {tree}")
+        raise DetailedDataError(f"{root}: {problem}; {tree}")
     if is_root(root):
         return root
     folders = [entry for entry in list_folder(root) if entry.is_dir()]
     below = [entry for folder in folders[:MAX_SEARCHED] for entry in list_folder(folder) if entry.is_dir()]
     for candidate in [*folders, *below][:MAX_SEARCHED]:
         if is_root(candidate):
-            raise DataError(f"{root}: not the dataset itself; the root is {candidate}; {tree}")
+            raise DetailedDataError(f"{root}: not the dataset itself; the root is {candidate}; {tree}")
     for parent in list(root.resolve().parents)[:2]:
         if is_root(parent):
-            raise DataError(f"{root}: lies inside the dataset; the root is {parent}; {tree}")
+            raise DetailedDataError(f"{root}: lies inside the dataset; the root is {parent}; {tree}")
     packed = [entry.name for entry in list_folder(root) if entry.suffix.lower() in ARCHIVES]
     if packed:
-        raise DataError(f"{root}: holds archives that are not unpacked ({', '.join(packed[:3])}); {tree}")
-    raise DataError(f"{root}: not the expected folder; {tree}")
+        raise DetailedDataError(f"{root}: holds archives that are not unpacked ({', '.join(packed[:3])}); {tree}")
+    raise DetailedDataError(f"{root}: not the expected folder; {tree}")
 
 
 def list_folder(folder: Path) -> list[Path]:

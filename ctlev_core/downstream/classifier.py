@@ -19,6 +19,7 @@ from ctlev_core.networks.resnet_files import ARCHITECTURES, SMALL_CNN, check_bat
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def input_files(options: Options) -> list[Path]:
 
 
 def train(
-    frames: np.ndarray,
+    frames: Images,
     labels: Labels,
     options: Options,
     *,
@@ -136,7 +137,7 @@ def train(
     return history
 
 
-def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+def predict(model: Path, frames: Images) -> Mapping[str, np.ndarray]:
     """Class probabilities of each frame.
 
     Args:
@@ -151,7 +152,7 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
     return {"probability": probability.reshape(len(frames), len(classes)), "classes": classes}
 
 
-def predict_recordings(model: Path, frames: np.ndarray, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+def predict_recordings(model: Path, frames: Images, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
     """As `predict`; a classifier trained with `by_recording` gives all N frames of a recording their mean.
 
     Args:
@@ -171,13 +172,13 @@ def predict_recordings(model: Path, frames: np.ndarray, recordings: Sequence[str
     return {**found, "probability": means[index].astype(np.float32)}
 
 
-def features(model: Path, frames: np.ndarray) -> np.ndarray:
+def features(model: Path, frames: Images) -> np.ndarray:
     """Pooled features [N, D] float32 in front of the head: what the Frechet distance compares."""
     network, config = _read_model(model)
     return _run(network, network.features, frames).reshape(len(frames), _num_features(config["shape"]))
 
 
-def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) -> tuple[tuple[str, ...], np.ndarray]:
+def _check_training_set(frames: Images, labels: Labels, options: Options) -> tuple[tuple[str, ...], np.ndarray]:
     from ctlev_core.supervised.models import check_frames
 
     where = "train classifier"
@@ -231,7 +232,7 @@ def _read_model(folder: Path) -> tuple[Any, dict[str, Any]]:
     return network.to(models.resolve_device("auto")), config
 
 
-def _run(network: Any, function: Any, frames: np.ndarray) -> np.ndarray:
+def _run(network: Any, function: Any, frames: Images) -> np.ndarray:
     from ctlev_core.supervised import models
 
     models.check_frames(frames, "predict classifier")

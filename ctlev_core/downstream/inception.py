@@ -18,7 +18,8 @@ from pydantic import Field
 from ctlev_core.networks import feature_extractors
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
-from data_contracts.manifest import file_digest
+from data_contracts.file_lists import file_digest
+from data_contracts.image_rows import Images
 
 VERSION = 1
 NAME = "inception"
@@ -54,7 +55,7 @@ def input_files(options: Options) -> list[Path]:
     return [options.file]
 
 
-def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarray:
+def features(model: Path, frames: Images, device: str = "auto") -> np.ndarray:
     """Features [N, 2048] float32 of frames [N, H, W, 3] uint8, of any size.
 
     Raises:

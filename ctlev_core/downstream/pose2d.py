@@ -20,6 +20,7 @@ from ctlev_core.supervised.image_shifts import shift_images
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels, check_labels
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def input_files(options: Options) -> list[Path]:
 
 
 def train(
-    frames: np.ndarray,
+    frames: Images,
     labels: Labels,
     options: Options,
     *,
@@ -118,7 +119,6 @@ def train(
     joints2d, visible = _check_training_set(frames, labels, options)
     weights = models.file_digests(input_files(options))
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
-    grey = _grey(frames)
     device = models.resolve_device(options.device)
     model: Any = models.build_seeded(lambda: _build(joints2d.shape[1], options), seed)
     if options.weights:
@@ -129,12 +129,12 @@ def train(
     def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
         import torch
 
-        images, points, seen = grey[rows], joints2d[rows], visible[rows]
+        images, points, seen = _grey(frames[rows]), joints2d[rows], visible[rows]
         if generator is not None:
             images, points = _shift(images, points, options.shift_px, generator)
             if mirror is not None:
                 images, points, seen = _flip_half(images, points, seen, mirror, generator)
-        inside = seen & _inside(points, grey.shape[1:])
+        inside = seen & _inside(points, frames.shape[1:3])
         with models.mixed_precision(options, device):
             heatmaps = model(_to_input(torch.from_numpy(images).to(device)))
         points_tensor = torch.from_numpy(np.where(inside[..., None], points, 0).astype(np.float32)).to(device)
@@ -147,7 +147,7 @@ def train(
         options,
         seed=seed,
         work=work,
-        run_digest=models.digest(NAME, VERSION, cache_material(options), weights, seed, grey, joints2d, visible),
+        run_digest=models.digest(NAME, VERSION, cache_material(options), weights, seed, frames, joints2d, visible),
         description="train pose2d",
     )
     models.write_model(
@@ -166,7 +166,7 @@ def train(
     return history
 
 
-def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+def predict(model: Path, frames: Images) -> Mapping[str, np.ndarray]:
     """Joints of each frame.
 
     Args:
@@ -185,14 +185,14 @@ def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
     models.read_weights(model, network)
     network.to(models.resolve_device("auto"))
     batches = models.predict_in_batches(
-        network, lambda images: _decode(network(_to_input(images)), options), _grey(frames)
+        network, lambda images: _decode(network(_to_input(images.amax(dim=-1))), options), frames
     )
     joints2d = [points.cpu().numpy() for points, _ in batches] or [np.zeros((0, config["num_joints"], 2), np.float32)]
     confidence = [values.cpu().numpy() for _, values in batches] or [np.zeros((0, config["num_joints"]), np.float32)]
     return {"joints2d": np.concatenate(joints2d), "confidence": np.concatenate(confidence)}
 
 
-def _check_training_set(frames: np.ndarray, labels: Labels, options: Options) -> tuple[np.ndarray, np.ndarray]:
+def _check_training_set(frames: Images, labels: Labels, options: Options) -> tuple[np.ndarray, np.ndarray]:
     from ctlev_core.supervised.models import check_frames
 
     where = "train pose2d"

@@ -29,6 +29,7 @@ from ctlev_core.supervised.frame_sequences import find_sequences
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels, check_labels
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def input_files(options: Options) -> list[Path]:
 
 
 def train(
-    frames: np.ndarray,
+    frames: Images,
     labels: Labels,
     options: Options,
     *,
@@ -121,7 +122,7 @@ def train(
 
 
 def train_sequences(
-    frames: np.ndarray,
+    frames: Images,
     labels: Labels,
     options: Options,
     *,
@@ -216,12 +217,12 @@ def train_sequences(
     return history
 
 
-def predict(model: Path, frames: np.ndarray) -> Mapping[str, np.ndarray]:
+def predict(model: Path, frames: Images) -> Mapping[str, np.ndarray]:
     """`predict_sequences` of frames that follow from no others: each is a recording of its own."""
     return predict_sequences(model, frames, ())
 
 
-def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+def predict_sequences(model: Path, frames: Images, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
     """The body of each frame, from it and the frames of its recording just before it.
 
     Args:
@@ -279,7 +280,7 @@ def predict_sequences(model: Path, frames: np.ndarray, recordings: Sequence[str]
     return empty | {name: np.concatenate([part.cpu().numpy() for part in parts]) for name, parts in columns}
 
 
-def _check_training_set(frames: np.ndarray, labels: Labels) -> BodySamples:
+def _check_training_set(frames: Images, labels: Labels) -> BodySamples:
     from ctlev_core.body.rotations import matrix_from_axis_angle
     from ctlev_core.supervised.models import check_frames
 

@@ -1,5 +1,8 @@
 """Features of a TorchScript file, such as the Inception network that the Frechet inception distance is defined with.
 
+A TorchScript file is a program: loaded, it runs what it holds, which may read and write any file of the user. So only
+the published Inception file runs by itself; of any other somebody must say, with `trusted`, that they know it.
+
 Nothing is trained: the file is kept with its checksum. Distances in its features are called `fid` and `kid` only where
 the checksum is that of `inception-2015-12-05.pt`; that file takes images in 0..255 and resizes them itself.
 
@@ -18,7 +21,8 @@ from pydantic import Field
 from ctlev_core.networks import feature_extractors
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
-from data_contracts.manifest import file_digest
+from data_contracts.file_lists import file_digest
+from data_contracts.image_rows import Images
 
 VERSION = 1
 NAME = "torchscript"
@@ -44,6 +48,11 @@ class Options(Frozen):
     image_size: int = Field(
         default=0, ge=0, description="images are squeezed to so many px a side (bicubic, antialiased); 0 = as they are"
     )
+    trusted: bool = Field(
+        default=False,
+        json_schema_extra=RUN_SETTING,
+        description="run the program in a file other than FID's Inception; it may read and write any file of yours",
+    )
     device: str = Field(
         default="auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING
     )
@@ -53,11 +62,18 @@ def input_files(options: Options) -> list[Path]:
     """The file.
 
     Raises:
-        DataError: none is named, it is missing, or it is the published Inception with a preprocessing not its own.
+        DataError: none is named, it is missing, it is the published Inception with a preprocessing not its own, or
+            another one that nobody has said to trust.
     """
     if options.file is None or not options.file.is_file():
         raise DataError(f"torchscript: expected option `file` to be a TorchScript file, got {options.file}")
-    if (options.values, options.image_size) != ("0..255", 0) and _is_inception(options.file):
+    is_inception = _is_inception(options.file)
+    if not (is_inception or options.trusted):
+        raise DataError(
+            f"{options.file}: is not FID's Inception of known checksum; a TorchScript file is a program that may read "
+            "and write any file of yours: if you know where it is from, set the option trusted=true"
+        )
+    if (options.values, options.image_size) != ("0..255", 0) and is_inception:
         raise DataError(
             f"{options.file} is the Inception network of FID, which takes 0..255 and resizes by itself; "
             f"expected values 0..255 and image_size 0, got {options.values} and {options.image_size}"
@@ -65,7 +81,7 @@ def input_files(options: Options) -> list[Path]:
     return [options.file]
 
 
-def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarray:
+def features(model: Path, frames: Images, device: str = "auto") -> np.ndarray:
     """Features [N, D] float32 of frames [N, H, W, 3] uint8.
 
     Raises:

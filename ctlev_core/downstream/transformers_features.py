@@ -18,6 +18,7 @@ from pydantic import Field
 from ctlev_core.networks import feature_extractors
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images
 
 VERSION = 1
 NAME = "transformers_features"
@@ -67,7 +68,7 @@ def input_files(options: Options) -> list[Path]:
     return [folder / _CONFIG, folder / _PREPROCESSOR, *sorted(folder.glob("model*.index.json")), *weights]
 
 
-def features(model: Path, frames: np.ndarray, device: str = "auto") -> np.ndarray:
+def features(model: Path, frames: Images, device: str = "auto") -> np.ndarray:
     """Features [N, D] float32 of frames [N, H, W, 3] uint8.
 
     Raises:

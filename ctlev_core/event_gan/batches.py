@@ -12,6 +12,7 @@ from torch import Tensor
 from ctlev_core.event_gan.event_images import Palette, frames_to_volumes, pairs_to_tensor
 from ctlev_core.event_gan.options import TrainingOptions
 from ctlev_core.supervised.batches import batch_rows
+from data_contracts.image_rows import Images, as_image_rows
 
 # Entropy that keeps random streams apart.
 _SPLIT_STREAM, _BATCH_STREAM = 20, 21
@@ -29,14 +30,15 @@ class Pairs:
         one_event: value of one event, in (0, 1].
     """
 
-    conditions: np.ndarray
-    frames: np.ndarray
+    conditions: Images
+    frames: Images
     palette: Palette
     one_event: float
 
     def take(self, rows: np.ndarray) -> Pairs:
         """The given rows."""
-        return Pairs(self.conditions[rows], self.frames[rows], self.palette, self.one_event)
+        conditions, frames = (as_image_rows(images).take(rows) for images in (self.conditions, self.frames))
+        return Pairs(conditions, frames, self.palette, self.one_event)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,13 +16,14 @@ from torch import Tensor
 
 from ctlev_core.event_gan.options import SamplingOptions
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images, image_chunks
 from data_contracts.labels import Conditions
 
 Palette = Literal["grey", "red_blue"]
 NUM_CHANNELS: dict[str, int] = {"grey": 1, "red_blue": 2}
 
 
-def check_pairs(conditions: Conditions, where: str) -> np.ndarray:
+def check_pairs(conditions: Conditions, where: str) -> Images:
     """The intensity pairs [N, H, W, 3] uint8 of `conditions`: frame at the window's start, at its end, zeros.
 
     Raises:
@@ -36,16 +37,16 @@ def check_pairs(conditions: Conditions, where: str) -> np.ndarray:
         raise DataError(f"{where}: pairs must be [N, H, W, 3] uint8, got {list(images.shape)} {images.dtype}")
     if len(images) != len(conditions):
         raise DataError(f"{where}: {len(images)} pairs do not match {len(conditions)} prompts")
-    if images[..., 2].any():
-        row = int(np.argmax(images[..., 2].any(axis=(1, 2))))
-        raise DataError(
-            f"{where}: condition images must hold the intensity frames at start and end of a window in channels 0 and "
-            f"1, and zeros in channel 2, which row {row} has not; is it a picture of another kind?"
-        )
+    for row, image in enumerate(images):
+        if image[..., 2].any():
+            raise DataError(
+                f"{where}: condition images must hold the intensity frames at start and end of a window in channels 0 "
+                f"and 1, and zeros in channel 2, which row {row} has not; is it a picture of another kind?"
+            )
     return images
 
 
-def check_event_images(frames: np.ndarray, pairs: np.ndarray, where: str) -> Palette:
+def check_event_images(frames: Images, pairs: Images, where: str) -> Palette:
     """The palette of real event images, which must fit their pairs.
 
     Returns:
@@ -60,18 +61,24 @@ def check_event_images(frames: np.ndarray, pairs: np.ndarray, where: str) -> Pal
             f"{where}: frames must have the shape of the pairs, {list(pairs.shape)} uint8, "
             f"got {list(frames.shape)} {frames.dtype}"
         )
-    if not frames.any():
+    has_event = has_green = False
+    is_grey = True
+    for chunk in image_chunks(frames):
+        has_event |= bool(chunk.any())
+        has_green |= bool(chunk[..., 1].any())
+        is_grey &= bool((chunk == chunk[..., :1]).all())
+    if not has_event:
         raise DataError(f"{where}: none of the {len(frames)} frames has an event")
-    if not frames[..., 1].any():
+    if not has_green:
         return "red_blue"
-    if np.array_equal(frames[..., 0], frames[..., 1]) and np.array_equal(frames[..., 0], frames[..., 2]):
+    if is_grey:
         return "grey"
     raise DataError(
         f"{where}: event images must be grey (three equal channels) or red and blue (no green), got another colour"
     )
 
 
-def one_event_value(frames: np.ndarray) -> float:
+def one_event_value(frames: Images) -> float:
     """The value in (0, 1] that one event has in event images: the median over images of the smallest value above 0.
 
     The encodings scale every window by itself, so that there is no one value for all. Images that are averages over

@@ -16,6 +16,7 @@ from ctlev_core.event_gan.networks import EventVolumeUNet
 from ctlev_core.event_gan.options import SamplingOptions
 from ctlev_core.supervised import models
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images
 
 NAME = "event_gan"
 
@@ -77,7 +78,7 @@ def load_checkpoint(folder: Path, device: str) -> Checkpoint:
     return checkpoint
 
 
-def check_sampling(checkpoint: Checkpoint, pairs: np.ndarray, seeds: Sequence[int]) -> None:
+def check_sampling(checkpoint: Checkpoint, pairs: Images, seeds: Sequence[int]) -> None:
     """Raise `ValueError` unless there is a seed a pair, and `DataError` unless pairs have the size of training."""
     if len(seeds) != len(pairs):
         raise ValueError(f"one seed a pair is needed, got {len(seeds)} seeds for {len(pairs)} pairs")
@@ -92,7 +93,7 @@ def check_sampling(checkpoint: Checkpoint, pairs: np.ndarray, seeds: Sequence[in
 @torch.no_grad()
 def sample_frames(
     network: nn.Module,
-    pairs: np.ndarray,
+    pairs: Images,
     palette: Palette,
     one_event: float,
     options: SamplingOptions,
@@ -104,7 +105,7 @@ def sample_frames(
     One pair at a time: convolutions round differently at other batch sizes, and no row may depend on another.
     """
     device = next(network.parameters()).device
-    frames = np.empty_like(pairs)
+    frames = np.empty(pairs.shape, np.uint8)
     for row, seed in enumerate(seeds):
         volume = network(pairs_to_tensor(pairs[row : row + 1]).to(device)).cpu().numpy()
         frames[row] = volumes_to_frames(volume, palette, one_event, options, [seed])[0]

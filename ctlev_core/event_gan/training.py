@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from ctlev_core.event_gan import losses
 from ctlev_core.event_gan.batches import Batch, Pairs, make_batch, split_rows
@@ -24,6 +23,7 @@ from ctlev_core.event_gan.local_statistics import local_statistics_error
 from ctlev_core.event_gan.networks import EventVolumeUNet, build_discriminator, generator_arguments
 from ctlev_core.event_gan.options import SamplingOptions, TrainingOptions
 from ctlev_core.event_gan.sampling import sample_frames
+from ctlev_core.progress import ProgressBar
 from ctlev_core.supervised.batches import batch_rows
 from ctlev_core.supervised.checkpoints import read_training_state, write_training_state
 from ctlev_core.supervised.models import build_seeded, resolve_device
@@ -161,16 +161,17 @@ class EventGAN:
     def validate(self) -> None:
         """Judge the averaged generator on the held back pairs and keep it where it is the best so far."""
         network, data, history = self.calibrate_average(), self.validation, self.curves.history
+        real = np.asarray(data.frames)
         frames = sample_frames(
             network, data.conditions, data.palette, data.one_event, SamplingOptions(), seeds=range(len(data.frames))
         )
-        error = local_statistics_error(frames, data.frames)
+        error = local_statistics_error(frames, real)
         if not history.validation_loss or error < min(history.validation_loss):
             self.best = {name: value.clone() for name, value in network.state_dict().items()}
             self.curves.best_step = self.step
         history.validation_step.append(self.step)
         history.validation_loss.append(error)
-        history.shuffled_loss.append(local_statistics_error(np.roll(frames, 1, axis=0), data.frames))
+        history.shuffled_loss.append(local_statistics_error(np.roll(frames, 1, axis=0), real))
 
     def log(self) -> None:
         """A row of the loss curves: the means since the last row."""
@@ -232,7 +233,7 @@ def train_generator(data: Pairs, options: TrainingOptions, *, seed: int, work: P
     gan.generator.train()
     gan.discriminator.train()
     saved = time.monotonic()
-    progress = tqdm(total=options.num_steps, initial=gan.step, desc="Event-GAN", unit="step", leave=False, disable=None)
+    progress = ProgressBar(total=options.num_steps, initial=gan.step, desc="Event-GAN", unit="step")
     with progress:
         while gan.step < options.num_steps:
             gan.train_step()
@@ -240,7 +241,7 @@ def train_generator(data: Pairs, options: TrainingOptions, *, seed: int, work: P
             is_last = gan.step == options.num_steps
             if gan.step % options.log_every == 0 or is_last:
                 gan.log()
-                progress.set_postfix(generator=f"{gan.curves.history.loss[-1]:.3f}", refresh=False)
+                progress.note(f"generator {gan.curves.history.loss[-1]:.3f}")
             if len(gan.validation.frames) and (gan.step % options.validation_every == 0 or is_last):
                 gan.validate()
             if time.monotonic() - saved > options.checkpoint_every_s or is_last:

@@ -26,7 +26,6 @@ Which labels there are depends on the data; `joint_set` names the order of the j
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -48,12 +47,12 @@ from data_contracts.image_folder import read_image_table
 from data_contracts.manifest import (
     LABEL_COLUMNS,
     MANIFEST_FILE,
-    RUN_FILE,
     Manifest,
     ManifestRef,
     labels_of,
     read_manifest,
 )
+from data_contracts.run_record import read_run_record
 
 Sample = dict[str, Any]
 _TEXTS = ("sample_id", "prompt")
@@ -222,11 +221,7 @@ def _open_artefact(ref: ManifestRef, conditions: bool) -> tuple[pa.Table, _Image
 
 
 def _reference(folder: Path) -> ManifestRef:
-    try:
-        digest = json.loads((folder / RUN_FILE).read_text())["digest"]
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{folder / RUN_FILE}: is not a provenance record: {error!r}") from error
-    return ManifestRef(key=folder.name, path=folder, digest=digest)
+    return ManifestRef(key=folder.name, path=folder, digest=read_run_record(folder).digest)
 
 
 def _conditions_of(generated: Manifest) -> _Array | None:

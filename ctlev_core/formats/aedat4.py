@@ -2,20 +2,19 @@
 
 Only the event stream is read. Time stamps are the file's own, unix time in microseconds.
 
-Source: iniVation, "AEDAT 4.0 file format"; decoded by the `aedat` package.
+Source: iniVation, "AEDAT 4.0 file format"; decoded by the `aedat` package, in a process of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ctlev_core.events.decoding import event_chunks
+from ctlev_core.events.decoding import aedat4_process, event_chunks
 from data_contracts.errors import DataError
-from data_contracts.events import Events
+from data_contracts.events import Events, SensorSize
 
 VERSION = 1
 SUFFIXES = (".aedat4",)
@@ -49,35 +48,21 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
 
 def _read_packets(path: Path) -> Iterator[Events]:
     """An empty chunk, then one a packet."""
-    decoder, streams = _decode(path, lambda: _open(path))
-    if len(streams) != 1:
-        raise DataError(f"{path}: expected one event stream, got {len(streams)}")
-    sensor_size = (int(streams[0]["width"]), int(streams[0]["height"]))
-
-    def packets() -> Iterator[Events]:
-        yield event_chunks.empty_events(sensor_size)
-        while (packet := _decode(path, lambda: next(decoder, None))) is not None:
-            if "events" in packet:
-                # Past 2^63 the unsigned stamps of a corrupt file turn negative, which the check reports.
-                t, x, y, p = (packet["events"][name] for name in ("t", "x", "y", "on"))
-                columns = (t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
-                yield Events(*columns, sensor_size)
-
-    yield from event_chunks.check_chunks(packets(), str(path))
-
-
-def _open(path: Path) -> tuple[Any, list[dict]]:
-    import aedat
-
-    decoder = aedat.Decoder(str(path))
-    return decoder, [stream for stream in decoder.id_to_stream().values() if stream["type"] == "events"]
-
-
-def _decode(path: Path, step: Any) -> Any:
-    """Run one step of the decoder; it reports a cut file as RuntimeError but panics on some corrupt ones."""
     try:
-        return step()
-    except BaseException as error:  # a panic is no Exception
-        if isinstance(error, (KeyboardInterrupt, SystemExit, MemoryError)):
-            raise
+        with aedat4_process.decoding(str(path)) as (streams, packets):
+            if len(streams) != 1:
+                raise DataError(f"{path}: expected one event stream, got {len(streams)}")
+            sensor_size = (streams[0]["width"], streams[0]["height"])
+            yield from event_chunks.check_chunks(_events(packets, sensor_size), str(path))
+    except aedat4_process.DecoderError as error:
         raise DataError(f"{path}: not a complete AEDAT 4 file, the decoder says: {error}") from error
+
+
+def _events(packets: Iterator[bytes], sensor_size: SensorSize) -> Iterator[Events]:
+    yield event_chunks.empty_events(sensor_size)
+    for packet in packets:
+        rows = np.frombuffer(packet, aedat4_process.EVENT)
+        # Past 2^63 the unsigned stamps of a corrupt file turn negative, which the check reports.
+        yield Events(
+            rows["t"].astype(np.int64), rows["x"].copy(), rows["y"].copy(), rows["on"].astype(np.uint8), sensor_size
+        )

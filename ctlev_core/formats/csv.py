@@ -155,7 +155,7 @@ def _parse_header(line: str, path: Path, is_comment: bool) -> tuple[str | None, 
     names = _field_names(line)
     if not names or any(_NUMBER.fullmatch(name) for name in names):
         return None
-    found = {name: column for column, name in event_tables.find_columns(names).items()}
+    found = {name: column for column, name in event_tables.find_columns(names, str(path)).items()}
     if len(found) < 4:
         if len(found) == 3 and not is_comment:
             event_tables.require_columns(names, f"{path}: header line {line.strip()!r}")

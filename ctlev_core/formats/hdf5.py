@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.events.decoding import event_chunks, event_tables
+from ctlev_core.safe_files import hdf5_files
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
@@ -34,7 +35,6 @@ _MAGIC = b"\x89HDF\r\n\x1a\n"
 _GROUPS = ("events", "CD/events", "/")
 _MATRIX_COLUMNS = ("x", "y", "t", "p")
 _BLOCK = 1 << 18
-_LARGEST_COMPRESSION = 1 << 20
 
 
 def sniff(path: Path) -> bool:
@@ -123,16 +123,16 @@ Source = tuple[int, Callable[[slice], event_tables.Columns], SensorSize | None]
 
 def _find_matrix(file: Any, path: Path, camera: str) -> Source | None:
     """MVSEC's table of one camera; None where the file has no cameras."""
-    cameras = file.get("davis")
-    if cameras is None:
+    cameras = hdf5_files.find_object(file, "davis", str(path))
+    if not hasattr(cameras, "keys"):
         return None
-    dataset = cameras.get(f"{camera}/events")
+    dataset = hdf5_files.find_object(cameras, f"{camera}/events", str(path))
     if not hasattr(dataset, "shape"):
         raise DataError(f"{path}: no dataset davis/{camera}/events; davis has {', '.join(cameras) or 'nothing'}")
     where = f"{path}: davis/{camera}/events"
     if len(dataset.shape) != 2 or dataset.shape[1] != len(_MATRIX_COLUMNS):
         raise DataError(f"{where}: expected [N, 4] of {', '.join(_MATRIX_COLUMNS)}, got {dataset.shape}")
-    _check_stored(dataset, where)
+    dataset = hdf5_files.check_dataset(dataset, where)
 
     def read_block(rows: slice) -> event_tables.Columns:
         return dict(zip(_MATRIX_COLUMNS, dataset[rows].T, strict=True))
@@ -142,18 +142,18 @@ def _find_matrix(file: Any, path: Path, camera: str) -> Source | None:
 
 def _find_columns(file: Any, path: Path) -> Source:
     """One dataset a column."""
-    groups = [(name, file.get(name)) for name in _GROUPS]
-    for name, group in groups:
-        if group is None or not hasattr(group, "keys") or not event_tables.find_columns(_datasets(group)):
-            continue
+    for name in _GROUPS:
         where = f"{path}: group {name}"
-        found = event_tables.require_columns(_datasets(group), where)
-        columns = {column: group[key] for column, key in found.items()}
+        group = hdf5_files.find_object(file, name, str(path))
+        names = hdf5_files.dataset_names(group, where) if hasattr(group, "keys") else []
+        if not event_tables.find_columns(names, where):
+            continue
+        found = event_tables.require_columns(names, where)
+        columns = {column: hdf5_files.find_object(group, key, where) for column, key in found.items()}
         lengths = {column: dataset.shape for column, dataset in columns.items()}
         if len(set(lengths.values())) != 1 or len(lengths["t"]) != 1:
             raise DataError(f"{where}: columns must be [N] and of one length, got {lengths}")
-        for column, dataset in columns.items():
-            _check_stored(dataset, f"{where}, column {column}")
+        columns = {c: hdf5_files.check_dataset(dataset, f"{where}, column {c}") for c, dataset in columns.items()}
         offset = _time_offset(file, path)
 
         def read_block(
@@ -174,26 +174,14 @@ def _find_columns(file: Any, path: Path) -> Source:
     )
 
 
-def _datasets(group: Any) -> list[str]:
-    return [key for key in group if hasattr(group.get(key), "shape")]
-
-
-def _check_stored(dataset: Any, where: str) -> None:
-    """A shape alone may promise more than any disk holds."""
-    if dataset.dtype.kind not in "buif":
-        raise DataError(f"{where}: expected numbers, got {dataset.dtype}")
-    if dataset.nbytes > _LARGEST_COMPRESSION * dataset.id.get_storage_size():
-        raise DataError(
-            f"{where}: {dataset.shape} values declared, {dataset.id.get_storage_size()} bytes stored: incomplete"
-        )
-
-
 def _time_offset(file: Any, path: Path) -> int:
-    dataset = file.get("t_offset", file.get("events/t_offset"))
+    found = (hdf5_files.find_object(file, name, str(path)) for name in ("t_offset", "events/t_offset"))
+    dataset = next((dataset for dataset in found if dataset is not None), None)
     if dataset is None:
         return 0
     if not hasattr(dataset, "shape") or dataset.size != 1 or dataset.dtype.kind not in "ui":
         raise DataError(f"{path}: expected t_offset as one whole number of microseconds")
+    dataset = hdf5_files.check_dataset(dataset, f"{path}: t_offset")
     offset = int(np.asarray(dataset[()]).reshape(-1)[0])
     if abs(offset) >= 1 << 62:
         raise DataError(f"{path}: expected t_offset below 2^62 us, got {offset}")

@@ -15,8 +15,10 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.pictures.image_moves import Moves, move_image
+from data_contracts.arrays import ArrayWriter
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images, image_chunks
 from data_contracts.labels import Conditions, History
 
 VERSION = 1
@@ -42,7 +44,7 @@ def base_model_folders(options: Options) -> list[Path]:
     return []
 
 
-def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
+def train(frames: Images, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
     """Keep the training frames and their classes in `out`.
 
     Args:
@@ -58,7 +60,9 @@ def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed:
     if not len(frames):
         raise DataError("generator 'augmentation' needs at least one frame, got none")
     out.mkdir(parents=True, exist_ok=True)
-    np.save(out / FRAMES_NAME, frames, allow_pickle=False)
+    with ArrayWriter(out / FRAMES_NAME) as written:
+        for chunk in image_chunks(frames):
+            written.append(chunk)
     (out / CLASSES_NAME).write_text(json.dumps(_classes(conditions)) + "\n", encoding="utf-8")
     return History()
 

@@ -19,6 +19,7 @@ from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.config import RUN_SETTING
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images
 from data_contracts.labels import Conditions, History
 
 VERSION = 3
@@ -61,7 +62,7 @@ def base_model_folders(options: Options) -> list[Path]:
         raise
 
 
-def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
+def train(frames: Images, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
     """Fine-tune on event images and write a `StableDiffusionControlNetPipeline` folder.
 
     Args:

@@ -25,6 +25,7 @@ import numpy as np
 
 from ctlev_core.event_gan.options import SamplingOptions, TrainingOptions
 from data_contracts.config import cache_material
+from data_contracts.image_rows import Images
 from data_contracts.labels import Conditions, History
 
 VERSION = 1
@@ -43,7 +44,7 @@ def base_model_folders(options: Options) -> list[Path]:
     return []
 
 
-def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
+def train(frames: Images, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
     """Train on real event images and the intensity frames around them, and write the generator.
 
     Args:

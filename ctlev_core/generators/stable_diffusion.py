@@ -17,6 +17,7 @@ from pydantic import Field
 
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.options import FineTuningOptions
+from data_contracts.image_rows import Images
 from data_contracts.labels import Conditions, History
 
 VERSION = 3
@@ -43,7 +44,7 @@ def base_model_folders(options: Options) -> list[Path]:
     return base_model_places(options.base_model or BUNDLED_OBJECT_MODEL)
 
 
-def train(frames: np.ndarray, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
+def train(frames: Images, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
     """Fine-tune on event images and write a `StableDiffusionPipeline` folder.
 
     Args:

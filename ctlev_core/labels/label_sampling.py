@@ -41,6 +41,26 @@ def balanced_choice(class_names: Sequence[str], recordings: Sequence[str], count
     return np.array([queues[i % len(classes)][i // len(classes)] for i in range(count)], dtype=np.int64)
 
 
+def spread_choice(groups: Sequence[str], recordings: Sequence[str], count: int, seed: int) -> np.ndarray:
+    """`count` different row indices, ascending: groups take turns until they are used up, and in them recordings.
+
+    Args:
+        groups: [N] of each row.
+        recordings: [N] of each row.
+        count: at most N.
+        seed: of the order in each group, and of groups in the last turn.
+    """
+    names, of_recording = np.array(groups), np.array(recordings)
+    known = sorted(set(groups))
+    order = np.random.default_rng([seed, len(known)]).permutation(len(known))
+    turn, place = np.empty(len(names), np.int64), np.empty(len(names), np.int64)
+    for number, name in enumerate(known):
+        random = np.random.default_rng([seed, number])
+        rows = _in_turns(random.permutation(np.flatnonzero(names == name)), of_recording)
+        turn[rows], place[rows] = np.arange(len(rows)), order[number]
+    return np.sort(np.lexsort((place, turn))[:count])
+
+
 def _in_turns(rows: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """The rows, reordered so that groups take turns: first one row of each, then a second one, and so on."""
     _, of_row = np.unique(groups[rows], return_inverse=True)

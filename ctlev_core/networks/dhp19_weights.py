@@ -6,7 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ctlev_core.safe_files.hdf5_files import check_dataset, find_object
 from data_contracts.errors import DataError
+
+MAX_KERNEL_BYTES = 256 * 2**20
+"""Of one layer; the authors' largest has 295 kB."""
 
 
 def read_keras_weights(path: Path) -> dict[str, np.ndarray]:
@@ -23,11 +27,11 @@ def read_keras_weights(path: Path) -> dict[str, np.ndarray]:
 
     def keep(name: str, item: object) -> None:
         if name.endswith("/kernel:0") and isinstance(item, h5py.Dataset):
-            kernels[name.split("/")[-2]] = np.asarray(item[()])
+            kernels[name.split("/")[-2]] = np.asarray(check_dataset(item, f"{path}: {name}", MAX_KERNEL_BYTES)[()])
 
     try:
         with h5py.File(path) as file:
-            weights = file.get("model_weights", file)
+            weights = find_object(file, "model_weights" if "model_weights" in file else "/", str(path))
             if isinstance(weights, h5py.Group):
                 weights.visititems(keep)
     except (OSError, RuntimeError) as error:

@@ -16,8 +16,9 @@ import numpy as np
 
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
+from data_contracts.file_lists import file_digest
+from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels
-from data_contracts.manifest import file_digest
 
 if TYPE_CHECKING:
     import torch
@@ -169,7 +170,7 @@ def _short_digest(digests: Mapping[str, str]) -> str:
 
 
 def compute_features(
-    frames: np.ndarray, network: Callable[[torch.Tensor], torch.Tensor], device: torch.device, where: str
+    frames: Images, network: Callable[[torch.Tensor], torch.Tensor], device: torch.device, where: str
 ) -> np.ndarray:
     """Features [N, D] float32 of frames [N, H, W, 3] uint8.
 

@@ -7,17 +7,17 @@ with another, wherever it is copied to.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 
 from data_contracts.errors import DataError
-from data_contracts.manifest import MANIFEST_FILE, RUN_FILE
+from data_contracts.manifest import MANIFEST_FILE
+from data_contracts.run_record import read_run_record
 
 Value = str | int | float | bool | None
 
@@ -91,12 +91,10 @@ def _numbered(role: str) -> Iterator[str]:
 
 def _read(role: str, folder: Path) -> Record:
     try:
-        record = json.loads((folder / RUN_FILE).read_text())
         rows = pq.read_metadata(folder / MANIFEST_FILE).num_rows
-        names = {field.name for field in fields(Record)} - {"role", "rows"}
-        return Record(role=role, rows=rows, **{name: record[name] for name in names})
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{folder}: has no provenance record that can be read: {error!r}") from error
+        return Record(role=role, rows=rows, **read_run_record(folder).model_dump())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{folder}: has no provenance record that can be read: {str(error)[:300]}") from error
 
 
 def _folder_of(key: str, neighbour: Path) -> Path:
@@ -167,11 +165,6 @@ def _plugins(value: Any) -> Iterator[tuple[str, Any]]:
     elif isinstance(value, list):
         for item in value:
             yield from _plugins(item)
-
-
-def digest_of(value: Any) -> str:
-    """SHA-256 of anything JSON can hold."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def write_provenance(path: Path, records: Sequence[Record]) -> None:

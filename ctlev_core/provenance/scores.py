@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.provenance.records import Record, behind, digest_of, options_of, versions_of
+from ctlev_core.provenance.records import Record, behind, options_of, versions_of
 from data_contracts import tables
+from data_contracts.run_record import digest_of
 from data_contracts.tables import Column, TableSchema
 
 Row = dict[str, Any]

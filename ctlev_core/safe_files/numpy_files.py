@@ -21,7 +21,10 @@ from ctlev_core.safe_files.plain_unpickler import Marker, PlainUnpickler
 from data_contracts.errors import DataError
 
 MAX_BYTES = 2 * 2**30
-"""Of one array."""
+"""Of one array, as stored and as float64."""
+MAX_NPZ_BYTES = 512 * 2**20
+"""Of all arrays read from an .npz file, as float64: a small file can unpack to a thousand times its size, and single
+bytes to eight times that. The largest body models have 300 MB."""
 _OBJECT = Marker()
 
 
@@ -39,21 +42,27 @@ def read_shape(path: Path) -> tuple[int, ...] | None:
     return header.shape if header.dtype.kind in "fiu" else None
 
 
-def read_numbers(file: IO[bytes], size: int, where: str) -> np.ndarray:
+def read_numbers(file: IO[bytes], size: int, where: str, max_bytes: int = MAX_BYTES) -> np.ndarray:
     """The array of a .npy stream as float64.
 
     Args:
         file: at its start.
         size: of the whole stream in bytes.
         where: names it in messages.
+        max_bytes: limit of the file, and of the array as float64.
     Raises:
-        DataError: it is no .npy file, cut, larger than `MAX_BYTES`, or holds something else than numbers.
+        DataError: it is no .npy file, cut, larger than the limit, or holds something else than numbers.
     """
-    if size > MAX_BYTES:
-        raise DataError(f"{where} has {size} bytes, more than the limit of {MAX_BYTES}")
+    if size > max_bytes:
+        raise DataError(f"{where} has {size} bytes, more than the limit of {max_bytes}")
     header = array_files.read_array_header(file, where, size)
     if header.dtype.kind not in "fiu":
         raise DataError(f"{where} must be numbers, got {header.dtype}")
+    needed = 8 * math.prod(header.shape)
+    if needed > max_bytes:
+        raise DataError(
+            f"{where}: {list(header.shape)} numbers take {needed} bytes, more than the limit of {max_bytes}"
+        )
     items = array_files.read_items(file, header.dtype, math.prod(header.shape), where)
     with np.errstate(invalid="ignore"):  # a signalling NaN; what it means is the caller's business
         return items.reshape(header.shape, order="F" if header.fortran_order else "C").astype(np.float64)
@@ -90,12 +99,13 @@ def read_npz(path: Path, names: Sequence[str], what: str) -> dict[str, np.ndarra
             members = {name.removesuffix(".npy"): name for name in archive.namelist()}
             missing = [name for name in names if name not in members]
             if missing:
-                raise DataError(f"{path}: lacks {', '.join(missing)}; found {', '.join(members)}")
-            arrays = {}
+                raise DataError(f"{path}: lacks {', '.join(missing)}; found {', '.join(members)[:200]}")
+            arrays, left = {}, MAX_NPZ_BYTES
             for name in names:
                 with archive.open(members[name]) as file:
                     size = archive.getinfo(members[name]).file_size
-                    arrays[name] = read_numbers(file, size, f"{path}: {name}")
+                    arrays[name] = read_numbers(file, size, f"{path}: {name}", left)
+                    left -= arrays[name].nbytes
             return arrays
     except DataError:
         raise

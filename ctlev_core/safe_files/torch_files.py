@@ -23,8 +23,9 @@ from ctlev_core.safe_files.plain_unpickler import Marker, PlainUnpickler
 from ctlev_core.safe_files.tensor_files import ITEM_BYTES, StoredTensor
 from data_contracts.errors import DataError
 
-MAX_PICKLE = 256 * 2**20
-"""Of `data.pkl`, which holds names and shapes only."""
+MAX_PICKLE = 16 * 2**20
+"""Of `data.pkl`, which holds names and shapes only: 1 MB for Stable Diffusion. A byte of it can become 64 in memory."""
+_MAX_BYTE_ORDER = 16
 _LOCAL_HEADER = struct.Struct("<4s5H3I2H")
 _MAX_DIMENSIONS = 16
 
@@ -177,7 +178,7 @@ def _read_archive(path: Path) -> Any:
             raise DataError(f"no weights archive of torch: it holds {len(pickles)} files data.pkl, expected one")
         prefix = pickles[0].removesuffix("data.pkl")
         order = f"{prefix}byteorder"
-        if order in archive.namelist() and archive.read(order) != b"little":
+        if order in archive.namelist() and _read_member(archive, order, _MAX_BYTE_ORDER) != b"little":
             raise DataError("its tensors are not in little-endian byte order")
         storages = {}
         for entry in archive.infolist():
@@ -188,10 +189,17 @@ def _read_archive(path: Path) -> Any:
                 if start + entry.file_size > size:
                     raise DataError(f"truncated: {entry.filename} ends at byte {start + entry.file_size} of {size}")
                 storages[entry.filename.removeprefix(f"{prefix}data/")] = (start, entry.file_size)
-        if archive.getinfo(pickles[0]).file_size > MAX_PICKLE:
-            raise DataError(f"its pickle has more than {MAX_PICKLE} bytes")
-        content = archive.read(pickles[0])
+        content = _read_member(archive, pickles[0], MAX_PICKLE)
     return _TorchUnpickler(BoundedReader(io.BytesIO(content), len(content)), MAX_PICKLE, storages).load()
+
+
+def _read_member(archive: zipfile.ZipFile, name: str, max_bytes: int) -> bytes:
+    entry = archive.getinfo(name)
+    if entry.compress_type != zipfile.ZIP_STORED:
+        raise DataError(f"{name} is compressed; torch does not do that")
+    if entry.file_size > max_bytes:
+        raise DataError(f"{name} has {entry.file_size} bytes, at most {max_bytes} are read")
+    return archive.read(entry)
 
 
 def _content_start(file: Any, entry: zipfile.ZipInfo) -> int:

@@ -28,7 +28,9 @@ from ctlev_core.scoring.gaussians import (
     check_same_width,
     fit_gaussian,
     mean_and_covariance,
+    scale_of,
 )
+from data_contracts.errors import DataError
 
 TOLERANCE = 1e-12
 _POWER_ITERATIONS = 12
@@ -50,6 +52,7 @@ def frechet_distance(features_a: np.ndarray, features_b: np.ndarray, *, toleranc
     Raises:
         ValueError: shapes do not fit, a set has fewer than two rows, or a value is not finite (the message
             names the row).
+        DataError: the distance is too large for a float64.
     """
     features_a, features_b = check_features(features_a, "first"), check_features(features_b, "second")
     check_same_width(features_a, features_b)
@@ -57,7 +60,7 @@ def frechet_distance(features_a: np.ndarray, features_b: np.ndarray, *, toleranc
         return 0.0
     # One common origin near the data: the distance does not change, and a large offset costs no digits.
     origin = features_a[0].astype(np.float64)
-    if tolerance > 0 and min(len(features_a), len(features_b)) > len(origin) and _scale(features_a, features_b) == 1:
+    if tolerance > 0 and min(len(features_a), len(features_b)) > len(origin) and scale_of(features_a, features_b) == 1:
         (mean_a, cov_a), (mean_b, cov_b) = (mean_and_covariance(rows, origin) for rows in (features_a, features_b))
         shift = _squared(mean_a - mean_b)
         bures = _bures_by_cholesky(cov_a, cov_b, shift, tolerance)
@@ -75,13 +78,18 @@ def frechet_distance_of_gaussians(a: GaussianFactor, b: GaussianFactor, *, toler
         tolerance: as for `frechet_distance`.
     Raises:
         ValueError: they have different numbers of dimensions.
+        DataError: the distance is too large for a float64.
     """
     check_same_width(a.root, b.root)
     # Origins are data: the difference of close ones is exact.
     difference = (a.origin - b.origin) + (a.offset - b.offset)
-    scale = _scale(difference, a.root, b.root)
+    scale = scale_of(difference, a.root, b.root)
     shift = _squared(difference / scale)
-    return (shift + _bures(a.root / scale, b.root / scale, shift, tolerance)) * scale**2
+    # As a product of floats: beyond 1e308 it is infinite, where a power would raise an error of Python's.
+    found = (shift + _bures(a.root / scale, b.root / scale, shift, tolerance)) * scale * scale
+    if not np.isfinite(found):
+        raise DataError(f"features of sizes up to {scale:.0e} are too far apart: the squared distance is beyond 1e308")
+    return found
 
 
 def _bures(root_a: np.ndarray, root_b: np.ndarray, shift: float, tolerance: float) -> float:
@@ -152,11 +160,3 @@ def _condition(root: np.ndarray) -> float:
 
 def _squared(array: np.ndarray) -> float:
     return float(np.vdot(array, array))
-
-
-def _scale(*arrays: np.ndarray) -> float:
-    """1, or a power of two near the largest magnitude where squares of the numbers might overflow or vanish."""
-    size = max(max(float(array.max(initial=0)), -float(array.min(initial=0))) for array in arrays)
-    if size == 0 or 1e-100 < size < 1e100:
-        return 1.0
-    return float(np.exp2(np.floor(np.log2(size))))

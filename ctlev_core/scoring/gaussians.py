@@ -77,6 +77,14 @@ def check_same_width(first: np.ndarray, second: np.ndarray) -> None:
         raise ValueError(f"both sets need the same number of features, got {first.shape[1]} and {second.shape[1]}")
 
 
+def scale_of(*arrays: np.ndarray) -> float:
+    """1, or a power of two near the largest magnitude where squares of the numbers might overflow or vanish."""
+    size = max(max(float(array.max(initial=0)), -float(array.min(initial=0))) for array in arrays)
+    if size == 0 or 1e-100 < size < 1e100:
+        return 1.0
+    return float(np.exp2(np.floor(np.log2(size))))
+
+
 def centre(features: np.ndarray) -> np.ndarray:
     """Subtract the mean from [N, D] in place, and return it [D]."""
     mean = features.mean(axis=0)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctlev_core.scoring.gaussians import check_features, check_same_width
+from data_contracts.errors import DataError
 
 _BLOCK_NUMBERS = 4_000_000
 
@@ -37,6 +38,7 @@ def compute_kid(
         The discrepancy. It depends on the scale and the offset of the features, unlike a Frechet distance.
     Raises:
         ValueError: shapes do not fit, a set has fewer than two rows, or a value is not finite (names the row).
+        DataError: the features are so large that their kernel is beyond float64.
     """
     features_a, features_b = check_features(features_a, "first"), check_features(features_b, "second")
     check_same_width(features_a, features_b)
@@ -45,14 +47,20 @@ def compute_kid(
     if subset_size != 0 and (subset_size < 2 or num_subsets < 1):
         raise ValueError(f"a mean needs subsets of at least 2 rows, got {num_subsets} of {subset_size}")
     pairs = len(a) ** 2 + len(b) ** 2 + len(a) * len(b)
-    if subset_size == 0 or pairs <= 3 * num_subsets * subset_size**2:
-        return _unbiased(a, b, origin)
-    generator = np.random.default_rng(seed)
-    values = []
-    for _ in range(num_subsets):
-        first, second = (rows[generator.permutation(len(rows))[:subset_size]] for rows in (a, b))
-        values.append(_unbiased(first, second, origin))
-    return float(np.mean(values))
+    with np.errstate(over="ignore", invalid="ignore"):  # seen in the result
+        if subset_size == 0 or pairs <= 3 * num_subsets * subset_size**2:
+            found = _unbiased(a, b, origin)
+        else:
+            generator = np.random.default_rng(seed)
+            values = []
+            for _ in range(num_subsets):
+                first, second = (rows[generator.permutation(len(rows))[:subset_size]] for rows in (a, b))
+                values.append(_unbiased(first, second, origin))
+            found = float(np.mean(values))
+    if not np.isfinite(found):
+        size = max(float(np.abs(features).max()) for features in (features_a, features_b))
+        raise DataError(f"features of sizes up to {size:.1e} are too large for KID: their kernel is beyond 1e308")
+    return found
 
 
 def _unbiased(a: np.ndarray, b: np.ndarray, origin: np.ndarray) -> float:

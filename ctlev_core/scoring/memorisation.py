@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core.scoring.gaussians import check_features, check_same_width
+from data_contracts.image_rows import Images
 from data_contracts.tables import Column, TableSchema
 
 CLOSEST_PAIRS = TableSchema(
@@ -176,7 +177,7 @@ def nearest_rows(
     return distances, nearest
 
 
-def small_pictures(frames: np.ndarray, size: int = 32, blur: float = 1.0) -> np.ndarray:
+def small_pictures(frames: Images, size: int = 32, blur: float = 1.0) -> np.ndarray:
     """Features of frames without a network: scaled down to `size` px along the longer side and blurred.
 
     The mean of the absolute or squared difference of event images punishes a shift of one pixel as much as another
@@ -193,7 +194,7 @@ def small_pictures(frames: np.ndarray, size: int = 32, blur: float = 1.0) -> np.
     """
     import cv2
 
-    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or not frames.size:
+    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or 0 in frames.shape:
         raise ValueError(f"frames must be [N, H, W, 3] uint8, not empty, got {frames.shape} {frames.dtype}")
     height, width = frames.shape[1:3]
     scale = min(1.0, size / max(height, width))

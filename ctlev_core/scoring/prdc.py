@@ -15,7 +15,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ctlev_core.scoring.gaussians import check_features, check_same_width
+from ctlev_core.scoring.gaussians import check_features, check_same_width, scale_of
 
 _BLOCK_NUMBERS = 4_000_000
 _ROUNDING = 1e-12
@@ -40,6 +40,9 @@ def compute_prdc(judged: np.ndarray, reference: np.ndarray, num_neighbours: int 
         )
     origin = reference[0].astype(np.float64)
     judged, reference = judged - origin, reference - origin
+    # Who is near whom does not change with the scale.
+    scale = scale_of(judged, reference)
+    judged, reference = judged / scale, reference / scale
     judged_radii, reference_radii = (_squared_radii(rows, num_neighbours) for rows in (judged, reference))
     is_precise, count = np.zeros(len(judged), bool), 0
     recalled, covered = [], []

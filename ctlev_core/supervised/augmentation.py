@@ -11,6 +11,7 @@ import numpy as np
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.supervised.image_shifts import shift_images
+from data_contracts.image_rows import Images
 
 
 class BodySamples(NamedTuple):
@@ -24,7 +25,7 @@ class BodySamples(NamedTuple):
         intrinsics: [N, 4] px: fx, fy, cx, cy.
     """
 
-    frames: np.ndarray
+    frames: Images
     rotations: np.ndarray
     betas: np.ndarray
     transl: np.ndarray
@@ -46,8 +47,9 @@ def mirror_half(samples: BodySamples, sequence: np.ndarray, generator: np.random
     rotations = mirror @ samples.rotations[:, JOINT_SETS["smpl"].mirror] @ mirror
     intrinsics = samples.intrinsics * np.array([1, 1, -1, 1], np.float32)
     intrinsics[:, 2] += samples.frames.shape[2]
+    frames = np.asarray(samples.frames)
     return BodySamples(
-        np.where(flip[:, None, None, None], samples.frames[:, :, ::-1], samples.frames),
+        np.where(flip[:, None, None, None], frames[:, :, ::-1], frames),
         np.where(flip[:, None, None, None], rotations, samples.rotations),
         samples.betas,
         np.where(flip[:, None], samples.transl * np.array([-1, 1, 1], np.float32), samples.transl),
@@ -72,7 +74,7 @@ def shift(samples: BodySamples, shift_px: int, sequence: np.ndarray, generator: 
     shifts = generator.integers(-shift_px, shift_px + 1, size=(_count(sequence), 2))[sequence]
     transl = samples.transl.copy()
     transl[:, :2] += samples.transl[:, 2:] * shifts.astype(np.float32) / samples.intrinsics[:, :2]
-    return samples._replace(frames=shift_images(samples.frames, shifts), transl=transl)
+    return samples._replace(frames=shift_images(np.asarray(samples.frames), shifts), transl=transl)
 
 
 def _count(sequence: np.ndarray) -> int:

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import nn
-from tqdm import tqdm
 
+from ctlev_core.progress import ProgressBar
 from ctlev_core.supervised.batches import TrainingRows
 from ctlev_core.supervised.checkpoints import read_training_state, write_training_state
 from ctlev_core.supervised.models import digest
@@ -91,9 +91,7 @@ def train_model(
     run.restore(path)
     model.train()
     saved = time.monotonic()
-    bar = tqdm(
-        total=options.num_steps, initial=run.state.step, desc=description, unit="step", leave=False, disable=None
-    )
+    bar = ProgressBar(total=options.num_steps, initial=run.state.step, desc=description, unit="step")
     with bar, _repeatable_convolutions():
         while run.state.step < options.num_steps and not run.is_over():
             step = run.state.step
@@ -101,7 +99,7 @@ def train_model(
             run.update(compute_loss(batch, np.random.default_rng([seed, _STREAM_STEP, step])))
             if len(rows.held_back) and (run.is_at(options.validation_every) or run.state.step == options.num_steps):
                 run.validate(compute_loss, rows.held_back)
-            bar.set_postfix(run.progress(), refresh=False)
+            bar.note(run.progress())
             bar.update()
             if time.monotonic() - saved >= options.checkpoint_every_s and run.state.step < options.num_steps:
                 run.save(path)
@@ -196,7 +194,7 @@ class _Run:
             state.best_loss, state.best_step, state.looks_since_best = loss, state.step, 0
             self.best = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
 
-    def progress(self) -> dict[str, str]:
+    def progress(self) -> str:
         """What the progress bar says."""
         history, said = self.state.history, {}
         if history.loss:
@@ -205,7 +203,7 @@ class _Run:
             said["held back"] = f"{history.validation_loss[-1]:.4g}"
         if self.state.skipped:
             said["skipped"] = str(self.state.skipped)
-        return said
+        return ", ".join(f"{name} {value}" for name, value in said.items())
 
     def finish(self, num_held_back: int) -> Training:
         """Put the best weights into the model, where rows were held back to judge them."""

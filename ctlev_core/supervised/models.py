@@ -14,7 +14,8 @@ from torch import nn
 
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.errors import DataError
-from data_contracts.manifest import file_digest
+from data_contracts.file_lists import file_digest
+from data_contracts.image_rows import ImageRows, Images
 
 MODEL_NAME = "model.safetensors"
 CONFIG_NAME = "config.json"
@@ -27,7 +28,7 @@ def resolve_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def check_frames(frames: np.ndarray, where: str) -> None:
+def check_frames(frames: Images, where: str) -> None:
     """Raise `DataError` unless frames are [N, H, W, 3] uint8 with at least one row and one pixel."""
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or 0 in frames.shape[1:3]:
         raise DataError(f"{where}: frames must be [N, H, W, 3] uint8, got {frames.shape} {frames.dtype}")
@@ -37,7 +38,9 @@ def digest(*parts: Any) -> str:
     """SHA-256 of arrays and JSON-ready values: two training runs with the same digest are the same run."""
     total = hashlib.sha256()
     for part in parts:
-        if isinstance(part, np.ndarray):
+        if isinstance(part, ImageRows):
+            total.update(part.digest().encode())
+        elif isinstance(part, np.ndarray):
             total.update(f"{part.dtype}{part.shape}".encode())
             total.update(np.ascontiguousarray(part).data)
         else:
@@ -95,7 +98,7 @@ def read_weights(folder: Path, model: nn.Module) -> None:
 
 
 def predict_in_batches(
-    model: nn.Module, function: Callable[[torch.Tensor], Any], inputs: np.ndarray, batch_size: int = 64
+    model: nn.Module, function: Callable[[torch.Tensor], Any], inputs: Images, batch_size: int = 64
 ) -> list[Any]:
     """`function(batch)` over all rows of `inputs` without gradients, `model` in evaluation mode."""
     device = next(model.parameters()).device

@@ -1,7 +1,11 @@
 """Manifests vouch for every file of their artefact."""
 
+import hashlib
+import json
+
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from data_contracts import tables
@@ -41,6 +45,53 @@ def test_round_trip(artefact):
     assert manifest.schema is tables.TRAINING
     assert manifest.array("frames").tolist() == np.arange(12).reshape(2, 6).tolist()
     assert manifest.rows_where(curve="training").tolist() == [0, 1]
+
+
+@pytest.fixture
+def many_files(tmp_path, monkeypatch):
+    """An artefact of more files than the manifest's metadata list."""
+    monkeypatch.setattr("data_contracts.manifest.MAX_LISTED_FILES", 20)
+    folder = tmp_path / "many"
+    (folder / "events").mkdir(parents=True)
+    for number in range(30):
+        (folder / "events" / f"{number:02d}.bin").write_bytes(bytes([number] * number))
+    return write_manifest(folder, training_table(), tables.TRAINING)
+
+
+def test_many_files_are_listed_beside_the_manifest(many_files):
+    manifest = read_manifest(many_files, full=True)
+    assert len(manifest.files) == 30 and list(manifest.files)[:2] == ["events/00.bin", "events/01.bin"]
+    assert manifest.files["events/07.bin"] == {"bytes": 7, "sha256": hashlib.sha256(bytes([7] * 7)).hexdigest()}
+    assert manifest.path("events/29.bin").stat().st_size == 29 and "events/30.bin" not in manifest.files
+    metadata = pq.read_metadata(many_files.path / "manifest.parquet").metadata
+    assert list(json.loads(metadata[b"ctlev.files"])) == ["file_list.parquet"]
+
+
+@pytest.mark.parametrize("file", ["events/09.bin", "file_list.parquet"])
+def test_damage_is_found_among_many_files(many_files, file):
+    path = many_files.path / file
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    with pytest.raises(DataError, match=f"{path.name}: expected {len(content)} bytes"):
+        read_manifest(many_files)
+    path.write_bytes(bytes([content[0] ^ 1]) + content[1:])
+    with pytest.raises(DataError, match=f"{path.name}: content has changed"):
+        read_manifest(many_files, full=True)
+    path.unlink()
+    with pytest.raises(DataError, match=f"{path.name}: file is missing"):
+        read_manifest(many_files)
+
+
+def test_a_list_of_files_that_is_none_is_refused(many_files):
+    """The same digest as in the manifest, but not the columns: as an altered copy of the code would write."""
+    from data_contracts.file_lists import read_file_list
+
+    path = many_files.path / "file_list.parquet"
+    pq.write_table(pa.table({"name": ["a"]}), path)
+    with pytest.raises(DataError, match="expected columns name, bytes, sha256, got name"):
+        read_file_list(path)
+    with pytest.raises(DataError, match=r"no stage may write a file file_list\.parquet"):
+        write_manifest(many_files.path, training_table(), tables.TRAINING)
 
 
 def test_same_content_has_the_same_digest(artefact, tmp_path):

@@ -16,8 +16,8 @@ from flow_scripts import run_script
 
 
 @contextlib.contextmanager
-def server(home: Path) -> Iterator[str]:
-    """The API of a Prefect server as scripts start it."""
+def server(home: Path) -> Iterator[dict[str, str]]:
+    """The variables that lead to a Prefect server as scripts start it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PREFECT_HOME", str(home / "prefect"))
         patch.setenv("PREFECT_LOGGING_LEVEL", "CRITICAL")
@@ -26,11 +26,9 @@ def server(home: Path) -> Iterator[str]:
 
         local_server.start(home)
         with local_server.connected():
-            from prefect.settings import PREFECT_API_URL
-
-            url = PREFECT_API_URL.value()
+            pass
     try:
-        yield url
+        yield local_server.environment()
     finally:
         local_server.stop()
 
@@ -40,7 +38,7 @@ def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """A server for all scripts, from the first one on."""
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
 
-        def start() -> str:
+        def start() -> dict[str, str]:
             return stack.enter_context(server(tmp_path_factory.mktemp("server")))
 
         patch.setattr(flow_scripts, "shared_server", functools.cache(start))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import http
 import json
@@ -25,6 +26,7 @@ from ctlev_core.processes import die_with_parent
 
 PREFECT = [str(Path(sys.executable).with_name("prefect"))]
 ENDED = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
+PASSWORD = "ctlev:a password of the tests"
 TIMEOUT_S = 900.0
 """For what takes seconds to a minute where nothing else runs."""
 
@@ -45,7 +47,8 @@ class Service:
         503, having changed nothing. Prefect's own client is as patient, and asks again.
         """
         data = None if body is None else json.dumps(body).encode()
-        headers = {"Content-Type": "application/json"}
+        known = base64.b64encode(self.environment["PREFECT_API_AUTH_STRING"].encode()).decode()
+        headers = {"Content-Type": "application/json", "Authorization": f"Basic {known}"}
         request = urllib.request.Request(f"{self.url}/{path}", data, headers, method=method)
         asks = request.get_method() == "GET" or path.endswith("/filter")
         deadline = time.monotonic() + TIMEOUT_S
@@ -160,6 +163,9 @@ def server(home: Path) -> Iterator[Service]:
         "CTLEV_HOME": str(home),
         "PREFECT_HOME": str(home / "prefect"),
         "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
+        "PREFECT_API_AUTH_STRING": PASSWORD,
+        "PREFECT_SERVER_API_AUTH_STRING": PASSWORD,
+        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://127.0.0.1:{port}",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         # A new schedule is seen when the scheduler next looks, by itself once a minute.
         "PREFECT_SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2",

@@ -39,8 +39,8 @@ class Finished:
         return {label: (state, key) for state, label, key in rows}
 
 
-def no_server() -> str:
-    """Stands for the Prefect server that tests share, and that conftest.py starts."""
+def no_server() -> dict[str, str]:
+    """The variables that lead to the Prefect server that tests share, and that conftest.py starts."""
     raise AssertionError("no server is shared")
 
 
@@ -57,7 +57,7 @@ def script(name: str, *arguments: str, home: Path, own_server: bool = False, **p
     command = [sys.executable, str(REPOSITORY / "flows" / f"{name}.py"), "--home", str(home), *arguments]
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PREFECT_")}
     if not own_server:
-        environment["PREFECT_API_URL"] = shared_server()
+        environment |= shared_server()
     return subprocess.Popen(
         command, cwd=home, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen
     )
@@ -94,9 +94,8 @@ def _here(name: str, arguments: tuple[str, ...], home: Path, **patches: Any) -> 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CTLEV_HOME", str(home))
         patch.setattr(sys, "argv", [f"{name}.py", "--home", str(home), *arguments])
-        from flows import command_line, local_server, settings  # here, because flows take the home from these
+        from flows import command_line, local_server
 
-        patch.setattr(settings, "HOME", home)
         patch.setattr(local_server, "start", lambda home: None)
         patch.setattr(local_server, "connected", patches.get("connected", _not_reached))
         patch.setattr(command_line, "with_plan", patches.get("with_plan"))

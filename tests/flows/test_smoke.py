@@ -44,7 +44,9 @@ def test_smoke_ends_in_a_report(smoke_home):
         assert expected in text
     assert "http://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", text) and "<script src" not in text
     output = (smoke_home / "first_run.txt").read_text()
-    assert f"reports/{report.name}" in output
+    verdict, where, *_, last = output.splitlines()
+    assert "synthetic data helped" in verdict and f"reports/{report.name}" in where
+    assert re.fullmatch(r"(\d+) stages, 0 of them cached, in .+", last)
 
 
 def test_every_artefact_is_whole_and_says_where_it_came_from(smoke_home):

@@ -22,6 +22,9 @@ from types import ModuleType
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "helpers"))
+import aedat4_writer
+
 from ctlev_core import plugins
 from ctlev_core.events.decoding import event_chunks
 from data_contracts.errors import DataError
@@ -48,8 +51,8 @@ def check_reader(module: ModuleType, path: Path) -> bool:
     claims = [other.__name__ for other in others if other.sniff(path) and getattr(other, "HAS_SIGNATURE", True)]
     if len(claims) > 1:
         raise Failure(f"claimed by {', '.join(claims)}")
-    whole = _attempt(module, lambda: [module.read(path)])
-    chunks = _attempt(module, lambda: list(module.read_chunks(path, 3)))
+    whole = _attempt(module, path, lambda: [module.read(path)])
+    chunks = _attempt(module, path, lambda: list(module.read_chunks(path, 3)))
     if (whole is None) != (chunks is None):
         raise Failure(
             f"whole {'refused' if whole is None else 'read'}, chunks {'refused' if chunks is None else 'read'}"
@@ -65,10 +68,18 @@ def check_reader(module: ModuleType, path: Path) -> bool:
     return True
 
 
-def _attempt(module: ModuleType, run) -> list[Events] | None:
+def check_message(error: DataError, path: Path) -> None:
+    """Raise `Failure` where a refusal does not name its file, or is too long to be read."""
+    text = str(error)
+    if path.name not in text or len(text) >= 500:
+        raise Failure(f"a message of {len(text)} characters must name {path.name} in less than 500: {text[:600]}")
+
+
+def _attempt(module: ModuleType, path: Path, run) -> list[Events] | None:
     try:
         parts = run()
-    except DataError:
+    except DataError as error:
+        check_message(error, path)
         return None
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
@@ -84,7 +95,9 @@ def valid_files(name: str, folder: Path) -> Iterator[bytes]:
     """Small files of the format."""
     module = plugins.load("formats", name)
     if name == "aedat4":
-        yield REAL_AEDAT4.read_bytes()
+        yield aedat4_writer.aedat4([aedat4_writer.packet([(1, 2, 3, 1), (5, 319, 239, 0)]), aedat4_writer.packet([])])
+        if REAL_AEDAT4.is_file():
+            yield REAL_AEDAT4.read_bytes()
         return
     generator = np.random.default_rng(0)
     width, height = SENSORS.get(name, (640, 480))

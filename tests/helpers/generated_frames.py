@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from ctlev_core.events import files as event_files
 from data_contracts import tables
+from data_contracts.events import Events
 from data_contracts.labels import Labels
 from data_contracts.manifest import ManifestRef, label_columns, write_manifest
 from data_contracts.tables import TableSchema
@@ -104,3 +106,45 @@ def make_generated(home: Path, count: int = 7, *, seed: int = 0, joints: bool = 
     inputs = {"conditions": conditions}
     synthetic = publish(home, "sample", f"s{key}", columns, tables.SYNTHETIC, inputs, frames=frames)
     return Generated(synthetic, conditions, frames, pictures, labels)
+
+
+def make_recorded(home: Path) -> tuple[ManifestRef, np.ndarray]:
+    """Encoded frames, three to train on and one to test on."""
+    frames = np.random.default_rng(9).integers(0, 256, (4, 14, 20, 3), np.uint8)
+    columns = {
+        "sample_id": [f"r{row}" for row in range(4)], "recording_id": ["r"] * 4, "subject": ["s"] * 4,
+        "split": ["train"] * 3 + ["test"], "class_name": ["walk"] * 4,
+        **{name: [1] * 4 for name in ("t_start_us", "t_end_us", "num_events")}, **label_columns(make_labels(4)),
+    }  # fmt: skip
+    return publish(home, "encode", "recorded", columns, tables.FRAMES, {}, frames=frames), frames
+
+
+def make_streams(made: Generated, home: Path, key: str, one_file: bool) -> tuple[list[Events], dict]:
+    """Files of an `export_events` artefact of a few events an image; the streams, and the columns of its table."""
+    count, streams, rows = len(made.frames), [], []
+    for row in range(count):
+        t = np.arange(row + 1, dtype=np.int64) * 10
+        one, x = np.ones(len(t), np.uint8), np.full(len(t), row, np.uint16)
+        streams.append(Events(t, x, x, one, SIZE))
+    folder = Store(home).temporary_folder(key) / "events"
+    folder.mkdir(parents=True)
+    start = start_us = 0
+    for row, events in enumerate(streams):
+        name = "events.parquet" if one_file else f"{row:06d}.parquet"
+        if not one_file:
+            event_files.write_events_parquet(folder / name, events)
+            start = start_us = 0
+        last_us = start_us + int(events.t[-1])
+        rows.append((f"events/{name}", start, len(events), start_us, last_us))
+        start, start_us = start + len(events), last_us + 100
+    if one_file:
+        moved = [Events(e.t + r[3], e.x, e.y, e.p, e.sensor_size) for e, r in zip(streams, rows, strict=True)]
+        event_files.write_event_chunks_parquet(folder / "events.parquet", moved)
+    names = ("file", "event_start", "num_events", "t_start_us", "t_end_us")
+    columns = {name: [row[number] for row in rows] for number, name in enumerate(names)}
+    columns |= {
+        "sample_id": [f"synthetic/{row:06d}" for row in range(count)], "class_name": list(made.labels.class_names),
+        "has_polarity": [False] * count, "is_exact": [True] * count, "error_levels": [0.0] * count,
+        "seed": list(range(count)), **label_columns(made.labels),
+    }  # fmt: skip
+    return streams, columns

@@ -23,7 +23,10 @@ DECODED_AT = (("c2v", 4), ("c3v", 5), ("c4v", 8), ("cv", 11))
 
 
 class TinyAutoencoder:
-    """What the project asks of an `AutoencoderKL`: config, dtype, device, encode, decode. Without noise: no `std`."""
+    """What the project asks of an `AutoencoderKL`: config, dtype, device, weights, encode, decode.
+
+    Without noise: no `std`.
+    """
 
     def __init__(self, scaling_factor: float = SCALING_FACTOR) -> None:
         self.encoder = load_file(FOLDER / "vaelight_encoder.safetensors")
@@ -32,6 +35,10 @@ class TinyAutoencoder:
             scaling_factor=scaling_factor, latent_channels=4, block_out_channels=(128, 256, 512, 512)
         )
         self.dtype, self.device = torch.float32, torch.device("cpu")
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """The weights by name."""
+        return {f"encoder.{name}": value for name, value in self.encoder.items()} | self.decoder
 
     def encode(self, images: torch.Tensor) -> types.SimpleNamespace:
         """Latents [N, 4, H / 8, W / 8], not scaled, of images [N, 3, H, W] in [-1, 1], as `latent_dist.mean`."""

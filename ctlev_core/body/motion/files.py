@@ -7,7 +7,7 @@ from types import ModuleType
 
 from ctlev_core import plugins
 from ctlev_core.body.motion.clip import MotionClip
-from data_contracts.errors import DataError
+from data_contracts.errors import DataError, DetailedDataError
 
 
 def list_formats() -> dict[str, ModuleType]:
@@ -43,7 +43,7 @@ def read_motion(path: Path, rate_hz: float | None = None) -> MotionClip:
     if module is None:
         known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in list_formats().items())
         size = path.stat().st_size
-        raise DataError(
+        raise DetailedDataError(
             f"{path}: not a motion file of a known format ({size} bytes); known formats: {known}{_objections(path)}"
         )
     if rate_hz is not None and hasattr(module, "RATE_HZ"):

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import (
@@ -39,6 +38,7 @@ from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from ctlev_core.diffusion.sampling.schedulers import make_scheduler as make_scheduler
 from ctlev_core.diffusion.sampling.shards import Shard, plan_shards
 from ctlev_core.diffusion.sampling.value_table import draw_values, nearest_values, read_value_table
+from ctlev_core.progress import ProgressBar
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
@@ -355,7 +355,7 @@ def _progress(shards: list[Shard]) -> Iterator[tuple[list[Shard], Callable[[int]
     """The shards that are still to be sampled, and what to call with the number of frames done."""
     missing = [shard for shard in shards if not shard.path.is_file()]
     total, left = sum(map(len, shards)), sum(map(len, missing))
-    with tqdm(total=total, initial=total - left, desc="sampling", unit="image", leave=False, disable=None) as bar:
+    with ProgressBar(total=total, initial=total - left, desc="sampling", unit="image") as bar:
         yield missing, bar.update
 
 

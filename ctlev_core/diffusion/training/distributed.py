@@ -60,6 +60,11 @@ class DistributedContext:
         torch.distributed.all_reduce(summed)
         return summed.item()
 
+    def wait(self) -> None:
+        """Until all processes are here."""
+        if self.count > 1:
+            torch.distributed.barrier()
+
     def agreed(self, value: T) -> T:
         """The value of process 0: whether to stop must not hang on clocks or on rounding that differs."""
         if self.count == 1:

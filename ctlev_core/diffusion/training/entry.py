@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from ctlev_core.diffusion.pretrained.loading import choose_device, load_base_model, save_base_model
@@ -27,11 +26,12 @@ from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.diffusion.training.trainer import TrainingHistory
 from data_contracts.config import ConditionChoice
+from data_contracts.image_rows import Images, as_image_rows, load_image_rows
 from data_contracts.labels import Conditions
 
 
 def train_checkpoint(
-    frames: np.ndarray,
+    frames: Images,
     conditions: Conditions,
     options: FineTuningOptions,
     *,
@@ -87,7 +87,7 @@ def train_checkpoint(
 
 
 def _train(
-    frames: np.ndarray,
+    frames: Images,
     conditions: Conditions,
     options: FineTuningOptions,
     job: Mapping[str, Any],
@@ -124,13 +124,13 @@ def _train(
 
 
 def _train_in_processes(
-    count: int, frames: np.ndarray, conditions: Conditions, options: FineTuningOptions, job: dict[str, Any]
+    count: int, frames: Images, conditions: Conditions, options: FineTuningOptions, job: dict[str, Any]
 ) -> TrainingHistory:
     folder = Path(job["work"]) / "job"
     folder.mkdir(parents=True, exist_ok=True)
-    np.save(folder / "frames.npy", frames, allow_pickle=False)
+    as_image_rows(frames).save(folder / "frames")
     if conditions.images is not None:
-        np.save(folder / "conditions.npy", conditions.images, allow_pickle=False)
+        as_image_rows(conditions.images).save(folder / "conditions")
     plain = options.model_dump(mode="json", include=set(FineTuningOptions.model_fields))
     written = {
         **job,
@@ -145,8 +145,8 @@ def _train_in_processes(
 def _train_rank(
     job: dict[str, Any], folder: Path, distributed: DistributedContext, device: torch.device
 ) -> TrainingHistory:
-    images = np.load(folder / "conditions.npy", mmap_mode="r") if job["with_images"] else None
-    frames = np.load(folder / "frames.npy", mmap_mode="r")
+    images = load_image_rows(folder / "conditions") if job["with_images"] else None
+    frames = load_image_rows(folder / "frames")
     made_by = None if job["made_by"] is None else ConditionChoice(**job["made_by"])
     conditions = Conditions(tuple(job["prompts"]), images, made_by=made_by)
     return _train(frames, conditions, FineTuningOptions(**job["options"]), job, distributed, device)

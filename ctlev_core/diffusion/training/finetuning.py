@@ -40,6 +40,7 @@ from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 from ctlev_core.pictures.image_moves import move_image
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
+from data_contracts.image_rows import ImageRows, Images
 from data_contracts.labels import Conditions
 
 Tune = Literal["unet", "controlnet", "both"]
@@ -84,7 +85,7 @@ def check_channel_order(base_model: PretrainedModel, conditions: Conditions) -> 
 
 def fine_tune(
     base_model: PretrainedModel,
-    frames: np.ndarray,
+    frames: Images,
     conditions: Conditions,
     options: FineTuningOptions,
     *,
@@ -139,7 +140,15 @@ def fine_tune(
     denoiser = Denoiser(base_model.unet, base_model.controlnet)
     schedule = NoiseSchedule(base_model.scheduler_config)
     num_turns = 4 if options.rot90_probability else 1
-    cache = cache_latents(base_model, frames, conditions, class_names, num_turns=num_turns)
+    cache = cache_latents(
+        base_model,
+        frames,
+        conditions,
+        class_names,
+        num_turns=num_turns,
+        folder=work,
+        distributed=distributed,
+    )
     check_cache(cache, conditions)
     base_model.text_encoder.to("cpu")
     num_pictures = round(options.batch_size * options.rehearsal_share)
@@ -223,7 +232,7 @@ def _with_pictures(
 
 def _value_table(
     base_model: PretrainedModel,
-    frames: np.ndarray,
+    frames: Images,
     cache: LatentCache,
     rows: np.ndarray,
     options: FineTuningOptions,
@@ -249,7 +258,8 @@ def draw_samples(base_model: PretrainedModel, frames: np.ndarray, conditions: Co
     options = SamplingOptions(num_inference_steps=SHOWN_STEPS, batch_size=SHOWN)
     with TemporaryDirectory() as folder:
         samples = sample_frames(base_model, conditions, options, seeds=range(len(frames)), work=Path(folder))
-    return picture_of_samples([conditions.images, frames, samples])
+    asked = None if conditions.images is None else np.asarray(conditions.images)
+    return picture_of_samples([asked, frames, samples])
 
 
 def _rows_of(conditions: Conditions, rows: np.ndarray) -> Conditions:
@@ -258,7 +268,7 @@ def _rows_of(conditions: Conditions, rows: np.ndarray) -> Conditions:
 
 
 def _identity(
-    frames: np.ndarray,
+    frames: Images,
     conditions: Conditions,
     options: FineTuningOptions,
     tune: str,
@@ -273,6 +283,8 @@ def _identity(
     made_by = conditions.made_by.model_dump(mode="json") if conditions.made_by and options.rot90_probability else None
     digest = hashlib.sha256(json.dumps([material, tune, seed, conditions.prompts, named, made_by]).encode())
     for array in (frames, conditions.images):
-        if array is not None:
+        if isinstance(array, ImageRows):
+            digest.update(array.digest().encode())
+        elif array is not None:
             digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

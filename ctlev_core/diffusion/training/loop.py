@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.training.acceleration import accelerated, autocast, check_precision
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.tensorboard import TrainingLog, training_log
 from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
+from ctlev_core.progress import ProgressBar
 
 
 def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray:
@@ -140,13 +140,13 @@ def _compute_gradients(
     return distributed.sum_gradients(trainer.parameters, total)
 
 
-def _progress_bar(trainer: Trainer, description: str, distributed: DistributedContext) -> tqdm:
+def _progress_bar(trainer: Trainer, description: str, distributed: DistributedContext) -> ProgressBar:
     disable = None if distributed.rank == 0 else True
     total = trainer.options.num_steps
-    return tqdm(total=total, initial=trainer.step, desc=description, unit="step", leave=False, disable=disable)
+    return ProgressBar(total=total, initial=trainer.step, desc=description, unit="step", disable=disable)
 
 
-def _log(trainer: Trainer, bar: tqdm, log: TrainingLog) -> None:
+def _log(trainer: Trainer, bar: ProgressBar, log: TrainingLog) -> None:
     options = trainer.options
     loss = float(np.mean(trainer.losses)) if trainer.losses else math.nan
     trainer.history.step.append(trainer.step)
@@ -154,7 +154,7 @@ def _log(trainer: Trainer, bar: tqdm, log: TrainingLog) -> None:
     trainer.losses = []
     images = trainer.step * options.batch_size * options.gradient_accumulation
     speed = images / max(trainer.seconds, 1e-9)
-    bar.set_postfix_str(f"loss {loss:.4f}, {speed:.1f} img/s, skipped {trainer.skipped}")
+    bar.note(f"loss {loss:.4f}, {speed:.1f} img/s, skipped {trainer.skipped}")
     log.scalars(
         trainer.step,
         **{

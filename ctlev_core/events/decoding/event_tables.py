@@ -35,7 +35,7 @@ _LARGEST_T = np.iinfo(np.int64).max
 _LARGEST_SECONDS = 9.2e12
 
 
-def find_columns(names: Iterable[str]) -> dict[str, str]:
+def find_columns(names: Iterable[str], where: str) -> dict[str, str]:
     """Which of `names` holds t, x, y and p; columns that are missing are left out.
 
     Raises:
@@ -46,7 +46,7 @@ def find_columns(names: Iterable[str]) -> dict[str, str]:
         for column, known in COLUMN_NAMES.items():
             if name.strip().lower() in known:
                 if column in found:
-                    raise DataError(f"two columns for {column}: {found[column]!r} and {name!r}")
+                    raise DataError(f"{where}: two columns for {column}: {found[column]!r} and {name!r}")
                 found[column] = name
     return found
 
@@ -58,10 +58,7 @@ def require_columns(names: Iterable[str], where: str) -> dict[str, str]:
         DataError: a column is missing or there twice; the message names it and lists what there is.
     """
     names = list(names)
-    try:
-        found = find_columns(names)
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from None
+    found = find_columns(names, where)
     missing = [f"{column} ({', '.join(COLUMN_NAMES[column])})" for column in COLUMN_NAMES if column not in found]
     if missing:
         raise DataError(f"{where}: no column {' and no column '.join(missing)}; got {', '.join(names) or 'none'}")

@@ -16,7 +16,7 @@ import numpy as np
 
 from ctlev_core.events.decoding import event_chunks
 from data_contracts.errors import DataError
-from data_contracts.events import EVENT_DTYPES, Events, SensorSize
+from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_sensor_size
 
 LAST_T, TIME_WENT_BACK, LARGEST_X, LARGEST_Y, NUM_SHARED = 0, 1, 2, 3, 4
 """Where the shared part of a decoder's state lies; the decoder's own part follows. All start at 0."""
@@ -105,7 +105,9 @@ def read_chunks(file: RecordFile, num_events: int) -> Iterator[Events]:
         DataError: as `read`.
     """
     sensor_size = file.sensor_size
-    if callable(sensor_size):
+    if not callable(sensor_size):
+        check_sensor_size(sensor_size, str(file.path))
+    else:
         state, total = scan(file)
         sensor_size = find_sensor_size(file, state, total)
     yield from event_chunks.regroup(_read_blocks(file, sensor_size, num_events), num_events)
@@ -130,7 +132,8 @@ def scan(file: RecordFile) -> tuple[np.ndarray, int]:
 
 def find_sensor_size(file: RecordFile, state: np.ndarray, num_events: int) -> SensorSize:
     """The file's sensor size, after its last record."""
-    return file.sensor_size(state, num_events) if callable(file.sensor_size) else file.sensor_size
+    size = file.sensor_size(state, num_events) if callable(file.sensor_size) else file.sensor_size
+    return check_sensor_size(size, str(file.path))
 
 
 def _blocks(file: RecordFile, num_records: int) -> Iterator[np.ndarray]:

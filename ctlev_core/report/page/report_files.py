@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef
 
 PAGE, LATEX, MARKDOWN, PROVENANCE = "report.html", "tables.tex", "tables.md", "provenance.json"
+_ANSWER = re.compile(r"\b(helped?|did harm|made it (better|worse)|is undecided|changed nothing|too few)\b")
+_SENTENCE_END = re.compile(r"(?<=[.?])\s+(?=[A-Z])")
+_HEADING = re.compile(r"[^.:`]*\(`[^`]+`\): ")
+"""Of the paragraph of an experiment in a study."""
 
 
 def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
@@ -26,6 +31,25 @@ def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
                 _replace(path, folder / name / path.relative_to(ref.path))
     _replace(ref.path / PAGE, folder / f"{name}.html")
     return f"report: {folder / f'{name}.html'}\ntables: {folder / name}"
+
+
+def read_verdict(folder: Path) -> str:
+    """The sentence of a report that says whether synthetic data helped; empty where no report lies in the folder.
+
+    It is the first that says so in the paragraphs above the first table of `tables.md`; of several experiments each has
+    one, with the heading of its paragraph.
+    """
+    if not (folder / MARKDOWN).is_file():
+        return ""
+    above = (folder / MARKDOWN).read_text(encoding="utf-8").partition("\n## ")[0].replace("\\", "")
+    paragraphs = [paragraph.strip() for paragraph in above.split("\n\n")[2:]]
+    found = []
+    for paragraph in paragraphs:
+        sentences, heading = _SENTENCE_END.split(paragraph), _HEADING.match(paragraph)
+        answer = next((one for one in sentences if _ANSWER.search(one)), None)
+        if answer is not None:
+            found.append(answer if heading is None or answer.startswith(heading[0]) else heading[0] + answer)
+    return "\n".join(found) or (_SENTENCE_END.split(paragraphs[0])[0] if paragraphs else "")
 
 
 def publish_page(ref: ManifestRef, table: str, home: Path, name: str) -> Path:

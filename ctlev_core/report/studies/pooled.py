@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.report.page.display_names import SOURCES, Name, metric_heading, metric_name, metric_words, set_name
+from ctlev_core.report.page.display_names import SOURCES, Name, metric_name, metric_words, set_name
 from ctlev_core.report.page.html import Curves, Folded, Section
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.verdict import ADDING, in_range, made_better, tell_change
@@ -25,7 +25,6 @@ from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
 from ctlev_core.statistics.pooled_scores import PooledScores, pool_values
 from data_contracts.training_sets import (
-    LABEL_CONSISTENT,
     ORACLE,
     RECORDED,
     SYNTHETIC,
@@ -215,14 +214,16 @@ def _score_table(groups: Sequence[Group]) -> Table:
     notes = [f"{metric_name(metric)}: {find_score(metric).meaning}"] if find_score(metric).meaning else []
     agreed = [group.label_agreement for group in groups]
     if any(agreed):
-        body.append([Name("synthetic, against their labels", LABELS), *("" if one is None else _score(one) for one in agreed)])
+        body.append(
+            [Name("synthetic, against their labels", LABELS), *("" if one is None else _score(one) for one in agreed)]
+        )
         notes.append(
-            f"Against their labels: {metric_name(metric)} of classifiers trained on recorded frames when they are shown synthetic frames "
-            "and the labels asked for. It says nothing of test recordings."
+            f"Against their labels: {metric_name(metric)} of classifiers trained on recorded frames when they are shown "
+            "synthetic frames and the labels asked for. It says nothing of test recordings."
         )
     sense = "lower" if lower_is_better(metric) else "higher"
     caption = (
-        f"{metric_heading(metric)} on test recordings that nothing was trained on; {sense} is better. "
+        f"{metric_name(metric)} on test recordings that nothing was trained on; {sense} is better. "
         f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: "
         "better than recorded frames alone, by a difference whose interval excludes 0."
     )

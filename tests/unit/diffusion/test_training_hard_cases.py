@@ -14,7 +14,8 @@ from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_lo
 from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_base_model
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
-from ctlev_core.diffusion.training import trainer
+from ctlev_core.diffusion.training import latent_cache, trainer
+from ctlev_core.diffusion.training.distributed import DistributedContext
 from ctlev_core.diffusion.training.entry import train_checkpoint
 from ctlev_core.diffusion.training.finetuning import check_channel_order, fine_tune
 from ctlev_core.diffusion.training.latent_cache import cache_latents, check_cache
@@ -196,6 +197,63 @@ def test_latents_are_encoded_fewer_at_a_time_where_memory_runs_out(monkeypatch):
     cache = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
     assert encoded == [4, 2, *[1] * 16]
     torch.testing.assert_close(cache.mean[:4], whole.mean)
+
+
+def with_deviations(base_model, monkeypatch):
+    """The base model's code is without noise; here as if it had some."""
+    encode = latent_cache.encode_posterior
+
+    def encode_with_deviations(base_model, images):
+        mean, _ = encode(base_model, images)
+        return mean, mean.abs() + 1
+
+    monkeypatch.setattr(latent_cache, "encode_posterior", encode_with_deviations)
+    return base_model
+
+
+def test_latents_on_disk_are_those_in_memory_and_are_encoded_once(tmp_path, monkeypatch):
+    base_model = with_deviations(make_base_model(), monkeypatch)
+    whole = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
+    stored = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4, folder=tmp_path)
+    np.testing.assert_array_equal(stored.mean, whole.mean)
+    np.testing.assert_array_equal(stored.std, whole.std)
+    rows, turns = np.array([3, 0, 2]), np.array([0, 3, 1])
+    batches = [
+        cache.batch(rows, torch.Generator().manual_seed(0), 0.0, torch.device("cpu"), turns).latents
+        for cache in (whole, stored)
+    ]
+    torch.testing.assert_close(*batches, rtol=0, atol=0)
+
+    def refuse(images):
+        raise AssertionError("encoded again")
+
+    monkeypatch.setattr(base_model.vae, "encode", refuse)
+    again = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4, folder=tmp_path)
+    np.testing.assert_array_equal(again.mean, whole.mean)
+    for other in (FRAMES[::-1], FRAMES[:3]):  # a run of other frames does not take them for its own
+        with pytest.raises(AssertionError, match="encoded again"):
+            cache_latents(base_model, other, CONDITIONS, num_turns=4, folder=tmp_path)
+
+
+def test_each_process_encodes_its_share_of_the_frames(tmp_path, monkeypatch):
+    """Process 1 of 3 finds the shares of the others, which have been here before; together they are the whole."""
+    base_model, taken = with_deviations(make_base_model(), monkeypatch), []
+    whole = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
+    encode = base_model.vae.encode
+    monkeypatch.setattr(base_model.vae, "encode", lambda images: taken.append(len(images)) or encode(images))
+    monkeypatch.setattr(DistributedContext, "wait", lambda self: None)
+    for rank in (0, 2):
+        with pytest.raises(FileNotFoundError):  # that they wait for one another is tested with processes
+            cache_latents(
+                base_model, FRAMES, CONDITIONS, num_turns=4, folder=tmp_path, distributed=DistributedContext(rank, 3)
+            )
+    taken.clear()
+    cache = cache_latents(
+        base_model, FRAMES, CONDITIONS, num_turns=4, folder=tmp_path, distributed=DistributedContext(1, 3)
+    )
+    assert sum(taken) == 4 * 2, "two of the four frames in four turns"
+    torch.testing.assert_close(np.asarray(cache.mean), whole.mean)
+    torch.testing.assert_close(np.asarray(cache.std), whole.std)
 
 
 def test_many_prompts_are_embedded_some_at_a_time(monkeypatch):

@@ -9,13 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from generated_frames import REJECTED_ROW, make_generated, make_labels, publish
+from generated_frames import REJECTED_ROW, make_generated, make_recorded
 from torch.utils.data import ConcatDataset, DataLoader
 
 from ctlev_core.export.event_dataset import EventDataset
-from data_contracts import tables
 from data_contracts.errors import DataError
-from data_contracts.manifest import label_columns
 from tasks.export_images import write_image_folder
 
 ROWS = [row for row in range(7) if row != REJECTED_ROW]
@@ -32,17 +30,6 @@ def place(request, tmp_path, made):
     if request.param == "exported":
         return write_image_folder(made.artefacts, tmp_path / "mine", name="n", notice="")
     return made.synthetic if request.param == "reference" else str(made.synthetic.path)
-
-
-def make_real(home):
-    """Encoded frames, three to train on and one to test on."""
-    frames = np.random.default_rng(9).integers(0, 256, (4, 14, 20, 3), np.uint8)
-    columns = {
-        "sample_id": [f"r{row}" for row in range(4)], "recording_id": ["r"] * 4, "subject": ["s"] * 4,
-        "split": ["train"] * 3 + ["test"], "class_name": ["walk"] * 4,
-        **{name: [1] * 4 for name in ("t_start_us", "t_end_us", "num_events")}, **label_columns(make_labels(4)),
-    }  # fmt: skip
-    return publish(home, "encode", "recorded", columns, tables.FRAMES, {}, frames=frames), frames
 
 
 def test_samples_hold_images_conditions_and_labels(made, place):
@@ -90,7 +77,7 @@ def test_images_of_the_store_do_not_travel_to_workers(tmp_path):
 
 
 def test_real_and_synthetic_frames_go_together(tmp_path, made):
-    ref, frames = make_real(tmp_path / "home")
+    ref, frames = make_recorded(tmp_path / "home")
     synthetic = EventDataset(made.synthetic, conditions=False)
     real = EventDataset(ref, split="train", class_names=synthetic.class_names)
     assert len(real) == 3 and real[0]["class_index"] == 2 and not {"seed", "prompt", "condition"} & set(real[0])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+import aedat4_writer
+import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -217,3 +219,22 @@ def test_summary_of_a_few_events_and_of_none():
         "num_negative": 1,
     }
     assert set(event_files.summarise(make_events([])).values()) == {0}
+
+
+def test_sensors_of_absurd_sizes_are_refused(tmp_path):
+    """Such a size makes every window of events gigabytes."""
+    events, size = make_events([(0, 0, 0, 1)]), (60_000, 50_000)
+    evt3, parquet, hdf5 = (plugins.load("formats", name) for name in ("evt3", "parquet", "hdf5"))
+    parquet.write(tmp_path / "a.parquet", events)
+    table = pq.read_table(tmp_path / "a.parquet").replace_schema_metadata({"sensor_size": "60000x50000"})
+    pq.write_table(table, tmp_path / "a.parquet")
+    hdf5.write(tmp_path / "a.h5", events)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["events"].attrs["sensor_size"] = size
+    evt3.write(tmp_path / "a.raw", events)
+    content = (tmp_path / "a.raw").read_bytes().replace(b"640", b"60000").replace(b"480", b"50000")
+    (tmp_path / "a.raw").write_bytes(content)
+    (tmp_path / "a.aedat4").write_bytes(aedat4_writer.aedat4([aedat4_writer.packet([(0, 0, 0, 1)])], *size))
+    for name in ("a.parquet", "a.h5", "a.raw", "a.aedat4"):
+        with pytest.raises(DataError, match=rf"{name}: sensor_size must be of 16777216 px at most, got 60000 x 50000"):
+            event_files.read_events_file(tmp_path / name)

@@ -3,6 +3,7 @@
 import hashlib
 import math
 from dataclasses import asdict
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from ctlev_core.metrics import fd_infinity, frechet, kid, prdc
 from ctlev_core.scoring.frechet import frechet_distance
+from ctlev_core.scoring.frechet_extended import refined_frechet_distance
 from ctlev_core.scoring.kid import compute_kid
 from ctlev_core.scoring.prdc import compute_prdc
 from ctlev_core.statistics.feature_distances import DISTANCE_ESTIMATES, estimate_distances, estimates_table
@@ -260,3 +262,51 @@ def test_too_few_recordings_leave_the_value_alone():
         estimate_distances(score, a, b, level=1.0)
     with pytest.raises(ValueError, match="at least 2 rows"):
         estimate_distances(score, a[:1], b)
+
+
+@pytest.mark.parametrize("size", [1e49, 1e52, 1e60, 1e150, 1e200, 1e300])
+def test_kid_of_huge_features_is_a_number_or_an_error(size):
+    a, b = normal(0, 20) * size, normal(1, 20) * size
+    if size < 1e50:
+        value = compute_kid(a, b)
+        exact = [[[Fraction(x) for x in row] for row in rows] for rows in (a, b)]
+        assert np.isclose(value, float(exact_kid(*exact)), rtol=1e-9)
+        return
+    with pytest.raises(DataError, match="are too large for KID: their kernel is beyond 1e308"):
+        compute_kid(a, b)
+
+
+def exact_kid(a, b):
+    """Unbiased MMD in fractions."""
+
+    def mean(rows, others, pairs):
+        width = len(rows[0])
+        return sum(
+            (sum(x * y for x, y in zip(p, q, strict=True)) / width + 1) ** 3 for p, q in pairs(rows, others)
+        ) / len(list(pairs(rows, others)))
+
+    def different(rows, _):
+        return [(p, q) for i, p in enumerate(rows) for j, q in enumerate(rows) if i != j]
+
+    def all_pairs(rows, others):
+        return [(p, q) for p in rows for q in others]
+
+    return mean(a, a, different) + mean(b, b, different) - 2 * mean(a, b, all_pairs)
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e120, 1e150])
+def test_frechet_distance_scales_with_the_square_of_the_features(size):
+    a, b = normal(0, 20), normal(1, 20)
+    assert np.isclose(frechet_distance(a * size, b * size) / size, frechet_distance(a, b) * size, rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e160, 1e200, 1e300])
+def test_a_frechet_distance_beyond_float64_is_an_error(size):
+    with pytest.raises(DataError, match="the squared distance is beyond 1e308"):
+        refined_frechet_distance(normal(0, 20) * size, normal(1, 20) * size)
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e160, 1e300])
+def test_neighbours_do_not_change_with_the_scale(size):
+    a, b = normal(0, 40), normal(1, 40, offset=0.5)
+    assert compute_prdc(a * size, b * size) == compute_prdc(a, b)

@@ -9,6 +9,7 @@ import torch
 
 from ctlev_core.downstream import torchscript, transformers_features
 from ctlev_core.networks import feature_extractors
+from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
 
@@ -79,7 +80,7 @@ def means(frames):
 def test_torchscript_sees_frames_as_they_are(tmp_path):
     frames = pictures(70)
     file = script(Means(), tmp_path / "means.pt")
-    model = keep(torchscript, torchscript.Options(file=file, device="cpu"), tmp_path)
+    model = keep(torchscript, torchscript.Options(file=file, device="cpu", trusted=True), tmp_path)
     found = torchscript.features(model, frames)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, means(frames), rtol=1e-5)
@@ -88,7 +89,7 @@ def test_torchscript_sees_frames_as_they_are(tmp_path):
 
 def test_torchscript_is_kept_wherever_its_file_goes(tmp_path):
     file = script(Means(), tmp_path / "means.pt")
-    model = keep(torchscript, torchscript.Options(file=file, device="cpu"), tmp_path)
+    model = keep(torchscript, torchscript.Options(file=file, device="cpu", trusted=True), tmp_path)
     content = file.read_bytes()
     file.unlink()
     assert torchscript.features(model, pictures()).shape == (5, 6)
@@ -104,7 +105,9 @@ def test_values_and_size_are_options(tmp_path):
     frames = np.full((3, 8, 6, 3), 51, np.uint8)
     file = script(Means(), tmp_path / "means.pt")
     for values, expected in (("0..1", [0.2] * 3), ("imagenet", (0.2 - np.array(MEAN)) / STD)):
-        options = torchscript.Options(file=file, values=values, image_size=16, architecture="means", device="cpu")
+        options = torchscript.Options(
+            file=file, values=values, image_size=16, architecture="means", device="cpu", trusted=True
+        )
         model = keep(torchscript, options, tmp_path, frames, name=values)
         np.testing.assert_allclose(torchscript.features(model, frames)[:, :3], np.tile(expected, (3, 1)), rtol=1e-5)
         assert torchscript.name_score(model, "kid").startswith("kid_event_means_")
@@ -114,7 +117,7 @@ def test_only_the_verified_inception_is_called_fid(tmp_path, monkeypatch):
     """The real file is not here: another one stands in for it by its checksum."""
     file = script(LikeInception(), tmp_path / "inception.pt")
     options = torchscript.Options(file=file, device="cpu")
-    other = keep(torchscript, options, tmp_path, name="other")
+    other = keep(torchscript, options.model_copy(update={"trusted": True}), tmp_path, name="other")
     assert torchscript.name_score(other, "fd").startswith("fd_event_torchscript_")
     monkeypatch.setattr(feature_extractors, "INCEPTION_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
     model = keep(torchscript, options, tmp_path)
@@ -145,22 +148,22 @@ def test_networks_that_make_no_features_are_refused(tmp_path, module, message):
     frames[:, 0, 0], frames[1, 0, 0] = 200, 0
     file = script(module, tmp_path / "network.pt")
     with pytest.raises(DataError, match=message):
-        keep(torchscript, torchscript.Options(file=file, device="cpu"), tmp_path, frames)
+        keep(torchscript, torchscript.Options(file=file, device="cpu", trusted=True), tmp_path, frames)
 
 
 def test_wrong_files_are_named(tmp_path):
     for file in (None, tmp_path / "none.pt"):
         with pytest.raises(DataError, match="expected option `file` to be a TorchScript file, got"):
-            torchscript.input_files(torchscript.Options(file=file))
+            torchscript.input_files(torchscript.Options(file=file, trusted=True))
     (tmp_path / "text.pt").write_text("no network")
     with pytest.raises(DataError, match="cannot be loaded as TorchScript"):
-        keep(torchscript, torchscript.Options(file=tmp_path / "text.pt"), tmp_path)
+        keep(torchscript, torchscript.Options(file=tmp_path / "text.pt", trusted=True), tmp_path)
     file = script(Means(), tmp_path / "means.pt")
     with pytest.raises(DataError, match="no frames to compute features of"):
-        keep(torchscript, torchscript.Options(file=file), tmp_path, pictures(0))
+        keep(torchscript, torchscript.Options(file=file, trusted=True), tmp_path, pictures(0))
     with pytest.raises(DataError, match="expected a transformers_features extractor, got 'torchscript'"):
         transformers_features.features(
-            keep(torchscript, torchscript.Options(file=file), tmp_path, name="other"), pictures()
+            keep(torchscript, torchscript.Options(file=file, trusted=True), tmp_path, name="other"), pictures()
         )
 
 
@@ -272,3 +275,30 @@ def test_weights_that_lack_a_tensor_are_refused(tmp_path):
 def test_no_folder_is_named():
     with pytest.raises(DataError, match="expected option `folder` to be a folder, got None"):
         transformers_features.input_files(transformers_features.Options())
+
+
+def test_a_program_in_a_file_runs_only_where_somebody_trusts_it(tmp_path):
+    """`torch.from_file(shared=True)` in a TorchScript file makes and writes files."""
+    written = tmp_path / "written"
+
+    class WritesFile(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.place = str(written)
+
+        def forward(self, images: torch.Tensor) -> torch.Tensor:
+            written = torch.from_file(self.place, True, 4, dtype=torch.float32).fill_(1)
+            return images.mean([2, 3]) + written.sum()
+
+    file = script(WritesFile(), tmp_path / "network.pt")
+    for function in (torchscript.input_files, lambda options: keep(torchscript, options, tmp_path)):
+        with pytest.raises(DataError, match=r"network\.pt: .* is a program .* set the option trusted=true") as refused:
+            function(torchscript.Options(file=file, device="cpu"))
+        assert len(str(refused.value)) < 500 and not written.exists()
+    keep(torchscript, torchscript.Options(file=file, device="cpu", trusted=True), tmp_path)
+    assert written.stat().st_size == 16
+
+
+def test_trust_changes_no_cache_key(tmp_path):
+    options = torchscript.Options(file=tmp_path / "a.pt")
+    assert cache_material(options) == cache_material(options.model_copy(update={"trusted": True}))

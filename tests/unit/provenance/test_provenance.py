@@ -33,8 +33,8 @@ def put(store, stage, key, arguments, inputs=(), rows=2, seconds=1.0):
     folder.mkdir(parents=True)
     pq.write_table(pa.table({"a": list(range(rows))}), folder / "manifest.parquet")
     record = {
-        "stage": stage, "stage_version": 1, "key": key, "digest": f"digest-{key}", "arguments": arguments,
-        "upstream": {name: f"digest-{name}" for name in inputs}, "versions": {"ctlev": "1"}, "started": "now",
+        "stage": stage, "stage_version": 1, "key": key, "digest": key * 32, "arguments": arguments,
+        "upstream": {name: name * 32 for name in inputs}, "versions": {"ctlev": "1"}, "started": "now",
         "wall_seconds": seconds, "cpu_seconds": seconds / 2, "process_peak_memory_mib": 100.0, "more": "ignored",
     }  # fmt: skip
     (folder / "run.json").write_text(json.dumps(record))
@@ -68,7 +68,7 @@ def test_everything_behind_is_found_once_and_named_over_the_shortest_way(store):
         "0b": "frames", "0f": "score", "0a": "frames / recordings", "0e": "score / model",
         "0d": "score / training_sets", "0c": "score / training_sets / checkpoint",
     }  # fmt: skip
-    assert found["0a"].rows == 7 and found["0f"].upstream["0e"] == "digest-0e"
+    assert found["0a"].rows == 7 and found["0f"].upstream["0e"] == "0e" * 32
     assert {record.key for record in behind(list(found.values()), "0d")} == {"0d", "0c", "0b", "0a"}
 
 
@@ -141,7 +141,7 @@ def score_rows(value, subject="recorded", samples=30):
             {
                 "task": "pose2d", "subject": subject, "seed": 0, "group": "all", "metric": "mpjpe2d_px", "value": value,
                 "low": value - 0.1, "high": value + 0.1, "num_samples": samples, "num_train": 2,
-                "model_digest": "digest-0e", "data_digest": "digest-0b",
+                "model_digest": "0e" * 32, "data_digest": "0b" * 32,
             }
         ],
         schema=tables.SCORES.arrow(),
@@ -153,9 +153,9 @@ def test_a_score_is_traced_to_training_sets_generators_recordings_config_and_cod
     table = trace_lineage([("0f", score_rows(5.0))], records)
     tables.check_table(table, SCORE_LINEAGE, "here")
     (row,) = table.to_pylist()
-    assert row["score_digest"] == "digest-0f" and row["split"] == "test"
-    assert row["training_digests"] == ["digest-0b", "digest-0d"]
-    assert row["checkpoint_digests"] == ["digest-0c"] and row["recordings_digests"] == ["digest-0a"]
+    assert row["score_digest"] == "0f" * 32 and row["split"] == "test"
+    assert row["training_digests"] == ["0b" * 32, "0d" * 32]
+    assert row["checkpoint_digests"] == ["0c" * 32] and row["recordings_digests"] == ["0a" * 32]
 
     def digests(changed):
         (other,) = trace_lineage([("0f", score_rows(5.0))], changed).to_pylist()

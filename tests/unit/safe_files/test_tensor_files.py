@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import tracemalloc
 import zipfile
 from collections import OrderedDict
 
@@ -15,6 +16,7 @@ from safetensors.torch import save_file
 
 from ctlev_core.diffusion.pretrained.model_building import load_tensor
 from ctlev_core.safe_files.tensor_files import check_finite, read_tensor_table
+from ctlev_core.safe_files.torch_files import read_torch_table
 from data_contracts.errors import DataError
 
 DTYPES = {
@@ -265,3 +267,34 @@ def test_values_that_are_not_finite_are_named(tmp_path, dtype, value):
     write(path, good)
     with pytest.raises(DataError, match=r"x\.safetensors: tensor 'second' holds values that are not finite"):
         check_finite(read_tensor_table(path).items())
+
+
+def repacked(tmp_path, **replaced):
+    """A file of torch whose members of some names are others, compressed."""
+    torch.save({"a": torch.zeros(2)}, tmp_path / "whole.pt")
+    with zipfile.ZipFile(tmp_path / "whole.pt") as whole, zipfile.ZipFile(tmp_path / "bomb.pt", "w") as bomb:
+        for name in whole.namelist():
+            content = replaced.get(name.rpartition("/")[2].partition(".")[0])
+            packing = zipfile.ZIP_STORED if content is None else zipfile.ZIP_DEFLATED
+            bomb.writestr(name, whole.read(name) if content is None else content, packing)
+    return tmp_path / "bomb.pt"
+
+
+@pytest.mark.parametrize("member", ["byteorder", "data"])
+def test_members_that_unpack_without_bound_are_refused_before(tmp_path, member):
+    path = repacked(tmp_path, **{member: bytes(200 * 2**20)})
+    assert path.stat().st_size < 2**20
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=r"bomb\.pt: .*is compressed; torch does not do that"):
+            read_torch_table(path)
+        assert tracemalloc.get_traced_memory()[1] < 20 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_pickle_is_no_larger_than_names_and_shapes_need(tmp_path, monkeypatch):
+    torch.save({"a": torch.zeros(2)}, tmp_path / "a.pt")
+    monkeypatch.setattr("ctlev_core.safe_files.torch_files.MAX_PICKLE", 50)
+    with pytest.raises(DataError, match=r"data\.pkl has \d+ bytes, at most 50 are read"):
+        read_torch_table(tmp_path / "a.pt")

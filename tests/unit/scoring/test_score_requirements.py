@@ -97,7 +97,10 @@ def test_a_model_that_says_nothing_is_not_checked(monkeypatch):
         ("metrics=[{name: kid}]", r"expected metrics of predictions, got 'kid'.*name it under distances"),
         ("distances=[{name: mpjpe2d}]", r"got 'mpjpe2d', which compares joints2d; name it under metrics"),
         ("feature_extractor={name: pose2d}", r"expected a model with features, got 'pose2d', which has none"),
-        ("downstream={name: torchscript, options: {file: FILE}}", r"got 'torchscript', which predicts nothing but"),
+        (
+            "downstream={name: torchscript, options: {file: FILE, trusted: true}}",
+            r"got 'torchscript', which predicts nothing but",
+        ),
     ],
 )
 def test_a_plan_that_cannot_be_scored_is_refused_before_anything_is_written(override, message, monkeypatch, tmp_path):

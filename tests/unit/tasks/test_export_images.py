@@ -11,20 +11,16 @@ import numpy as np
 import pandas
 import pyarrow.parquet as pq
 import pytest
-from generated_frames import REJECTED_ROW, make_generated, publish
+from generated_frames import REJECTED_ROW, make_generated, make_streams, publish
 
-from ctlev_core.events import files as event_files
 from ctlev_core.export.event_dataset import EventDataset
 from ctlev_core.provenance.records import read_provenance
 from data_contracts import image_folder, tables
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError, TableVersionError
-from data_contracts.events import Events
 from data_contracts.image_folder import file_names, read_image_table, write_image_table
-from data_contracts.manifest import label_columns
 from data_contracts.synthesis import Synthesis
 from tasks import export_images as task
-from tasks.store import Store
 
 
 def export(made, folder, **others):
@@ -214,42 +210,11 @@ def test_nothing_to_export(tmp_path):
 KEY = "streams"
 
 
-def make_streams(made, home, one_file):
-    """An `export_events` artefact of a few events an image."""
-    count, streams, rows = len(made.frames), [], []
-    for row in range(count):
-        t = np.arange(row + 1, dtype=np.int64) * 10
-        one, x = np.ones(len(t), np.uint8), np.full(len(t), row, np.uint16)
-        streams.append(Events(t, x, x, one, (20, 14)))
-    folder = Store(home).temporary_folder(KEY) / "events"
-    folder.mkdir(parents=True)
-    start = start_us = 0
-    for row, events in enumerate(streams):
-        name = "events.parquet" if one_file else f"{row:06d}.parquet"
-        if not one_file:
-            event_files.write_events_parquet(folder / name, events)
-            start = start_us = 0
-        last_us = start_us + int(events.t[-1])
-        rows.append((f"events/{name}", start, len(events), start_us, last_us))
-        start, start_us = start + len(events), last_us + 100
-    if one_file:
-        moved = [Events(e.t + r[3], e.x, e.y, e.p, e.sensor_size) for e, r in zip(streams, rows, strict=True)]
-        event_files.write_event_chunks_parquet(folder / "events.parquet", moved)
-    names = ("file", "event_start", "num_events", "t_start_us", "t_end_us")
-    columns = {name: [row[number] for row in rows] for number, name in enumerate(names)}
-    columns |= {
-        "sample_id": [f"synthetic/{row:06d}" for row in range(count)], "class_name": list(made.labels.class_names),
-        "has_polarity": [False] * count, "is_exact": [True] * count, "error_levels": [0.0] * count,
-        "seed": list(range(count)), **label_columns(made.labels),
-    }  # fmt: skip
-    return streams, columns
-
-
 @pytest.mark.parametrize("one_file", [False, True])
 def test_event_streams_come_along(tmp_path, one_file):
     home = tmp_path / "home"
     made = make_generated(home)
-    streams, columns = make_streams(made, home, one_file)
+    streams, columns = make_streams(made, home, KEY, one_file)
     ref = publish(home, "export_events", KEY, columns, tables.EVENT_STREAMS, {"generated": made.synthetic})
     folder = export(made, tmp_path / "mine", **{"event streams": ref})
     dataset = EventDataset(folder)

@@ -281,3 +281,17 @@ def test_tracks_out_of_order_and_empty_ones_are_refused(t_us, message):
     labels = Labels(("walk",) * len(t_us), np.array(t_us, np.int64))
     with pytest.raises(DataError, match=message):
         _check_track(labels, recording, "test")
+
+
+@pytest.mark.parametrize(("count", "told"), [(65_534, False), (65_535, True), (70_000, True)])
+def test_counts_that_stop_at_what_they_can_hold_are_told(frames_of, caplog, count, told):
+    """A hot pixel."""
+    events = make_events(0)
+    t = np.sort(np.random.default_rng(0).integers(0, 1000, count))
+    hot = Events(t, np.full(count, 7, np.uint16), np.full(count, 5, np.uint16), np.ones(count, np.uint8), SENSOR)
+    module = make_dataset()
+    module.read_events = lambda recording, options: hot if recording.recording_id == "test/one" else events
+    frames_of(module, Windows(method="whole"))
+    said = [record.getMessage() for record in caplog.records if "counts stop there" in record.getMessage()]
+    expected = "recording 'test/one', window 0: pixel x = 7, y = 5 fired 65535 times or more; counts stop there"
+    assert said == ([expected] if told else [])

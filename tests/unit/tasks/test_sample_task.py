@@ -17,8 +17,9 @@ from ctlev_core.postprocessing.quality_filter import find_causes, fit_quality_fi
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.config import SamplingChoice
+from data_contracts.file_lists import file_digest
 from data_contracts.labels import Conditions, Labels
-from data_contracts.manifest import Manifest, conditions_of, file_digest, label_columns, read_manifest, write_manifest
+from data_contracts.manifest import Manifest, conditions_of, label_columns, read_manifest, write_manifest
 from tasks import sample as task
 from tasks.stage import Output
 

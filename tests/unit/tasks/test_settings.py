@@ -17,13 +17,14 @@ from data_contracts import tables
 from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
+from data_contracts.image_rows import ImageRows
 from data_contracts.labels import Labels
 from flows.command_line import PRESETS, load_preset
 from flows.full_experiment import full_experiment
 from flows.inputs import check_inputs
 from tasks.evaluate import _groups_by_origin, _others
 from tasks.stage import Output, call_flow, planning
-from tasks.subset import take_label_consistent, take_share
+from tasks.subset import take_label_consistent, take_recorded, take_share
 
 COUNT = 12
 
@@ -104,6 +105,9 @@ class Synthetic:
     def array(self, name):
         return self.frames
 
+    def images(self, rows, name="frames"):
+        return ImageRows.of([(self.array(name), rows)])
+
 
 def test_a_share_is_the_first_rows(tmp_path):
     synthetic = Synthetic()
@@ -113,6 +117,64 @@ def test_a_share_is_the_first_rows(tmp_path):
         table = take_share.function(Output(folder, folder), synthetic, share=share)
         assert table.equals(synthetic.table[:expected])
         np.testing.assert_array_equal(np.load(folder / "frames.npy"), synthetic.frames[:expected])
+
+
+def recorded_frames(counts):
+    """`counts` frames by (subject, class, recording), and as many test frames, held in memory."""
+    rows = [names for names, count in counts.items() for _ in range(count)]
+    splits = ["train"] * len(rows) + ["test"] * len(rows)
+    rows += [(f"other {subject}", *names) for subject, *names in rows]
+    names = ("subject", "class_name", "recording_id")
+    table = pa.table(
+        {
+            "sample_id": [f"s{number}" for number in range(len(rows))],
+            "split": splits,
+            **{name: [row[column] for row in rows] for column, name in enumerate(names)},
+        }
+    )
+    arrays = {
+        "frames": np.arange(len(rows), dtype=np.uint8)[:, None, None, None].repeat(3, axis=3),
+        "histograms": np.arange(len(rows), dtype=np.uint16)[:, None, None, None],
+    }
+    frames = Synthetic()
+    frames.table, frames.array = table, arrays.__getitem__
+    frames.column = lambda name: table[name].to_pylist()
+    frames.rows_where = lambda split: np.flatnonzero(np.array(splits) == split)
+    return frames, arrays
+
+
+COUNTS = {("ann", "walk", "r0"): 10, ("ann", "walk", "r1"): 10, ("ann", "run", "r2"): 3, ("bob", "walk", "r3"): 30}
+
+
+@pytest.mark.parametrize(
+    ("count", "kept"),
+    [
+        (6, {"r0": 1, "r1": 1, "r2": 2, "r3": 2}),
+        (12, {"r0": 2, "r1": 2, "r2": 3, "r3": 5}),  # "run" is used up, and the others go on
+        (53, {"r0": 10, "r1": 10, "r2": 3, "r3": 30}),
+    ],
+)
+def test_recorded_frames_are_spread_over_subjects_classes_and_recordings(tmp_path, count, kept):
+    frames, arrays = recorded_frames(COUNTS)
+    table = take_recorded.function(Output(tmp_path, tmp_path), frames, count=count, seed=1)
+    splits, recordings = (np.array(table[name].to_pylist()) for name in ("split", "recording_id"))
+    found = Counter(recordings[splits == "train"].tolist())
+    assert sum(found.values()) == count and (splits == "test").sum() == 53
+    assert all(abs(found[name] - number) <= 1 for name, number in kept.items()), found
+    rows = np.array([int(name[1:]) for name in table["sample_id"].to_pylist()])
+    assert (np.diff(rows) > 0).all()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(np.load(tmp_path / f"{name}.npy"), array[rows])
+    again = take_recorded.function(Output(tmp_path, tmp_path), frames, count=count, seed=1)
+    assert again.equals(table)
+    other = take_recorded.function(Output(tmp_path, tmp_path), frames, count=count, seed=2)
+    assert other.equals(table) == (count == 53)
+
+
+def test_more_recorded_frames_than_there_are_is_refused(tmp_path):
+    frames, _ = recorded_frames(COUNTS)
+    with pytest.raises(DataError, match=r"num_recorded: 54 training frames were asked for, the recordings give 53"):
+        take_recorded.function(Output(tmp_path, tmp_path), frames, count=54, seed=0)
 
 
 def test_label_consistent_rows_are_the_best_of_each_class(monkeypatch, tmp_path):

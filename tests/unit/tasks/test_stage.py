@@ -22,7 +22,8 @@ from ctlev_core.plugins import PluginError
 from data_contracts import tables
 from data_contracts.config import RUN_SETTING, DatasetChoice, Frozen, Windows, cache_material
 from data_contracts.errors import DataError
-from data_contracts.manifest import read_manifest
+from data_contracts.manifest import read_manifest, write_manifest
+from data_contracts.run_record import read_run_record, write_run_record
 from tasks import workers
 from tasks.stage import files_of, in_one_run, planning, stage
 from tasks.store import Store
@@ -205,14 +206,12 @@ def test_damaged_artefact_is_set_aside_and_made_anew(home):
 def test_artefact_of_changed_input_is_made_anew():
     source, _ = run(first, windows=Windows(), seed=1)
     run(second, source)
-    record = source.path / "run.json"
     # The input is repeated and comes out differently, as a training run may on another machine.
     manifest = source.path / "manifest.parquet"
     manifest.unlink()
-    from data_contracts.manifest import write_manifest
-
     changed = write_manifest(source.path, curve([7, 7]), tables.TRAINING)
-    record.write_text(json.dumps(json.loads(record.read_text()) | {"digest": changed.digest}))
+    written = read_run_record(source.path)
+    write_run_record(source.path, written.model_copy(update={"digest": changed.digest}))
     repeated, cached = run(first, windows=Windows(), seed=1)
     assert cached and repeated.digest != source.digest
     made, cached = run(second, repeated)

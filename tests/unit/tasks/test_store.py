@@ -20,14 +20,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ctlev_core.provenance.raw_file_digests import RawFileDigests, digest_raw_files
 from data_contracts import tables
 from data_contracts.errors import DataError
 from data_contracts.manifest import write_manifest
 from data_contracts.published import StoredArtefact, Version, published_folder, write_latest, write_version
 from data_contracts.regeneration import Gates
 from data_contracts.tables import TABLES
-from flows import prune, verify
-from tasks.store import RawFileDigests, Store, StoreInUseError, digest_raw_files
+from flows import cli
+from tasks.store import Store, StoreInUseError
 
 DAY_S = 86_400
 TABLE = pa.table(
@@ -50,7 +51,11 @@ def add(store, number, *, inputs=(), age_days=0.0, stage="encode", arguments=Non
     np.save(temporary / "frames.npy", np.full(50, number))
     (temporary / "checkpoint" / "weights.bin").write_bytes(bytes([number % 256]) * 100)
     write_manifest(temporary, TABLE, tables.TRAINING)
-    record = {"upstream": {key(i): "0" * 64 for i in inputs}, "arguments": arguments or {}}
+    record = {
+        "stage": stage, "stage_version": 1, "key": key(number), "arguments": arguments or {}, "versions": {},
+        "upstream": {key(i): "0" * 64 for i in inputs}, "started": "2026-01-01T00:00:00Z", "wall_seconds": 0.0,
+        "cpu_seconds": 0.0, "process_peak_memory_mib": 0.0,
+    }  # fmt: skip
     folder = store.publish(stage, key(number), temporary, record).path
     age(folder, age_days)
     return folder
@@ -71,8 +76,10 @@ def tree(home):
 
 
 def command(script, monkeypatch, home, *arguments):
-    monkeypatch.setattr(sys, "argv", [script.__name__, "--home", str(home), *arguments])
-    return script.main()
+    monkeypatch.setattr(sys, "argv", [script, "--home", str(home), *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.script(script)
+    return end.value.code
 
 
 @st.composite
@@ -207,25 +214,23 @@ def test_dry_run_is_the_default_and_changes_nothing(tmp_path, monkeypatch, capsy
     old, new = add(store, 1, age_days=40), add(store, 2)
     size = sum(path.stat().st_size for path in old.rglob("*") if path.is_file())
     before = tree(tmp_path)
-    assert command(prune, monkeypatch, tmp_path) == 0
+    assert command("prune", monkeypatch, tmp_path) == 0
     assert tree(tmp_path) == before
     output = capsys.readouterr().out
     assert f"encode/{old.name}" in output and new.name not in output and "1 of 2 folders" in output
     assert store.unneeded(30)[0][0].size_bytes == size
-    assert command(prune, monkeypatch, tmp_path, "--apply") == 0
+    assert command("prune", monkeypatch, tmp_path, "--apply") == 0
     assert not old.exists() and new.exists()
-    assert command(prune, monkeypatch, tmp_path, "--keep-days", "0", "--apply") == 0
+    assert command("prune", monkeypatch, tmp_path, "--keep-days", "0", "--apply") == 0
     assert not new.exists()
 
 
 @pytest.mark.parametrize("days", ["-1", "nan", "inf", "many"])
 def test_a_wrong_number_of_days_is_refused(tmp_path, monkeypatch, days):
-    with pytest.raises(SystemExit) as refused:
-        command(prune, monkeypatch, tmp_path, "--keep-days", days)
-    assert refused.value.code == 2
+    assert command("prune", monkeypatch, tmp_path, "--keep-days", days) == 2
 
 
-@pytest.mark.parametrize("script", [prune, verify])
+@pytest.mark.parametrize("script", ["prune", "verify"])
 def test_a_home_that_is_not_there_is_refused_and_not_made(tmp_path, monkeypatch, capsys, script):
     assert command(script, monkeypatch, tmp_path / "absent") == 2
     assert "there is no such home folder" in capsys.readouterr().err
@@ -322,7 +327,7 @@ def test_an_unreadable_record_stops_pruning_for_what_it_refers_to_is_unknown(tmp
     add(store, 1, age_days=99)
     damaged = add(store, 2, inputs=[1])
     (damaged / "run.json").write_text("{")
-    assert command(prune, monkeypatch, tmp_path, "--apply") == 2
+    assert command("prune", monkeypatch, tmp_path, "--apply") == 2
     assert "run flows/verify.py first" in capsys.readouterr().err
     assert len(store.artefacts()) == 2
 
@@ -359,18 +364,18 @@ def test_damage_is_found_and_set_aside_and_the_rest_stays(tmp_path, monkeypatch,
     home = tmp_path / "home"
     store = Store(home)
     whole, damaged = add(store, 1), add(store, 2)
-    assert command(verify, monkeypatch, home) == 0
+    assert command("verify", monkeypatch, home) == 0
     assert "2 artefacts, 0 of them damaged" in capsys.readouterr().out
     DAMAGE[kind](damaged)
     left = sorted(path.name for path in damaged.rglob("*"))
-    assert command(verify, monkeypatch, home) == 1
+    assert command("verify", monkeypatch, home) == 1
     output = capsys.readouterr().out
     assert f"damaged: encode/{damaged.name}" in output and "2 artefacts, 1 of them damaged" in output
     assert whole.exists() and not damaged.exists()
     moved = home / "damaged" / "encode" / f"{damaged.name}.0"
     assert sorted(path.name for path in moved.rglob("*")) == left
     assert store.find("encode", damaged.name) is None
-    assert command(verify, monkeypatch, home) == 0
+    assert command("verify", monkeypatch, home) == 0
 
 
 @pytest.mark.parametrize("by", [-1, 1])
@@ -382,7 +387,7 @@ def test_what_another_version_of_the_code_wrote_is_no_damage_and_stays(tmp_path,
         patch.setattr(tables, "TRAINING", other)
         folder = add(store, 1)
     add(store, 2)
-    assert command(verify, monkeypatch, tmp_path) == 0
+    assert command("verify", monkeypatch, tmp_path) == 0
     output = capsys.readouterr().out
     assert f"outdated, made anew when needed: encode/{folder.name}: " in output and "damaged:" not in output
     assert "2 artefacts, 0 of them damaged, 1 outdated" in output
@@ -419,12 +424,11 @@ def test_pruning_keeps_published_versions_with_their_scores_and_what_they_were_m
     score = add(store, 5, inputs=[2], age_days=99, stage="memorisation")
     publish(store, 1, versions[0], score)
     publish(store, 2, versions[1])
-    assert command(prune, monkeypatch, tmp_path, "--apply") == 0
+    assert command("prune", monkeypatch, tmp_path, "--apply") == 0
     assert [path.exists() for path in (source, *versions, score)] == [True, True, True, False, True]
-    assert command(prune, monkeypatch, tmp_path, "--keep-versions", "1", "--apply") == 0
+    assert command("prune", monkeypatch, tmp_path, "--keep-versions", "1", "--apply") == 0
     assert [path.exists() for path in (source, *versions, score)] == [True, False, True, False, False]
-    with pytest.raises(SystemExit):
-        command(prune, monkeypatch, tmp_path, "--keep-versions", "-1")
+    assert command("prune", monkeypatch, tmp_path, "--keep-versions", "-1") == 2
 
 
 def test_a_damaged_record_of_a_version_stops_pruning_and_is_named(tmp_path, monkeypatch, capsys):
@@ -432,9 +436,9 @@ def test_a_damaged_record_of_a_version_stops_pruning_and_is_named(tmp_path, monk
     folder = add(store, 1, age_days=99, stage="sample")
     publish(store, 1, folder)
     (published_folder(tmp_path, "walks") / "v0001.json").write_text("{")
-    assert command(prune, monkeypatch, tmp_path, "--apply") == 2 and folder.exists()
+    assert command("prune", monkeypatch, tmp_path, "--apply") == 2 and folder.exists()
     assert "v0001.json: is not the record of a version" in capsys.readouterr().err
-    assert command(verify, monkeypatch, tmp_path) == 1
+    assert command("verify", monkeypatch, tmp_path) == 1
     assert "damaged: " in capsys.readouterr().out
 
 
@@ -442,9 +446,9 @@ def test_latest_data_that_is_not_there_is_found(tmp_path, monkeypatch, capsys):
     store = Store(tmp_path)
     folder = add(store, 1, stage="sample")
     publish(store, 1, folder)
-    assert command(verify, monkeypatch, tmp_path) == 0
+    assert command("verify", monkeypatch, tmp_path) == 0
     flip_a_bit(folder)
-    assert command(verify, monkeypatch, tmp_path) == 1
+    assert command("verify", monkeypatch, tmp_path) == 1
     assert f"missing: sample/{folder.name} of the latest data, version 1 of walks" in capsys.readouterr().out
 
 
@@ -486,9 +490,9 @@ def test_a_store_that_may_only_be_read_is_read_and_errors_are_clear(monkeypatch,
         flip_a_bit(damaged)
         before = tree(home)
         with without_write_permission(home):
-            assert command(prune, monkeypatch, home, "--apply") == 2
+            assert command("prune", monkeypatch, home, "--apply") == 2
             assert "error: " in (errors := capsys.readouterr().err) and "Permission denied" in errors
-            assert command(verify, monkeypatch, home) == 2
+            assert command("verify", monkeypatch, home) == 2
             said = capsys.readouterr()
             assert f"damaged: encode/{damaged.name}" in said.out
             assert "is damaged and cannot be set aside" in said.err and "Permission denied" in said.err
@@ -507,8 +511,9 @@ def test_digests_of_raw_files_are_read_once_and_written_by_many(tmp_path, monkey
     assert not list(tmp_path.glob("*.tmp")) and len(json.loads((tmp_path / "raw_file_digests.json").read_text())) > 0
     everything = [file for files in named for file in files]
     assert digest_raw_files(everything, tmp_path) == [row for rows in found for row in rows]
-    monkeypatch.setattr("tasks.store.json.loads", lambda text: pytest.fail("read again"))
-    monkeypatch.setattr("tasks.store.file_digest", lambda path: pytest.fail("hashed again"))
+    remembering = "ctlev_core.provenance.raw_file_digests"
+    monkeypatch.setattr(f"{remembering}.read_remembered", lambda path: pytest.fail("read again"))
+    monkeypatch.setattr(f"{remembering}.file_digest", lambda path: pytest.fail("hashed again"))
     assert digest_raw_files(everything, tmp_path) == [row for rows in found for row in rows]
 
 

@@ -1,0 +1,135 @@
+"""A generator that was trained by a run, to sample from in a script or a notebook."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ctlev_core import plugins
+from ctlev_core.plugins import validate_options
+from ctlev_core.provenance.records import read_provenance
+from ctlev_core.seeds import sample_seeds
+from data_contracts.errors import DataError
+from data_contracts.labels import Conditions
+from data_contracts.manifest import RUN_FILE
+
+CHECKPOINT = "checkpoint"
+PROMPT = "A moving human"
+"""What ControlNets are told, where nothing else is said."""
+
+
+class TrainedGenerator:
+    """A checkpoint, and how to sample from it.
+
+    Attributes:
+        folder: of the checkpoint; of diffusion models an ordinary diffusers folder.
+        name: of the plug-in in `ctlev_core/generators` that made it.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder, self.name = folder, name
+
+    def __repr__(self) -> str:
+        return f"TrainedGenerator({self.name!r}, {str(self.folder)!r})"
+
+    def sample(
+        self,
+        prompts: str | Sequence[str] | None = None,
+        *,
+        images: npt.ArrayLike | None = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> np.ndarray:
+        """Event images, one for each prompt or condition image.
+
+        Args:
+            prompts: texts, such as "A photo of cat"; one text serves all images.
+            images: [N, H, W, 3] uint8 condition images, such as those of `skeleton_map` and `normal_map`, or one
+                [H, W, 3]; for generators that are asked by pictures.
+            seed: row i has the i-th seed that follows from it.
+            options: the generator's `SampleOptions`, such as `num_inference_steps`; `ctlev options NAME` lists them.
+        Returns:
+            [N, H, W, 3] uint8.
+        Raises:
+            ValueError: nothing was asked for, numbers differ, or the generator takes something else.
+            PluginError: an unknown or wrong option.
+            DataError: the checkpoint is broken.
+        """
+        asked = _conditions(prompts, images)
+        module: Any = plugins.load("generators", self.name)
+        chosen = validate_options(module.SampleOptions, options, f"generators {self.name!r}")
+        with tempfile.TemporaryDirectory(prefix="ctlev_sample_") as work:
+            seeds = sample_seeds(seed, len(asked))
+            return module.sample(self.folder, asked, chosen, seeds=seeds, work=Path(work))
+
+
+def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] | None = None) -> TrainedGenerator:
+    """The generator of a run, or of a folder.
+
+    Args:
+        place: name of a report (its experiment's own generator), the path of an artefact of the stage `finetune`, or of
+            a diffusers folder that training wrote.
+        home: folder of all state, where `place` is a name; None = CTLEV_HOME, else `.ctlev`.
+    Raises:
+        DataError: there is no such run or folder, or it holds no generator.
+    """
+    path = Path(place)
+    if path.is_dir():
+        return _of_folder(path)
+    state = Path(home or os.environ.get("CTLEV_HOME") or ".ctlev")
+    report = state / "reports" / str(place)
+    if not (report / "provenance.json").is_file():
+        known = sorted(one.parent.name for one in (state / "reports").glob("*/provenance.json"))
+        raise DataError(
+            f"generator {str(place)!r}: is neither a folder nor a report of {state}, which has "
+            f"{', '.join(known) or 'none'}; of a study name the folder of a checkpoint"
+        )
+    records = [one for one in read_provenance(report / "provenance.json") if one.stage == "finetune"]
+    own = next((one for one in records if one.role == "checkpoint of synthetic"), None)
+    if own is None:
+        raise DataError(f"{report}: no generator was trained in this run")
+    folder = state / "artefacts" / own.stage / own.key
+    if not folder.is_dir():
+        raise DataError(f"{folder}: is not in the store any more; run the experiment again")
+    return _of_folder(folder)
+
+
+def _of_folder(folder: Path) -> TrainedGenerator:
+    """The generator of an artefact, or of the checkpoint alone."""
+    if not (folder / RUN_FILE).is_file() and (folder.parent / RUN_FILE).is_file() and folder.name == CHECKPOINT:
+        folder = folder.parent
+    if (folder / RUN_FILE).is_file():
+        try:
+            plugin = json.loads((folder / RUN_FILE).read_text())["arguments"]["generator"]["plugin"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{folder}: is no artefact of the stage finetune") from error
+        return TrainedGenerator(folder / CHECKPOINT, plugin.rpartition("/")[2])
+    if not (folder / "model_index.json").is_file():
+        raise DataError(
+            f"{folder}: expected an artefact of the stage finetune or a diffusers folder; no model_index.json"
+        )
+    return TrainedGenerator(folder, "controlnet" if (folder / "controlnet").is_dir() else "stable_diffusion")
+
+
+def _conditions(prompts: str | Sequence[str] | None, images: npt.ArrayLike | None) -> Conditions:
+    pictures = None if images is None else np.asarray(images)
+    if pictures is not None and pictures.ndim == 3:
+        pictures = pictures[None]
+    if pictures is not None and (pictures.ndim != 4 or pictures.shape[3] != 3 or pictures.dtype != np.uint8):
+        raise ValueError(f"images must be [N, H, W, 3] uint8, got {pictures.shape} {pictures.dtype}")
+    count = None if pictures is None else len(pictures)
+    if prompts is None and count is None:
+        raise ValueError("sample: expected prompts, or images to be conditioned on")
+    texts = (
+        [PROMPT if prompts is None else prompts] * (count or 1) if isinstance(prompts, str | None) else list(prompts)
+    )
+    if count is not None and len(texts) != count:
+        raise ValueError(f"sample: {len(texts)} prompts for {count} images")
+    return Conditions(tuple(texts), pictures)

@@ -1,0 +1,83 @@
+"""The files of an artefact with their sizes and digests, where they are too many for the manifest's metadata."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from data_contracts.errors import DataError
+
+FILE_LIST = "file_list.parquet"
+MAX_LISTED_FILES = 10_000
+"""Files that the manifest's own metadata lists at most."""
+_COLUMNS = pa.schema([("name", pa.string()), ("bytes", pa.int64()), ("sha256", pa.binary(32))])
+
+
+class FileList(Mapping[str, Mapping[str, Any]]):
+    """Size and digest of each file by its name, as `{"bytes": ..., "sha256": ...}`; a million takes some 200 MB."""
+
+    def __init__(self, table: pa.Table) -> None:
+        self._row = {name: row for row, name in enumerate(table["name"].to_pylist())}
+        self._bytes = table["bytes"].to_numpy()
+        # One buffer: a million short texts would take a hundred bytes each.
+        self._digests = np.frombuffer(b"".join(table["sha256"].to_pylist()), np.uint8).reshape(-1, 32)
+
+    def __getitem__(self, name: str) -> Mapping[str, Any]:
+        row = self._row[name]
+        return {"bytes": int(self._bytes[row]), "sha256": self._digests[row].tobytes().hex()}
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._row
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._row)
+
+    def __len__(self) -> int:
+        return len(self._row)
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_file_list(folder: Path, files: Sequence[Path]) -> None:
+    """Write `file_list.parquet` of files below `folder`."""
+    columns = {
+        "name": [path.relative_to(folder).as_posix() for path in files],
+        "bytes": [path.stat().st_size for path in files],
+        "sha256": [bytes.fromhex(file_digest(path)) for path in files],
+    }
+    pq.write_table(pa.table(columns, schema=_COLUMNS), folder / FILE_LIST, compression="zstd")
+
+
+def read_file_list(path: Path) -> FileList:
+    """The list in `file_list.parquet`, whose own digest was checked.
+
+    Raises:
+        DataError: it is no such table.
+    """
+    table = read_table(path, path).replace_schema_metadata(None)
+    if table.schema != _COLUMNS or any(column.null_count for column in table.columns):
+        raise DataError(f"{path}: expected columns {', '.join(_COLUMNS.names)}, got {', '.join(table.column_names)}")
+    return FileList(table)
+
+
+def read_table(source: Path | pa.BufferReader, path: Path) -> pa.Table:
+    """One Parquet file. `pq.read_table` would load pyarrow's datasets for it, and those pandas, a third of a second."""
+    try:
+        with pq.ParquetFile(source) as file:
+            return file.read()
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error
+    except pa.ArrowInvalid as error:
+        raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error

@@ -1,0 +1,308 @@
+"""The command `ctlev`: every subcommand with its arguments. What they do is imported when one is called.
+
+The scripts beside this file (`python flows/synthesize.py ...`) are single subcommands of it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from ctlev_core import __version__
+from flows import preset_list
+
+app = typer.Typer(
+    name="ctlev",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+SINGLE_RUNS, PARTS, STORE, LOOK_UP = (
+    "Experiments",
+    "Parts of an experiment",
+    "Runs and the store",
+    "Presets and options",
+)
+
+
+def _complete_preset(incomplete: str) -> list[tuple[str, str]]:
+    heads = preset_list.preset_heads()
+    return [(head.name, head.summary) for head in heads if head.name.startswith(incomplete)]
+
+
+def _complete_report(incomplete: str) -> list[str]:
+    home = Path(os.environ.get("CTLEV_HOME") or ".ctlev")
+    return sorted(path.stem for path in (home / "reports").glob(f"{incomplete}*.html"))
+
+
+def _complete_option(incomplete: str) -> list[str]:
+    from flows.option_list import option_names
+
+    return [f"{name}=" for name in option_names() if name.startswith(incomplete)]
+
+
+Preset = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="PRESET",
+        help="name of a bundled preset (`ctlev presets`), or path of a .yaml file",
+        autocompletion=_complete_preset,
+        show_default=False,
+    ),
+]
+PresetOption = Annotated[str | None, typer.Option("--preset", metavar="PRESET", help="the same", show_default=False)]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="change an option; repeatable (`ctlev options PRESET` lists them)",
+        autocompletion=_complete_option,
+        show_default=False,
+    ),
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="print the plan and run nothing")]
+Home = Annotated[
+    Path | None,
+    typer.Option("--home", help="folder of all state (default: CTLEV_HOME, else .ctlev)", show_default=False),
+]
+Verbose = Annotated[bool, typer.Option("--verbose", help="show Prefect's log")]
+Run = Annotated[
+    str,
+    typer.Argument(help="name, key or path of a report", autocompletion=_complete_report, show_default=False),
+]
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"ctlev {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _ctlev(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version and end")
+    ] = False,
+) -> None:
+    """Labelled event-camera data from a fine-tuned image-diffusion model."""
+
+
+def main() -> NoReturn:
+    """The console script."""
+    app(prog_name="ctlev")
+    raise SystemExit(0)
+
+
+def script(name: str) -> NoReturn:
+    """Run one subcommand with this process's arguments, as the flow scripts do; ends the process."""
+    from flows.settings import leave_script_folder
+
+    leave_script_folder()
+    command: Any = typer.main.get_command(app)
+    command.commands[name].main(args=sys.argv[1:], prog_name=Path(sys.argv[0]).name)
+    raise SystemExit(0)
+
+
+def _run(module: str, default: str, given: tuple[str | None, str | None], **asked: Any) -> NoReturn:
+    """Run the flow of a module.
+
+    Args:
+        module: of `flows`, with a `COMMAND`.
+        default: preset.
+        given: preset as argument and as option.
+        asked: `home`, `verbose`, and the rest of `flows.command_line.Asked`.
+    """
+    if os.environ.get("LOCAL_RANK", "0") != "0":
+        raise typer.Exit(0)  # under `accelerate launch` one process runs the flow; training starts the others itself
+    if None not in given and given[0] != given[1]:
+        raise typer.BadParameter(f"two presets are named: {given[0]} and --preset {given[1]}")
+    from flows.settings import configure
+
+    configure(asked.pop("home"), verbose=asked.pop("verbose", False))
+    from flows.command_line import Asked, run_command
+
+    command = importlib.import_module(f"flows.{module}").COMMAND
+    overrides = list(asked.pop("overrides") or [])
+    raise typer.Exit(run_command(command, Asked(given[0] or given[1] or default, overrides, **asked)))
+
+
+@app.command(rich_help_panel=SINGLE_RUNS)
+def run(
+    preset: Preset = None,
+    preset_option: PresetOption = None,
+    overrides: Overrides = None,
+    dry_run: DryRun = False,
+    home: Home = None,
+    verbose: Verbose = False,
+) -> None:
+    """Run a whole experiment or study, recordings in, a scored report out; by default the preset `demo`.
+
+    What is in the store already is not computed again. `--set num_synthetic=200,400` runs both, in one report.
+    """
+    _run(
+        "full_experiment",
+        "demo",
+        (preset, preset_option),
+        overrides=overrides,
+        dry_run=dry_run,
+        home=home,
+        verbose=verbose,
+    )
+
+
+@app.command(rich_help_panel=SINGLE_RUNS)
+def plan(
+    preset: Preset = None,
+    preset_option: PresetOption = None,
+    overrides: Overrides = None,
+    home: Home = None,
+) -> None:
+    """List what `run` would do: each stage, cached or not, with its time, memory and disk, and the total."""
+    _run("full_experiment", "demo", (preset, preset_option), overrides=overrides, dry_run=True, costs=True, home=home)
+
+
+def _part(name: str, module: str, help_text: str, *, default: str = "pose", panel: str = PARTS) -> None:
+    """Add the command of a flow that takes a preset, `pose` where none is named."""
+
+    def command(
+        preset: Preset = None,
+        preset_option: PresetOption = None,
+        overrides: Overrides = None,
+        dry_run: DryRun = False,
+        home: Home = None,
+        verbose: Verbose = False,
+    ) -> None:
+        given = preset, preset_option
+        _run(module, default, given, overrides=overrides, dry_run=dry_run, home=home, verbose=verbose)
+
+    app.command(name, help=f"{help_text} By default of the preset `{default}`.", rich_help_panel=panel)(command)
+
+
+_part(
+    "prepare", "prepare_dataset", "Ingest recordings, encode them as event images, render conditions; a contact sheet."
+)
+_part("train", "train_generator", "Fine-tune a generator on labelled event images.")
+_part(
+    "synthesize", "synthesize", "Sample labelled event images; `--set export_folder=FOLDER` writes them as plain files."
+)
+_part("evaluate", "evaluate", "Train downstream models on recorded, synthetic and mixed data, and score them.")
+_part("baselines", "baselines", "Make the frames of the baselines, which are asked for the same labels.")
+_part("export-events", "export_events", "Write the synthetic frames as event streams.")
+_part("speed-vs-error", "speed_vs_error", "Measure samplers and numbers of steps against error.")
+_part("realism-chain", "realism_chain", "Send recorded frames through the parts of a generator, to see what is lost.")
+_part("pretrain", "pretrain", "Train a small base model on pictures.", default="small")
+_part(
+    "regenerate",
+    "regenerate",
+    "Make the next version of the synthetic data, and publish it if it keeps the gates.",
+    panel=SINGLE_RUNS,
+)
+
+
+@app.command(rich_help_panel=STORE)
+def compare(run_a: Run, run_b: Run, home: Home = None) -> None:
+    """Say what differs between two finished experiments: options, data, code and scores."""
+    from flows.settings import configure
+
+    folder = configure(home)
+    from flows.compare import print_comparison
+
+    raise typer.Exit(print_comparison(run_a, run_b, folder))
+
+
+@app.command(rich_help_panel=STORE)
+def verify(home: Home = None) -> None:
+    """Hash every artefact of the store again and set damaged ones aside, so that the next run makes them anew."""
+    from flows.verify import verify_home
+
+    raise typer.Exit(verify_home(_home(home)))
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"must be a number of days, got {value}")
+    return value
+
+
+@app.command(rich_help_panel=STORE)
+def prune(
+    keep_days: Annotated[
+        float, typer.Option(min=0, metavar="N", help="keep what was used since", callback=_finite)
+    ] = 30,
+    keep_versions: Annotated[
+        int,
+        typer.Option(
+            min=0, metavar="N", help="keep the newest published versions of each experiment, and always the latest"
+        ),
+    ] = 5,
+    apply: Annotated[bool, typer.Option("--apply", help="remove; without it, list what would be removed")] = False,
+    home: Home = None,
+) -> None:
+    """Remove from the store what no run has used for long, and nothing that anything kept was made from."""
+    from flows.prune import prune_home
+
+    raise typer.Exit(prune_home(_home(home), keep_days, keep_versions, apply=apply))
+
+
+def _home(home: Path | None) -> Path:
+    from tasks.store import home_folder
+
+    return (home or home_folder()).absolute()
+
+
+@app.command(rich_help_panel=STORE)
+def show(
+    run: Annotated[
+        str | None,
+        typer.Argument(
+            help="name, key or path of a report; the newest where none is named",
+            autocompletion=_complete_report,
+            show_default=False,
+        ),
+    ] = None,
+    open_page: Annotated[
+        bool | None,
+        typer.Option("--open/--no-open", help="open it in a browser (default: on a terminal)", show_default=False),
+    ] = None,
+    home: Home = None,
+) -> None:
+    """Open the report of a run, and print its path."""
+    from flows.show import show_report
+
+    raise typer.Exit(show_report(run, _home(home), open_page=open_page))
+
+
+@app.command(rich_help_panel=LOOK_UP)
+def presets() -> None:
+    """List the presets, a line each: what it does, and how long it takes."""
+    from flows.preset_table import print_presets
+
+    print_presets()
+
+
+@app.command(rich_help_panel=LOOK_UP)
+def options(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="PRESET|PLUGIN",
+            help="a preset, or a plug-in such as `controlnet` or `datasets/folder`",
+            show_default=False,
+        ),
+    ],
+) -> None:
+    """List every option of a preset or a plug-in: type, default, description."""
+    from flows.option_list import print_options
+
+    raise typer.Exit(print_options(name))
+
+
+if __name__ == "__main__":
+    main()
