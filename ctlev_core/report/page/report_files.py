@@ -11,7 +11,7 @@ from data_contracts.manifest import MANIFEST_FILE, ManifestRef
 PAGE, LATEX, MARKDOWN, PROVENANCE = "report.html", "tables.tex", "tables.md", "provenance.json"
 _ANSWER = re.compile(r"\b(helped?|did harm|made it (better|worse)|is undecided|changed nothing|too few)\b")
 _SENTENCE_END = re.compile(r"(?<=[.?])\s+(?=[A-Z])")
-_HEADING = re.compile(r"[^.:`]*\(`[^`]+`\): ")
+_HEADING = re.compile(r"[^.:]*\([^()]+\): ")
 """Of the paragraph of an experiment in a study."""
 
 

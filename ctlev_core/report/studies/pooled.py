@@ -172,7 +172,8 @@ def _sentence(group: Group) -> str:
     if added is None:
         return f"{group.name}: nothing was trained on recorded and synthetic frames together."
     before, after = (group.score(training_set).value for training_set in (RECORDED, BOTH))
-    told = f"{group.name}: {tell_change(ADDING, added, group.metric, before, after)}"
+    told = tell_change(ADDING, added, group.metric, before, after)
+    told = f"{group.name}: {told[:1].lower()}{told[1:]}"
     beside = group.difference(AUGMENTED, BOTH)
     if beside is None:
         return told
@@ -218,8 +219,8 @@ def _score_table(groups: Sequence[Group]) -> Table:
             [Name("synthetic, against their labels", LABELS), *("" if one is None else _score(one) for one in agreed)]
         )
         notes.append(
-            f"Against their labels: {metric_name(metric)} of classifiers trained on recorded frames when they are shown "
-            "synthetic frames and the labels asked for. It says nothing of test recordings."
+            f"Against their labels: {metric_name(metric)} of classifiers trained on recorded frames when they are "
+            "shown synthetic frames and the labels asked for. It says nothing of test recordings."
         )
     sense = "lower" if lower_is_better(metric) else "higher"
     caption = (
@@ -250,8 +251,8 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
         return []
     sense = "Lower" if lower_is_better(metric) else "Higher"
     caption = (
-        f"Differences in {metric_name(metric)}, the first of the two minus the second, paired by test recording and by draw. "
-        f"{sense} is better. In brackets 95 % intervals; bold: the interval excludes 0."
+        f"Differences in {metric_name(metric)}, the first of the two minus the second, paired by test recording and by "
+        f"draw. {sense} is better. In brackets 95 % intervals; bold: the interval excludes 0."
     )
     notes = []
     if any(shares):
@@ -261,8 +262,8 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
             "is certain."
         )
     chances = (
-        f"Share of resampled studies in which the first of the two has the better {metric_name(metric)}; 50 % is a tie. Resampled "
-        "studies are spread as widely as the intervals are."
+        f"Share of resampled studies in which the first of the two has the better {metric_name(metric)}; 50 % is a "
+        "tie. Resampled studies are spread as widely as the intervals are."
     )
     return [
         Table(

@@ -99,8 +99,8 @@ def study_plain(parts: Sequence[Part]) -> list[tuple[str, str]]:
             "What was done",
             "An event camera reports, pixel by pixel, when it gets brighter or darker. In each experiment a generator "
             "learnt from recorded event images and what is known of them, and made synthetic ones for other labels. In "
-            f"{compared} of {len(parts)} experiments models were then trained on recorded images, on synthetic ones and "
-            "on both, and tested on recorded images that nothing was trained on.",
+            f"{compared} of {len(parts)} experiments models were then trained on recorded images, on synthetic ones "
+            "and on both, and tested on recorded images that nothing was trained on.",
         ),
         (
             "How sure is it?",
@@ -230,10 +230,9 @@ def distances_table(parts: Sequence[Part]) -> Table:
         for training_set in training_sets
     ]
     caption = (
-        "Frechet distance to the recorded training frames, in features of a classifier trained on recorded events: "
-        "another one "
-        "for each experiment, so that only numbers below one another compare. Lower is nearer; the row of held-out "
-        "recorded frames is the floor. In brackets 95 %."
+        "Frechet distance to the recorded training frames, in features of a classifier trained on recorded events, "
+        "another one for each experiment, so that only numbers below one another compare. Lower is nearer; the row of "
+        "held-out recorded frames is the floor. In brackets 95 %."
     )
     return Table(
         "Quality of the frames",
