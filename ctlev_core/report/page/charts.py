@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ctlev_core.report.page.html import Curves
 
 WIDTH, HEIGHT = 560, 300
-LEFT, RIGHT, TOP, BOTTOM = 66, 14, 10, 48
+LEFT, RIGHT, TOP, BOTTOM = 84, 14, 10, 48
 """Margins, in units of the drawing."""
 NUM_COLOURS, NUM_DASHES = 8, 3
 _MARKED_POINTS = 24

@@ -19,10 +19,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from ctlev_core.report.page import charts, figures
+from ctlev_core.report.page.report_files import FACTS
 from ctlev_core.report.page.tables import Table, shown_cells
 
-FACTS = "<!-- date, version and machine: filled in when the page is published -->"
-"""Where `report_files` writes what must not enter the digest of a stored page."""
 Colours = Sequence[tuple[str, str]]
 """(CSS colour or gradient, meaning) of each entry of a legend."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ctlev_core.duration_text import duration_text
 from ctlev_core.provenance.records import Record, options_of
 from ctlev_core.report.page.display_names import STAGES, role_name, stage_name
 from ctlev_core.report.page.html import Box, Diagram
@@ -98,18 +99,8 @@ def _without_shortcuts(edges: list[tuple[str, str]]) -> list[tuple[str, str]]:
 
 def _told(runs: Sequence[Record]) -> str:
     times = f"{len(runs)} × · " if len(runs) > 1 else ""
-    return f"{times}{duration(sum(record.wall_seconds for record in runs))}"
-
-
-def duration(seconds: float) -> str:
-    """`0.4 s`, `52 s`, `3 min 20 s`, `2 h 5 min`."""
-    if seconds < 60:
-        return f"{seconds:.1f} s" if seconds < 9.95 else f"{seconds:.0f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, left = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {left} min"
-    return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+    seconds = sum(record.wall_seconds for record in runs)
+    return f"{times}{duration_text(seconds) if seconds >= 9.95 else f'{seconds:.1f} s'}"
 
 
 def _arrow(start: tuple[float, float], end: tuple[float, float]) -> str:
