@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from ctlev_core.duration_text import duration_text
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError, TrainingError, shortened
@@ -28,7 +29,7 @@ from flows.costs import HOW_ESTIMATED, estimate_costs
 from flows.inputs import InputsMissing, check_inputs
 from flows.plan_table import print_plan_with_costs
 from flows.preset_list import PRESETS, preset_names
-from flows.run_progress import duration_text, shown
+from flows.run_progress import shown
 from flows.settings import ScriptFlow
 from tasks.stage import PlannedStage, in_one_run, planning
 from tasks.store import home_folder

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from flows.run_progress import duration_text
+from ctlev_core.duration_text import duration_text
 from flows.stage_costs import StageCost, estimate_stages, time_left
 from flows.tables_of_text import print_table
 from tasks.stage import PlannedStage

@@ -23,6 +23,7 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar as Bar
 from rich.table import Table
 
+from ctlev_core.duration_text import duration_text
 from ctlev_core.progress import Progress, reporting_to
 from flows.stage_costs import StageCost, estimate_stages, time_left
 from tasks.stage import PlannedStage, watched_by
@@ -196,14 +197,3 @@ def shown(rows: Sequence[PlannedStage], home: Path) -> Iterator[RunProgress]:
         os.environ.setdefault("TQDM_DISABLE", "1")
         with progress.drawn():
             yield progress
-
-
-def duration_text(seconds: float) -> str:
-    """A time as `42 s`, `3 min 20 s` or `2 h 5 min`."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min" + (f" {whole % 60} s" if whole < 600 and whole % 60 else "")
-    minutes = round(whole / 60)
-    return f"{minutes // 60} h" + (f" {minutes % 60} min" if minutes % 60 else "")

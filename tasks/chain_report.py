@@ -21,7 +21,7 @@ from tasks.stage import Output, stage
 TABLE = f"{tables.REALISM_CHAIN.name}.parquet"
 
 
-@stage(version=1, schema=tables.REPORT)
+@stage(version=2, schema=tables.REPORT)
 def chain_report(
     out: Output,
     frames: Manifest,

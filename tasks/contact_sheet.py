@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pyarrow as pa
 
 from ctlev_core.report.page.html import render_report
+from ctlev_core.report.page.report_files import page_facts, publish_file
 from ctlev_core.report.sections.contact_sheet import contact_sheet_sections
 from data_contracts import tables
 from data_contracts.manifest import Manifest, ManifestRef
@@ -16,7 +16,7 @@ from tasks.stage import Output, stage
 PAGE = "contact_sheet.html"
 
 
-@stage(version=1, schema=tables.REPORT)
+@stage(version=2, schema=tables.REPORT)
 def contact_sheet(
     out: Output, frames: Manifest, frame_conditions: Manifest, sample_conditions: Manifest, *, title: str, notice: str
 ) -> pa.Table:
@@ -32,7 +32,5 @@ def publish_contact_sheet(ref: ManifestRef, home: Path, name: str) -> str:
     """Put the newest contact sheet of an experiment where a person looks for it, and say where that is."""
     path = home / "reports" / f"{name}_conditions.html"
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}")
-    shutil.copyfile(ref.path / PAGE, temporary)
-    temporary.replace(path)
+    publish_file(ref.path / PAGE, path, facts=page_facts(ref.path))
     return f"contact sheet: {path}"

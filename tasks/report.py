@@ -16,30 +16,35 @@ from ctlev_core.provenance.records import Record, read_records, write_provenance
 from ctlev_core.provenance.scores import paired_samples, trace_lineage
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
-from ctlev_core.report.page.html import Curves, Folded, Section, render_report
+from ctlev_core.report.page.display_names import set_name
+from ctlev_core.report.page.html import Chapter, Curves, Folded, Section, render_report
 from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, PROVENANCE
-from ctlev_core.report.page.tables import Cell, Table, render_latex, render_markdown
+from ctlev_core.report.page.tables import Table, render_latex, render_markdown
 from ctlev_core.report.sections import pictures
+from ctlev_core.report.sections.colour_legends import all_colours
 from ctlev_core.report.sections.contact_sheet import contact_sheet_sections
-from ctlev_core.report.sections.costs import cost_table, options_table, versions_table
-from ctlev_core.report.sections.data_split import told_split
+from ctlev_core.report.sections.costs import cost_table, versions_table
+from ctlev_core.report.sections.data_split import recordings_table, told_split
 from ctlev_core.report.sections.distances import floor_tables
+from ctlev_core.report.sections.lineage import lineage_diagram, record_tables
 from ctlev_core.report.sections.memorisation import memorisation_sections
 from ctlev_core.report.sections.nearest_classes import nearest_sections
+from ctlev_core.report.sections.plain_words import plain_words
 from ctlev_core.report.sections.realism import realism_sections
 from ctlev_core.report.sections.rejections import rejection_sections
 from ctlev_core.report.sections.scaling import scaling_figure, scaling_points
 from ctlev_core.report.sections.score_tables import (
     PairedScores,
     baseline_tables,
+    frame_tables,
     group_tables,
     score_tables,
     trained_rows,
 )
-from ctlev_core.report.sections.training_curves import base_model_figures
-from ctlev_core.report.sections.verdict import verdict
+from ctlev_core.report.sections.training_curves import base_model_figures, loss_curves
+from ctlev_core.report.sections.verdict import Verdict, verdict
 from ctlev_core.report.studies.paper_numbers import paper_section
-from ctlev_core.report.studies.summary import Figure, Summary, write_summary
+from ctlev_core.report.studies.summary import Summary, write_summary
 from ctlev_core.statistics.paired_differences import share_of_gain
 from data_contracts import tables
 from data_contracts.manifest import Manifest
@@ -52,7 +57,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=17, schema=tables.REPORT)
+@stage(version=18, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -107,51 +112,89 @@ def report(
     real = [frames, *(manifest for manifest in (oracle, target) if manifest is not None)]
     samples = paired_samples(_samples(scores, [*real, *generated]))
     rows, paired = traced.to_pylist(), PairedScores(samples)
-    results = _results(rows, training_sets, list(shown), paired)
+    own = next(iter(shown.values()))
+    kind, options = _condition(frame_conditions)
+    event_image = np.asarray(frames.array("frames")[0]) if len(frames) else np.zeros((1, 1, 3), np.uint8)
+    colours = all_colours(kind, options, event_image)
+    results = score_tables(rows, training_sets, paired)
+    origins, by_class = group_tables(rows, training_sets)
+    results += [*origins, *baseline_tables(list(shown), _first_metric(rows), paired)]
+    about_frames, floors = frame_tables(rows), floor_tables(scores)
     copied = memorisation_sections(frames, generated, memorisation)
     distributions, tests = (realism.attached(schema).to_pylist() for schema in (DISTRIBUTIONS, TWO_SAMPLE_TESTS))
     looks = realism_sections(realism.table.to_pylist(), distributions, tests)
     refused = rejection_sections(shown)
-    floors = floor_tables(scores)
-    sheet = contact_sheet_sections(frames, frame_conditions, conditions)
-    _, by_class = group_tables(rows, training_sets)
     words = _verdict(rows, training_sets, list(shown), paired)
-    steps = pictures.steps(frames, frame_conditions, conditions, next(iter(shown.values())), _kind(frame_conditions))
-    grid, *other_grids = pictures.sample_grids(conditions, shown, real)
-    figures = _figures(rows, _learnt_with(records), conditions, next(iter(shown.values())))
-    write_summary(out.folder, Summary(words, steps, grid, figures))
+    steps = pictures.steps(frames, frame_conditions, conditions, own, kind)
+    grid, *other_grids = pictures.sample_grids(conditions, shown, real, colours)
+    charts, moving = _charts(rows, _learnt_with(records)), pictures.motion(conditions, own)
+    write_summary(out.folder, Summary(str(words), steps, grid, [*charts[:-1], *moving, *charts[-1:]], colours))
     page = render_report(
         title=title,
         lead=notice,
-        verdict=words,
+        verdict=words.headline,
+        answer=words.answer,
+        plain=plain_words(rows, words, len(frame_conditions), len(own), pictures.condition_in_words(kind)),
         steps=steps,
+        colours=colours,
         sections=[
-            *results,
-            *copied[:1],
-            *refused,
-            grid,
-            *other_grids,
-            *([] if nearest is None else nearest_sections(nearest)),
-            *figures,
-            pictures.real_grid(frames, target),
-            *looks[:1],
-            *_training_of_generators(checkpoints, checkpoint_names),
-            *_folded("Class by class", by_class),
-            *_folded("How to read the distances", floors),
-            *_folded("Closest pairs of generated and training frames", copied[1:]),
-            *_folded("More on how real frames look", looks[1:]),
-            *_folded("What was learnt from, and asked for", sheet),
-            *_folded("Downstream training", [_curves("Downstream training", models, model_names)]),
-            *_folded("Recordings", [_recordings_table(recordings, frames)]),
-            *_folded("Where the time went", [cost_table(records)]),
-            *_folded("What exactly was run", [options_table(records), versions_table(records)]),
-            paper_section(),
+            Chapter("Did it help?", [*results, *charts, *_folded("Class by class", by_class)]),
+            Chapter(
+                "What the frames look like",
+                [
+                    grid,
+                    *other_grids,
+                    *moving,
+                    pictures.real_grid(frames, target),
+                    *([] if nearest is None else nearest_sections(nearest)),
+                    *_folded(
+                        "What was learnt from, and asked for",
+                        contact_sheet_sections(frames, frame_conditions, conditions),
+                    ),
+                ],
+            ),
+            Chapter(
+                "How good are they?",
+                [
+                    *about_frames,
+                    *_folded("How to read the distances", floors),
+                    *looks[:1],
+                    *_folded("More on how real frames look", looks[1:]),
+                    *copied[:1],
+                    *_folded("Closest pairs of generated and training frames", copied[1:]),
+                    *refused,
+                ],
+            ),
+            Chapter(
+                "How they were made",
+                [
+                    lineage_diagram(records),
+                    *(
+                        loss_curves(f"Training of the generator: {set_name(name)}", [checkpoint], [name])
+                        for name, checkpoint in zip(checkpoint_names, checkpoints, strict=True)
+                    ),
+                    *_folded("Downstream training", [loss_curves("Downstream training", models, model_names)]),
+                    *_folded("Recordings", [recordings_table(recordings, frames)]),
+                    *_folded("Where the time went", [cost_table(records)]),
+                ],
+            ),
+            Chapter(
+                "For reference",
+                [
+                    Folded("What exactly was run", [*record_tables(records), versions_table(records)]),
+                    paper_section(),
+                ],
+            ),
         ],
     )
     (out.folder / PAGE).write_text(page, encoding="utf-8")
-    kept = [table for table in (*results, *by_class, *floors, *copied, *refused) if isinstance(table, Table)]
+    kept = [
+        table for table in (*results, *about_frames, *by_class, *floors, *copied, *refused) if isinstance(table, Table)
+    ]
     (out.folder / LATEX).write_text(render_latex(kept, title=title, lead=notice), encoding="utf-8")
-    (out.folder / MARKDOWN).write_text(render_markdown(kept, title=title, lead=notice, verdict=words), encoding="utf-8")
+    (out.folder / MARKDOWN).write_text(
+        render_markdown(kept, title=title, lead=notice, verdict=str(words)), encoding="utf-8"
+    )
     write_provenance(out.folder / PROVENANCE, records)
     parquet = {"scores": traced, "samples": samples, "realism": realism.table, "recordings": recordings.table}
     for name, table in parquet.items():
@@ -163,26 +206,16 @@ def _first_metric(rows: list[Row]) -> str:
     return next((row["metric"] for row in trained_rows(rows)), "")
 
 
-def _results(rows: list[Row], training_sets: Sequence[str], names: list[str], paired: PairedScores) -> list[Table]:
-    """The tables of scores, headline first."""
-    headline, *others = score_tables(rows, training_sets, paired)
-    origins, _ = group_tables(rows, training_sets)
-    return [headline, *origins, *baseline_tables(names, _first_metric(rows), paired), *others]
-
-
-def _figures(
-    rows: list[Row], learnt_with: dict[str, dict[str, Any]], conditions: Manifest, synthetic: Manifest
-) -> list[Figure]:
+def _charts(rows: list[Row], learnt_with: dict[str, dict[str, Any]]) -> list[Curves]:
     metric = _first_metric(rows)
     points = scaling_points(rows, metric)
     return [
         *base_model_figures(rows, learnt_with, metric),
-        *pictures.motion(conditions, synthetic),
         *([scaling_figure(points, metric)] if len({point.ratio for point in points}) >= FEWEST_AMOUNTS else []),
     ]
 
 
-def _verdict(rows: list[Row], training_sets: Sequence[str], names: list[str], paired: PairedScores) -> str:
+def _verdict(rows: list[Row], training_sets: Sequence[str], names: list[str], paired: PairedScores) -> Verdict:
     metric = _first_metric(rows)
     own, *others = names
     beside = {other: paired.difference(with_recorded(other), with_recorded(own), metric) for other in others}
@@ -217,9 +250,10 @@ def _score_name(manifest: Manifest) -> str:
     return f"{first['subject']}, seed {first['seed']}" + (", distance" if first["task"] == "distance" else "")
 
 
-def _kind(conditions: Manifest) -> str:
-    """Name of the condition plug-in that made them."""
-    return read_run_record(conditions.ref.path).arguments["condition"]["plugin"].rpartition("/")[2]
+def _condition(conditions: Manifest) -> tuple[str, dict[str, Any]]:
+    """Name and options of the condition plug-in that made them."""
+    made_by = read_run_record(conditions.ref.path).arguments["condition"]
+    return made_by["plugin"].rpartition("/")[2], made_by["options"]
 
 
 def _samples(scores: list[Manifest], data: list[Manifest]) -> Iterator[tuple[list[Row], pa.Table, str]]:
@@ -254,50 +288,3 @@ def _content_digest(data: Manifest, names: Sequence[str]) -> str:
 
 def _folded(title: str, sections: Sequence[Section]) -> list[Folded]:
     return [Folded(title, sections)] if sections else []
-
-
-def _curves(title: str, manifests: list[Manifest], names: Sequence[str]) -> Curves:
-    series: dict[str, tuple[list[float], list[float]]] = {}
-    for manifest, name in zip(manifests, names, strict=True):
-        for curve in dict.fromkeys(manifest.column("curve")):
-            rows = [row for row in manifest.table.to_pylist() if row["curve"] == curve]
-            label = f"{name}, {'shuffled conditions' if curve == 'shuffled' else curve}"
-            series[label] = ([row["step"] for row in rows], [row["loss"] for row in rows])
-    shuffled = any(label.endswith("shuffled conditions") for label in series)
-    caption = (
-        "Validation on frames that are not learnt from, with their own conditions and with those of others: where the "
-        "two lines part, the generator heeds its conditions."
-    )
-    return Curves(title, series, x_label="optimiser step", y_label="loss", caption=caption if shuffled else "")
-
-
-def _training_of_generators(checkpoints: list[Manifest], names: Sequence[str]) -> list[Section]:
-    return [
-        _curves(f"Training of the generator: {name}", [checkpoint], [name])
-        for name, checkpoint in zip(names, checkpoints, strict=True)
-    ]
-
-
-def _recordings_table(recordings: Manifest, frames: Manifest) -> Table:
-    """Recordings added up by split and class, with their events."""
-    table = recordings.table.to_pylist()
-    frames_of: dict[str, int] = {}
-    for name in frames.column("recording_id"):
-        frames_of[name] = frames_of.get(name, 0) + 1
-    body: list[list[Cell]] = []
-    for key in dict.fromkeys((row["splits"], row["class_name"]) for row in table):
-        members = [row for row in table if (row["splits"], row["class_name"]) == key]
-        body.append(
-            [
-                *key,
-                len(members),
-                len({row["subject"] for row in members}),
-                sum(row["num_events"] for row in members),
-                sum(row["num_positive"] for row in members),
-                sum(row["num_negative"] for row in members),
-                round(sum(row["duration_us"] for row in members) / 1e6, 4),
-                sum(frames_of.get(row["recording_id"], 0) for row in members),
-            ]
-        )
-    columns = ["split", "class", "recordings", "subjects", "events", "ON", "OFF", "seconds", "frames"]
-    return Table("Recordings", columns, body, caption="Splits are fixed at ingest. `condition`: labels without events.")

@@ -19,7 +19,7 @@ from tasks.stage import Output, stage
 TABLE = f"{tables.SPEED_VS_ERROR.name}.parquet"
 
 
-@stage(version=3, schema=tables.REPORT)
+@stage(version=4, schema=tables.REPORT)
 def speed_report(
     out: Output,
     extractor: Manifest,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ctlev_core.report.page.html import Folded, Links, Text, render_report
+from ctlev_core.report.page.html import Chapter, Folded, Links, Text, render_report
 from ctlev_core.report.page.report_files import LATEX, MARKDOWN, PAGE, published_files
 from ctlev_core.report.page.tables import render_latex, render_markdown
 from ctlev_core.report.sections.score_tables import PairedScores
@@ -20,8 +20,9 @@ from ctlev_core.report.studies.study import (
     distances_table,
     speed_sections,
     speed_table,
+    study_chapters,
     study_overview,
-    study_sections,
+    study_plain,
     study_tables,
     study_verdict,
     study_words,
@@ -33,7 +34,7 @@ from data_contracts.study import SPEED_VS_ERROR
 from tasks.stage import Output, stage
 
 
-@stage(version=7, schema=tables.REPORT)
+@stage(version=8, schema=tables.REPORT)
 def study_report(
     out: Output,
     reports: list[Manifest],
@@ -80,20 +81,30 @@ def study_report(
     if groups:
         shown[-1] = [distances_table([*(group.parts[0] for group in groups), *alone])]
     links = [(part.heading, f"{title}/{part.name}/{PAGE}") for part in parts]
-    links += [(f"Speed against error (`{speed.experiment}`)", f"{title}/{SPEED_VS_ERROR}/{PAGE}") for speed in measured]
+    links += [
+        (f"Speed against error ({speed.experiment.replace('_', ' ')})", f"{title}/{SPEED_VS_ERROR}/{PAGE}")
+        for speed in measured
+    ]
     page = render_report(
         title=title,
         lead=notice,
         verdict="\n\n".join(filter(None, (pooled_verdict(groups), verdict or words))),
         overview=scores[0] if scores else overview,
+        plain=study_plain(parts),
         steps=parts[0].summary.steps,
+        colours=parts[0].summary.colours,
         sections=[
-            *pooled_sections(groups, scores),
+            Chapter("By the number of recordings", pooled_sections(groups, scores)),
             *([overview] if groups and overview.rows else []),
-            *study_sections(alone, shown),
-            *(section for speed in measured for section in speed_sections(parts, speed)),
-            *([Folded("The same in words", [Text("", words)])] if verdict else []),
-            Links("Everything else, experiment by experiment", links),
+            *study_chapters(alone, shown),
+            *(Chapter("Speed against error", speed_sections(parts, speed)) for speed in measured),
+            Chapter(
+                "More",
+                [
+                    *([Folded("The same in words", [Text("", words)])] if verdict else []),
+                    Links("Everything else, experiment by experiment", links),
+                ],
+            ),
         ],
     )
     (out.folder / PAGE).write_text(page, encoding="utf-8")

@@ -1,24 +1,11 @@
-"""Pictures of the report: grids of images as PNG, curves as SVG."""
+"""Pictures of the report: grids of images as PNG, animations as WebP."""
 
 from __future__ import annotations
 
-import io
 import math
-import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-
-SERIES_COLOURS = ("#3b7dd8", "#e07b39", "#3a9d6e", "#c2528b", "#8a6fd1", "#b8922f", "#4fa3b5", "#808080")
-"""Distinct from one another for most colour-blind readers, and legible on white and on near-black."""
-LINE_STYLES = ("solid", "dashed", "dotted")
-"""Taken in turn once all colours are used up."""
-
-_INK = "#010203"
-"""Stands for the text colour of the page, which an SVG inside a page can inherit."""
-_MARKED_POINTS = 24
-"""Series with fewer points than this show each of them."""
 
 
 def image_grid_png(rows: Sequence[Sequence[np.ndarray]], min_cell_px: int = 128, gap_px: int = 4) -> bytes:
@@ -104,95 +91,3 @@ def _paste_enlarged(image: np.ndarray, cell: np.ndarray) -> None:
     columns = np.arange(width) * image.shape[1] // width
     top, left = (cell.shape[0] - height) // 2, (cell.shape[1] - width) // 2
     cell[top : top + height, left : left + width] = image[rows[:, None], columns]
-
-
-def series_style(index: int) -> tuple[str, str]:
-    """Colour and line style of the series with this number."""
-    turn, colour = divmod(index, len(SERIES_COLOURS))
-    return SERIES_COLOURS[colour], LINE_STYLES[turn % len(LINE_STYLES)]
-
-
-def curves_svg(
-    series: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-    x_label: str,
-    y_label: str,
-    *,
-    log_x: bool = False,
-    log_y: bool = False,
-    spans: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
-) -> str:
-    """Line chart as an `<svg>` element whose text and axes take the colour of the page around it.
-
-    Args:
-        series: name -> (x, y); points that are not finite, or not positive on a logarithmic axis, are left out. Names
-            are not drawn: the page shows them in a legend, in the order and style of `series_style`.
-        x_label: below the chart, unit included.
-        y_label: left of it.
-        log_x: logarithmic x axis.
-        log_y: logarithmic y axis.
-        spans: name -> (low, high) at each x of that series, drawn as a bar; none where an end is not finite.
-    Returns:
-        The element, without references to anything outside. Equal arguments give equal text.
-    Raises:
-        ValueError: x and y of a series differ in length.
-    """
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    inked = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    settings: dict[Any, Any] = {
-        **dict.fromkeys(inked, _INK),
-        "svg.fonttype": "none",
-        "svg.hashsalt": "ctlev",
-        "font.size": 9,
-        "text.parse_math": False,
-    }
-    with rc_context(settings):
-        figure = Figure(figsize=(6.4, 3.2), layout="constrained")
-        axes = figure.add_subplot()
-        for index, (name, (x, y)) in enumerate(series.items()):
-            x, y = _drawable(name, x, y, log_x, log_y)
-            colour, style = series_style(index)
-            marker = "o" if len(x) < _MARKED_POINTS else None
-            axes.plot(x, y, color=colour, linestyle=style, linewidth=1.4, marker=marker, markersize=3)
-            if spans and name in spans:
-                places, low, high = (np.asarray(v, np.float64) for v in (series[name][0], *spans[name]))
-                known = np.isfinite(places + low + high)
-                axes.vlines(places[known], low[known], high[known], color=colour, linewidth=1.1, alpha=0.6)
-        axes.set(
-            xlabel=x_label, ylabel=y_label, xscale="log" if log_x else "linear", yscale="log" if log_y else "linear"
-        )
-        for axis, logarithmic in ((axes.xaxis, log_x), (axes.yaxis, log_y)):
-            if logarithmic:
-                # Plain numbers at 1, 2 and 5 of each decade: matplotlib's own labels are formulas, and few.
-                axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-                axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-                axis.set_minor_formatter(NullFormatter())
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.18, linewidth=0.6, color=_INK)
-        file = io.StringIO()
-        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
-    svg = file.getvalue()
-    svg = svg[svg.index("<svg") :].strip().replace(_INK, "currentColor")
-    # Descriptions and a style sheet of matplotlib's: the first are noise, the second would apply to the whole page.
-    svg = re.sub(r"<(metadata|style)\b.*?</\1>", "", svg, flags=re.DOTALL)
-    # Several charts share a page, where these ids, which nothing refers to, would be doubles.
-    svg = re.sub(r'<g id="[^"]*">', "<g>", svg)
-    return re.sub(r'<svg [^>]*?(viewBox="[^"]*")[^>]*>', r'<svg \1 role="img">', svg, count=1, flags=re.DOTALL)
-
-
-def _drawable(
-    name: str, x: Sequence[float], y: Sequence[float], log_x: bool, log_y: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    x_values, y_values = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    if x_values.shape != y_values.shape or x_values.ndim != 1:
-        raise ValueError(
-            f"series {name!r}: x and y must have the same length, got {x_values.shape} and {y_values.shape}"
-        )
-    keep = np.isfinite(x_values) & np.isfinite(y_values)
-    if log_x:
-        keep &= x_values > 0
-    if log_y:
-        keep &= y_values > 0
-    return x_values[keep], y_values[keep]

@@ -1,22 +1,29 @@
 """A report as one HTML file that needs nothing else: no network, no fonts, no scripts from elsewhere.
 
-The caller gives sections in the order they are read; every text of theirs is escaped, and `backticks` become code.
+The caller gives sections in the order they are read; every text of theirs is escaped, and `backticks` become code. How
+the page looks is in `templates`.
 """
 
 from __future__ import annotations
 
 import base64
-import html
+import functools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
 
-from ctlev_core.report.page import figures
-from ctlev_core.report.page.style import SCRIPT, STYLE
-from ctlev_core.report.page.tables import Table, format_table, split_number
+from ctlev_core.report.page import charts, figures
+from ctlev_core.report.page.report_files import FACTS
+from ctlev_core.report.page.tables import Table, shown_cells
+
+Colours = Sequence[tuple[str, str]]
+"""(CSS colour or gradient, meaning) of each entry of a legend."""
 
 
 @dataclass(frozen=True)
@@ -36,12 +43,14 @@ class ImageGrid:
         rows: (label, images [H, W] or [H, W, 3] uint8) of each row.
         column_labels: one a column, or none.
         caption: what the reader sees.
+        colours: legend.
     """
 
     title: str
     rows: Sequence[tuple[str, Sequence[np.ndarray]]]
     column_labels: Sequence[str] = ()
     caption: str = ""
+    colours: Colours = ()
 
 
 @dataclass(frozen=True)
@@ -94,7 +103,39 @@ class Links:
     pages: Sequence[tuple[str, str]]
 
 
-Section = Text | Table | ImageGrid | Curves | Animation | Links
+@dataclass(frozen=True)
+class Box:
+    """A box of a diagram: place of its upper left corner, heading, a line below it, and where it leads."""
+
+    x: float
+    y: float
+    heading: str
+    line: str
+    href: str
+
+
+@dataclass(frozen=True)
+class Diagram:
+    """Boxes with arrows between them.
+
+    Attributes:
+        title: heading of the section.
+        boxes: what is drawn.
+        arrows: as paths of SVG.
+        size: (width, height) of the drawing.
+        box_size: of a box.
+        caption: what the reader sees.
+    """
+
+    title: str
+    boxes: Sequence[Box]
+    arrows: Sequence[str]
+    size: tuple[float, float]
+    box_size: tuple[float, float]
+    caption: str = ""
+
+
+Section = Text | Table | ImageGrid | Curves | Animation | Links | Diagram
 
 
 @dataclass(frozen=True)
@@ -110,6 +151,14 @@ class Folded:
     title: str
     sections: Sequence[Section]
     caption: str = ""
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """Sections that belong together, under one heading of the table of contents; none without sections."""
+
+    title: str
+    sections: Sequence[Section | Folded]
 
 
 @dataclass(frozen=True)
@@ -129,15 +178,48 @@ class Step:
     follows: bool = False
 
 
+@dataclass(frozen=True)
+class Answer:
+    """Whether it helped, as a word and an interval on a line.
+
+    Attributes:
+        word: `Helped`, `Did harm`, `Undecided` ...
+        tone: `good`, `bad` or `open`.
+        text: the difference with its interval, and unit, as the score counts.
+        value: the same with better being positive.
+        low: lower end of the interval, likewise; NaN = unknown.
+        high: upper end.
+    """
+
+    word: str
+    tone: str
+    text: str
+    value: float
+    low: float
+    high: float
+
+    def line(self) -> dict[str, float] | None:
+        """Places from 0 (worse) to 100 (better) of zero, value and ends; None where the interval is not known."""
+        known = np.array([self.low, self.value, self.high])
+        reach = float(np.abs(known).max()) * 1.15
+        if not np.isfinite(reach) or not reach:
+            return None
+        low, value, high = (round(50 + 50 * number / reach, 1) for number in known.tolist())
+        return {"low": low, "value": value, "high": high}
+
+
 def render_report(
     *,
     title: str,
     lead: str,
     verdict: str,
-    sections: Sequence[Section | Folded],
+    sections: Sequence[Section | Folded | Chapter],
     overview: Table | None = None,
     footer: str = "",
     steps: Sequence[Step] = (),
+    answer: Answer | None = None,
+    plain: Sequence[tuple[str, str]] = (),
+    colours: Colours = (),
 ) -> str:
     """The page as text, to be written as UTF-8.
 
@@ -149,183 +231,68 @@ def render_report(
         overview: the numbers behind the verdict, right below it.
         footer: where the numbers come from.
         steps: what was done, in pictures; below the verdict.
+        answer: the verdict as a word and a drawn interval.
+        plain: what was done and what it means, (heading, paragraph) each, for a reader who knows nothing of events.
+        colours: legend of the pictures of `steps`.
     Returns:
         One HTML document. Equal arguments give equal text.
     Raises:
         ValueError: rows of a table do not fit its columns, images are not images, or series differ in length.
     """
-    entries = "".join(
-        f'<li><a href="#section-{number}">{_inline(section.title)}</a></li>'
-        for number, section in enumerate(sections, 1)
-    )
-    contents = f'<nav aria-label="Contents"><ol>{entries}</ol></nav>' if len(sections) > 2 else ""
-    body = "\n".join(_numbered(section, number) for number, section in enumerate(sections, 1))
-    numbers = "" if overview is None else f"{_table(overview)}\n"
-    foot = f"<footer>{_paragraphs(footer)}</footer>" if footer else ""
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'">
-<title>{html.escape(title)}</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<main>
-<header>
-<h1>{_inline(title)}</h1>
-<div class="lead">{_paragraphs(lead)}</div>
-<div class="verdict">{_paragraphs(verdict)}</div>
-{numbers}{_strip(steps)}{contents}
-</header>
-{body}
-{foot}
-</main>
-<script>{SCRIPT}</script>
-</body>
-</html>
-"""
-
-
-def _numbered(section: Section | Folded, number: int) -> str:
-    if not isinstance(section, Folded):
-        return f'<section id="section-{number}"><h2>{_inline(section.title)}</h2>\n{_section(section)}</section>'
-    parts = "\n".join(
-        (f"<h3>{_inline(part.title)}</h3>\n" if len(section.sections) > 1 else "") + _section(part)
-        for part in section.sections
-    )
-    return (
-        f'<section id="section-{number}"><details><summary><h2>{_inline(section.title)}</h2></summary>\n'
-        f"{_caption(section.caption)}{parts}</details></section>"
-    )
-
-
-def _strip(steps: Sequence[Step]) -> str:
-    """Pictures with a heading and a sentence below each."""
-    parts = []
-    for step in steps:
-        if isinstance(step.picture, str):
-            picture = f'<p class="words">{_inline(step.picture)}</p>'
+    chapters: list[Chapter] = []
+    for section in sections:
+        if isinstance(section, Chapter):
+            chapters += [section] if section.sections else []
+        elif chapters and not chapters[-1].title:
+            chapters[-1] = Chapter("", [*chapters[-1].sections, section])
         else:
-            png = base64.b64encode(figures.image_grid_png([[step.picture]], min_cell_px=192)).decode("ascii")
-            picture = f'<img alt="{html.escape(step.heading)}" src="data:image/png;base64,{png}">'
-        follows = ' class="follows"' if step.follows else ""
-        parts.append(
-            f'<li{follows}><figure><div class="picture">{picture}</div>'
-            f"<figcaption><b>{_inline(step.heading)}</b> {_inline(step.sentence)}"
-            "</figcaption></figure></li>"
-        )
-    return f'<ol class="steps">{"".join(parts)}</ol>\n' if parts else ""
+            chapters.append(Chapter("", [section]))
+    given = {
+        "title": title, "lead": lead, "verdict": verdict, "overview": overview, "footer": footer, "steps": steps,
+        "answer": answer, "plain": plain, "colours": colours, "chapters": chapters, "facts": Markup(FACTS),
+    }  # fmt: skip
+    return _templates().get_template("page.html.j2").render(given)
 
 
-def _section(section: Section) -> str:
-    if isinstance(section, Text):
-        return _paragraphs(section.text)
-    if isinstance(section, Table):
-        return _table(section)
-    if isinstance(section, ImageGrid):
-        return _image_grid(section)
-    if isinstance(section, Animation):
-        return _animation(section)
-    if isinstance(section, Links):
-        pages = (f'<li><a href="{html.escape(quote(place))}">{_inline(text)}</a></li>' for text, place in section.pages)
-        return f"<ul>{''.join(pages)}</ul>"
-    return _curves(section)
+@functools.cache
+def _templates() -> Environment:
+    loader = FileSystemLoader(Path(__file__).parent / "templates")
+    found = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )  # fmt: skip
+    filters = (_inline, _paragraphs, _grid_png, _webp, _code_of, shown_cells, charts.draw, charts.series_class, quote)
+    found.filters |= {one.__name__.lstrip("_"): one for one in filters}
+    found.tests["picture"] = lambda value: isinstance(value, np.ndarray)
+    return found
 
 
-def _inline(text: str) -> str:
+def _inline(text: str) -> Markup:
     """Escaped text in which `this` is code."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(str(text)))))
 
 
-def _paragraphs(text: str) -> str:
-    parts = [part.strip() for part in re.split(r"\n\s*\n", text) if part.strip()]
-    return "\n".join(f"<p>{_inline(part)}</p>" for part in parts)
+def _paragraphs(text: str) -> list[str]:
+    return [part.strip() for part in re.split(r"\n\s*\n", text) if part.strip()]
 
 
-def _caption(text: str) -> str:
-    return f'<p class="caption">{_inline(text)}</p>\n' if text else ""
+def _code_of(text: str) -> str:
+    """What a name that was put into words is called in tables and options; empty for other texts."""
+    return getattr(text, "code", "")
 
 
-def _table(table: Table) -> str:
-    shown = format_table(table)
-    if not shown.rows:
-        return _caption(table.caption) + '<p class="empty">No rows.</p>'
-    head = "".join(
-        f'<th scope="col"{_class("number" if is_number else "")}><button type="button">{_inline(name)}</button></th>'
-        for name, is_number in zip(table.columns, shown.numeric, strict=True)
-    )
-    body = "\n".join(
-        "<tr>" + "".join(_cell(text, shown.numeric[x], (y, x) in table.bold) for x, text in enumerate(row)) + "</tr>"
-        for y, row in enumerate(shown.rows)
-    )
-    notes = "".join(f"<li>{_inline(note)}</li>" for note in table.footnotes)
-    footnotes = f'<ul class="footnotes">{notes}</ul>' if notes else ""
-    return (
-        f"{_caption(table.caption)}"
-        f'<div class="scroll" tabindex="0"><table>\n<thead><tr>{head}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>"
-        f"{footnotes}"
-    )
+def _grid_png(grid: ImageGrid | np.ndarray, min_cell_px: int = 128) -> str:
+    """The pictures of a grid, or a single one, as a data address."""
+    if isinstance(grid, np.ndarray):
+        rows: list[Sequence[np.ndarray]] = [[grid]]
+    else:
+        rows, columns = [images for _, images in grid.rows], max(len(images) for _, images in grid.rows)
+        if grid.column_labels and len(grid.column_labels) != columns:
+            raise ValueError(f"grid {grid.title!r}: {len(grid.column_labels)} column labels for {columns} columns")
+    png = figures.image_grid_png(rows, min_cell_px=min_cell_px)
+    return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
-def _class(names: str) -> str:
-    return f' class="{names}"' if names else ""
-
-
-def _cell(text: str, numeric: bool, bold: bool) -> str:
-    names = " ".join(name for name, on in (("number", numeric), ("bold", bold)) if on)
-    found = split_number(text) if numeric else None
-    if found is None:
-        return f"<td{_class(names)}>{_inline(text)}</td>"
-    number, unit, uncertainty = found
-    sort_key = number.replace(",", "").replace("−", "-")
-    shown = html.escape(number + unit)
-    if uncertainty:
-        shown += f'<span class="uncertainty">{html.escape(uncertainty)}</span>'
-    return f'<td{_class(names)} data-sort="{sort_key}">{shown}</td>'
-
-
-def _image_grid(grid: ImageGrid) -> str:
-    columns = max((len(images) for _, images in grid.rows), default=0)
-    if columns == 0:
-        return _caption(grid.caption) + '<p class="empty">No images.</p>'
-    if grid.column_labels and len(grid.column_labels) != columns:
-        raise ValueError(f"grid {grid.title!r}: {len(grid.column_labels)} column labels for {columns} columns")
-    png = base64.b64encode(figures.image_grid_png([images for _, images in grid.rows])).decode("ascii")
-    labels = "".join(f"<span>{_inline(label)}</span>" for label, _ in grid.rows)
-    heads = "".join(f"<span>{_inline(label)}</span>" for label in grid.column_labels)
-    description = html.escape(grid.title + ": " + "; ".join(label for label, _ in grid.rows))
-    return (
-        f"{_caption(grid.caption)}"
-        f'<div class="scroll" tabindex="0"><div class="grid" style="--columns:{columns};--rows:{len(grid.rows)}">'
-        f'<div class="heads">{heads}</div><div class="labels">{labels}</div>'
-        f'<img alt="{description}" src="data:image/png;base64,{png}"></div></div>'
-    )
-
-
-def _animation(animation: Animation) -> str:
-    if not animation.clips:
-        return _caption(animation.caption) + '<p class="empty">No pictures.</p>'
-    parts = []
-    for label, frames in animation.clips:
-        webp = base64.b64encode(figures.animation_webp(frames, animation.rate_hz)).decode("ascii")
-        source = f'<img alt="{html.escape(label)}" src="data:image/webp;base64,{webp}">'
-        parts.append(f"<figure>{source}<figcaption>{_inline(label)}</figcaption></figure>")
-    return f'{_caption(animation.caption)}<div class="clips">{"".join(parts)}</div>'
-
-
-def _curves(curves: Curves) -> str:
-    if not any(len(x) for x, _ in curves.series.values()):
-        return _caption(curves.caption) + '<p class="empty">No points.</p>'
-    svg = figures.curves_svg(
-        curves.series, curves.x_label, curves.y_label, log_x=curves.log_x, log_y=curves.log_y, spans=curves.spans
-    )
-    legend = "".join(
-        f'<li><i style="border-top:2px {style} {colour}"></i>{_inline(name)}</li>'
-        for name, (colour, style) in ((name, figures.series_style(index)) for index, name in enumerate(curves.series))
-    )
-    return f'{_caption(curves.caption)}<div class="scroll" tabindex="0">{svg}</div><ul class="legend">{legend}</ul>'
+def _webp(frames: np.ndarray, rate_hz: float) -> str:
+    webp = figures.animation_webp(frames, rate_hz)
+    return f"data:image/webp;base64,{base64.b64encode(webp).decode('ascii')}"

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import html
+import json
 import re
 import shutil
 from pathlib import Path
 
+from ctlev_core.duration_text import duration_text
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef
+from data_contracts.run_record import RUN_FILE, RunRecord, read_run_record
 
 PAGE, LATEX, MARKDOWN, PROVENANCE = "report.html", "tables.tex", "tables.md", "provenance.json"
+FACTS = "<!-- date, version and machine: filled in when the page is published -->"
+"""Its place in a page: what is stored has none of them, so that equal results are equal pages."""
 _ANSWER = re.compile(r"\b(helped?|did harm|made it (better|worse)|is undecided|changed nothing|too few)\b")
 _SENTENCE_END = re.compile(r"(?<=[.?])\s+(?=[A-Z])")
-_HEADING = re.compile(r"[^.:`]*\(`[^`]+`\): ")
+_HEADING = re.compile(r"[^.:]*\([^()]+\): ")
 """Of the paragraph of an experiment in a study."""
 
 
@@ -28,8 +34,8 @@ def publish_report(ref: ManifestRef, home: Path, name: str) -> str:
         (folder / name / place.relative_to(ref.path)).mkdir(exist_ok=True)
         for path in published_files(place):
             if path != ref.path / PAGE:
-                _replace(path, folder / name / path.relative_to(ref.path))
-    _replace(ref.path / PAGE, folder / f"{name}.html")
+                publish_file(path, folder / name / path.relative_to(ref.path), facts=page_facts(ref.path, place))
+    publish_file(ref.path / PAGE, folder / f"{name}.html", facts=page_facts(ref.path, ref.path, *parts))
     return f"report: {folder / f'{name}.html'}\ntables: {folder / name}"
 
 
@@ -65,8 +71,8 @@ def publish_page(ref: ManifestRef, table: str, home: Path, name: str) -> Path:
     """
     folder = home / "reports"
     folder.mkdir(parents=True, exist_ok=True)
-    _replace(ref.path / table, folder / f"{name}.parquet")
-    _replace(ref.path / PAGE, folder / f"{name}.html")
+    publish_file(ref.path / table, folder / f"{name}.parquet")
+    publish_file(ref.path / PAGE, folder / f"{name}.html", facts=page_facts(ref.path))
     return folder / f"{name}.html"
 
 
@@ -77,8 +83,39 @@ def published_files(folder: Path) -> list[Path]:
     return sorted([*(folder / name for name in wanted if (folder / name).exists()), *tables_of])
 
 
-def _replace(source: Path, target: Path) -> None:
-    """Copy a file so that whoever reads the target sees the old one or the new one."""
+def page_facts(artefact: Path, *places: Path) -> str:
+    """When, by which version and where a page was made, and how long all that it tells of took; as HTML.
+
+    Args:
+        artefact: folder of the page's artefact; without a provenance record there, nothing is said.
+        places: folders whose `provenance.json` lists what is behind the page.
+    """
+    if not (artefact / RUN_FILE).is_file():
+        return ""
+    record = read_run_record(artefact)
+    spent = {
+        stage["key"]: stage["wall_seconds"]
+        for place in places
+        if (place / PROVENANCE).is_file()
+        for stage in json.loads((place / PROVENANCE).read_text(encoding="utf-8"))["stages"]
+    }
+    told = _made_by(record) + ([f"its stages took {duration_text(sum(spent.values()))} in all"] if spent else [])
+    return html.escape(" · ".join(told))
+
+
+def _made_by(record: RunRecord) -> list[str]:
+    known = record.versions
+    told = [f"Made {record.started[:16].replace('T', ' ')} UTC"]
+    told += [f"{words} {known[name]}" for name, words in (("ctlev", "ctlev"), ("commit", "commit")) if name in known]
+    told += [known["platform"]] if "platform" in known else []
+    return [*told, *([f"{known['cores']} cores"] if "cores" in known else [])]
+
+
+def publish_file(source: Path, target: Path, facts: str = "") -> None:
+    """Copy a file so that whoever reads the target sees the old one or the new one; pages with their facts."""
     temporary = target.with_name(f".{target.name}")
-    shutil.copyfile(source, temporary)
+    if facts and source.suffix == ".html":
+        temporary.write_text(source.read_text(encoding="utf-8").replace(FACTS, facts, 1), encoding="utf-8")
+    else:
+        shutil.copyfile(source, temporary)
     temporary.replace(target)

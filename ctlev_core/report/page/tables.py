@@ -1,4 +1,4 @@
-"""Tables of the report as one structure, written as Markdown and as LaTeX; `report.html` writes them for browsers.
+"""Tables of the report as one structure, written as Markdown and as LaTeX; `templates` has them for browsers.
 
 Cells are texts or numbers. Columns of numbers are formatted alike and aligned to the right in every language, and an
 uncertainty behind a number (`6.31 ± 0.02`, `6.31 [6.12, 6.50]`) is set smaller where the language can.
@@ -39,6 +39,8 @@ class Table:
         caption: what the reader must know to read it.
         footnotes: one line each, below.
         bold: (row, column) of cells to emphasise.
+        folded: closed until the reader opens it.
+        anchor: what links in the page lead to it by; empty = none do.
     """
 
     title: str
@@ -47,6 +49,8 @@ class Table:
     caption: str = ""
     footnotes: Sequence[str] = ()
     bold: Collection[tuple[int, int]] = ()
+    folded: bool = False
+    anchor: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,40 @@ def format_table(table: Table) -> Formatted:
     return Formatted([list(row) for row in zip(*columns, strict=True)], numeric)
 
 
+@dataclass(frozen=True)
+class ShownCell:
+    """A cell as a page shows it: the text, or number, unit and uncertainty apart, and a key to sort numbers by."""
+
+    text: str
+    uncertainty: str = ""
+    sort_key: str = ""
+    numeric: bool = False
+    bold: bool = False
+
+
+def shown_cells(table: Table) -> tuple[list[bool], list[list[ShownCell]]]:
+    """Which columns hold numbers only, and all cells row by row.
+
+    Raises:
+        ValueError: as `format_table`.
+    """
+    shown = format_table(table)
+    rows = []
+    for y, row in enumerate(shown.rows):
+        cells = []
+        for x, text in enumerate(row):
+            numeric, bold = shown.numeric[x], (y, x) in table.bold
+            found = split_number(text) if numeric else None
+            if found is None:
+                cells.append(ShownCell(text, numeric=numeric, bold=bold))
+            else:
+                number, unit, uncertainty = found
+                sort_key = number.replace(",", "").replace("−", "-")
+                cells.append(ShownCell(number + unit, uncertainty, sort_key, numeric, bold))
+        rows.append(cells)
+    return shown.numeric, rows
+
+
 def split_number(text: str) -> tuple[str, str, str] | None:
     """Number, unit and uncertainty of a cell's text; None where it does not begin with a number."""
     match = _NUMBER.match(text)
@@ -96,12 +134,14 @@ def _is_fraction(cell: object) -> TypeGuard[float]:
 def _format(cell: Cell, decimals: int) -> str:
     if cell is None or (_is_fraction(cell) and math.isnan(cell)):
         return NO_VALUE
+    if isinstance(cell, str):
+        return cell or NO_VALUE  # as it is: a name keeps the code behind it
     if isinstance(cell, bool | np.bool_):
         return "yes" if cell else "no"
     if isinstance(cell, int | np.integer):
         return f"{int(cell):,}"
     if not _is_fraction(cell):
-        return str(cell) or NO_VALUE
+        return str(cell)
     if math.isinf(cell):
         return "∞" if cell > 0 else "−∞"
     if cell and not 1e-4 <= abs(cell) < 1e9:

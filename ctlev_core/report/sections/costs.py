@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ctlev_core.provenance.records import Record, options_of, versions_of
+from ctlev_core.provenance.records import Record, versions_of
+from ctlev_core.report.page.display_names import stage_name
 from ctlev_core.report.page.tables import Cell, Table
 
 
@@ -20,8 +21,8 @@ def cost_table(records: Sequence[Record]) -> Table:
         entry[4] = max(entry[4], record.process_peak_memory_mib)
     wall, cpu = (sum(entry[column] for entry in totals.values()) for column in (1, 2))
     body: list[list[Cell]] = [
-        [name, int(runs), _seconds(seconds), f"{seconds / wall:.0%}" if wall else "", _seconds(of_cpu), _seconds(most),
-         round(peak)]
+        [stage_name(name), int(runs), _seconds(seconds), f"{seconds / wall:.0%}" if wall else "", _seconds(of_cpu),
+         _seconds(most), round(peak)]
         for name, (runs, seconds, of_cpu, most, peak) in sorted(totals.items(), key=lambda item: -item[1][1])
     ]  # fmt: skip
     columns = ["stage", "runs", "seconds", "share", "CPU seconds", "longest run, s", "peak memory of its process, MiB"]
@@ -34,25 +35,6 @@ def cost_table(records: Sequence[Record]) -> Table:
 
 def _seconds(value: float) -> float:
     return round(value, 1)
-
-
-def options_table(records: Sequence[Record]) -> Table:
-    """Every stage with its options as they were, defaults included."""
-    body: list[list[Cell]] = [
-        [
-            record.role,
-            record.stage,
-            record.rows,
-            record.key[:12],
-            record.digest[:12],
-            ", ".join(f"{name.replace('.options.', '.')}={value}" for name, value in options_of(record).items()),
-        ]
-        for record in records
-        if record.stage not in ("score_model", "score_distance")  # one a score; in the provenance file
-    ]
-    columns = ["what", "stage", "rows", "key", "digest", "options"]
-    caption = "Everything behind this report but its scores, which `provenance.json` lists too."
-    return Table("Stages and options", columns, body, caption=caption)
 
 
 def versions_table(records: Sequence[Record]) -> Table:

@@ -1,8 +1,11 @@
-"""How training and test data of a report were kept apart, told from the recordings themselves."""
+"""The recordings of a report, and how training and test data were kept apart, told from the recordings themselves."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+
+from ctlev_core.report.page.tables import Cell, Table
+from data_contracts.manifest import Manifest
 
 
 def told_split(splits: Sequence[str]) -> str:
@@ -24,3 +27,28 @@ def told_split(splits: Sequence[str]) -> str:
             "windows of the same recordings are told apart, not how well unseen recordings would be."
         )
     return f"Of {len(tested)} tested recordings {shared} are split in time, and also learnt from."
+
+
+def recordings_table(recordings: Manifest, frames: Manifest) -> Table:
+    """Recordings added up by split and class, with their events."""
+    table = recordings.table.to_pylist()
+    frames_of: dict[str, int] = {}
+    for name in frames.column("recording_id"):
+        frames_of[name] = frames_of.get(name, 0) + 1
+    body: list[list[Cell]] = []
+    for key in dict.fromkeys((row["splits"], row["class_name"]) for row in table):
+        members = [row for row in table if (row["splits"], row["class_name"]) == key]
+        body.append(
+            [
+                *key,
+                len(members),
+                len({row["subject"] for row in members}),
+                sum(row["num_events"] for row in members),
+                sum(row["num_positive"] for row in members),
+                sum(row["num_negative"] for row in members),
+                round(sum(row["duration_us"] for row in members) / 1e6, 4),
+                sum(frames_of.get(row["recording_id"], 0) for row in members),
+            ]
+        )
+    columns = ["split", "class", "recordings", "subjects", "events", "ON", "OFF", "seconds", "frames"]
+    return Table("Recordings", columns, body, caption="Splits are fixed at ingest. `condition`: labels without events.")

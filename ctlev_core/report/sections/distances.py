@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ctlev_core.report.page.display_names import metric_name, set_name
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.feature_distances import DISTANCE_ESTIMATES
@@ -29,6 +30,8 @@ def floor_tables(scores: Sequence[Manifest]) -> list[Table]:
                 floor = score_text(row["floor"], row["floor_low"], row["floor_high"])
             halved = None if row["halved"] is None else score_text(row["halved"])
             counts = [row[name] for name in ("num_predicted", "num_target", "num_features")]
-            body.append([row["subject"], row["metric"], score_text(row["value"]), halved, floor, *counts])
+            body.append(
+                [set_name(row["subject"]), metric_name(row["metric"]), score_text(row["value"]), halved, floor, *counts]
+            )
     columns = ["frames", "score", "all", "halves", "halves of recorded frames", "number", "recorded frames", "features"]
     return [Table("How to read the distances", columns, body, caption=_CAPTION)] if body else []

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from ctlev_core.report.page.display_names import Name, metric_name, set_name
 from ctlev_core.report.page.html import ImageGrid, Section, Table
 from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
 from ctlev_core.statistics.bootstrap import score_text
 from data_contracts.manifest import Manifest
 
 _CAPTION = (
-    "close_share: share of generated frames nearer to a training frame than the closest 1 % of recorded frames are to "
-    "those of other recordings; about 0.01 without copying, in brackets 95 % over frames. duplicates: frames equal to "
-    "a training frame. nearest_distance_ratio: median distance to the nearest training frame, over that of recorded "
-    "frames."
+    "Close copies: share of generated frames nearer to a training frame than the closest 1 % of recorded frames are to "
+    "those of other recordings; about 0.01 without copying, in brackets 95 % over frames. Exact copies: frames equal "
+    "to a training frame. Ratio: median distance to the nearest training frame, over that of recorded frames."
 )
 
 
@@ -39,7 +39,9 @@ def memorisation_sections(frames: Manifest, generated: Sequence[Manifest], copie
         ]
         names = [f"{pair['distance'] / pair['threshold']:.2f}" if pair["threshold"] else "0" for pair in shown]
         caption = "The pairs that lie closest; above each its distance over that of the closest 1 % of recorded frames."
-        sections.append(ImageGrid(f"Closest pairs: {shown[0]['subject']}, {features}", images, names, caption))
+        sections.append(
+            ImageGrid(f"Closest pairs: {set_name(shown[0]['subject'])}, {features}", images, names, caption)
+        )
     return sections
 
 
@@ -50,9 +52,12 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
     body: list[list[str]] = []
     for subject in dict.fromkeys(row["subject"] for row in rows):
         found = [cells.get((subject, *column)) for column in columns]
-        body.append([subject, *("" if cell is None else _text(cell) for cell in found)])
+        body.append([set_name(subject), *("" if cell is None else _text(cell) for cell in found)])
     return Table(
-        "Does it copy?", ["frames", *(f"{metric}, {group}" for group, metric in columns)], body, caption=_CAPTION
+        "Does it copy?",
+        ["frames", *(Name(f"{metric_name(metric)}: {group}", metric) for group, metric in columns)],
+        body,
+        caption=_CAPTION,
     )
 
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ctlev_core.events.windows import spread
-from ctlev_core.report.page.html import Animation, ImageGrid, Step
+from ctlev_core.report.page.display_names import set_name
+from ctlev_core.report.page.html import Animation, Colours, ImageGrid, Step
 from data_contracts.manifest import Manifest
 
 GRID_COLUMNS = 10
@@ -22,6 +23,11 @@ _KINDS = {
     "body_motion": "a body that moves",
     "intensity_pair": "two ordinary pictures, one after the other",
 }
+
+
+def condition_in_words(kind: str) -> str:
+    """What a condition of this plug-in is."""
+    return _KINDS.get(kind, "words, as the generator reads them" if kind == "text" else f"a condition, `{kind}`")
 
 
 def steps(frames: Manifest, frame_conditions: Manifest, conditions: Manifest, made: Manifest, kind: str) -> list[Step]:
@@ -46,9 +52,12 @@ def steps(frames: Manifest, frame_conditions: Manifest, conditions: Manifest, ma
     real, fake = np.asarray(frames.array("frames")[learnt[first]]), np.asarray(made.array("frames")[second])
     t_start_us, t_end_us = (frames.column(name)[learnt[first]] for name in ("t_start_us", "t_end_us"))
     colours = colours_in_words(real)
-    label = _KINDS.get(kind, "words, as the generator reads them" if kind == "text" else f"a condition, `{kind}`")
     return [
-        Step("1. A label", _condition(frame_conditions, first), f"What is known of a recorded moment, {label}."),
+        Step(
+            "1. A label",
+            _condition(frame_conditions, first),
+            f"What is known of a recorded moment, {condition_in_words(kind)}.",
+        ),
         Step(
             "2. A recorded event image",
             real,
@@ -92,7 +101,9 @@ def _of_median_activity(manifest: Manifest, rows: np.ndarray) -> int:
     return int(candidates[np.argsort(active, kind="stable")[(len(active) - 1) // 2]])
 
 
-def sample_grids(conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest]) -> list[ImageGrid]:
+def sample_grids(
+    conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest], colours: Colours = ()
+) -> list[ImageGrid]:
     """The grid of `sample_grid`, and one of frames alone for each generator that was asked for other labels."""
     first = next(iter(generated.values())).column("source_id")
     same, others = {}, []
@@ -102,14 +113,16 @@ def sample_grids(conditions: Manifest, generated: Mapping[str, Manifest], real: 
             continue
         names = frames.column("class_name")
         chosen = evenly_by_class(names, GRID_COLUMNS)
-        row = (name, [np.asarray(frames.array("frames")[index]) for index in chosen])
+        row = (set_name(name), [np.asarray(frames.array("frames")[index]) for index in chosen])
         caption = "It was asked for other labels than the others. One column a sample, none chosen by eye."
         labels = [names[index] for index in chosen]
-        others.append(ImageGrid(f"Sampled: {name}", [row], column_labels=labels, caption=caption))
-    return [sample_grid(conditions, same, real), *others]
+        others.append(ImageGrid(f"Sampled: {set_name(name)}", [row], column_labels=labels, caption=caption))
+    return [sample_grid(conditions, same, real, colours), *others]
 
 
-def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest]) -> ImageGrid:
+def sample_grid(
+    conditions: Manifest, generated: Mapping[str, Manifest], real: list[Manifest], colours: Colours = ()
+) -> ImageGrid:
     """Condition, recorded frame of the same moment or at least class where there is one, and the frame of each
     generator.
 
@@ -117,6 +130,7 @@ def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: l
         conditions: what was asked for.
         generated: frames by generator; all were asked for the same.
         real: sets of recorded frames to look for the same moments in.
+        colours: legend.
     """
     synthetic = next(iter(generated.values()))
     matches = _same_moments(synthetic.column("source_id"), real)
@@ -138,8 +152,9 @@ def sample_grid(conditions: Manifest, generated: Mapping[str, Manifest], real: l
     elif "images.npy" not in conditions.files:
         rows += _same_classes([names[row] for row in chosen], real)
     for name, frames in generated.items():
-        rows.append((name, [np.asarray(frames.array("frames")[row]) for row in chosen if row < len(frames)]))
-    return ImageGrid("Asked for, and sampled", rows, column_labels=[names[row] for row in chosen], caption=caption)
+        rows.append((set_name(name), [np.asarray(frames.array("frames")[row]) for row in chosen if row < len(frames)]))
+    labels = [names[row] for row in chosen]
+    return ImageGrid("Asked for, and sampled", rows, column_labels=labels, caption=caption, colours=colours)
 
 
 def evenly_by_class(class_names: Sequence[str], count: int) -> np.ndarray:

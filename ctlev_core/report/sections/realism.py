@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.realism.summary import AXES
+from ctlev_core.report.page.display_names import metric_name, set_name
 from ctlev_core.report.page.html import Curves, Section, Table
 from ctlev_core.report.sections.two_sample import two_sample_tables
 
@@ -24,8 +25,8 @@ _TITLES = {
         "How real do the synthetic frames look?",
         "Event images have no time stamps: what compares them is where and how bright their pixels are. Active: value "
         "of 25 of 255 and more. Speckle: active pixels in groups of one or two; isolated: without an active one "
-        "around; hot: 128 and more, and four times those around. Contrast: standard deviation over full scale. c2st: "
-        "how well a network tells the two sets apart, 0.5 = not at all.",
+        "around; hot: 128 and more, and four times those around. Contrast: standard deviation over full scale. "
+        "Told apart: how well a network tells the two sets apart, 0.5 = not at all.",
     ),
     "events": (
         "How alike are the recordings?",
@@ -63,7 +64,7 @@ def realism_sections(
     for group, (title, caption) in ({"frames": _TITLES["frames"]} | baselines | _TITLES).items():
         of_group = [row for row in rows if row["group"] == group]
         if of_group:
-            titled = title.format(group.removeprefix(prefix))
+            titled = title.format(set_name(group.removeprefix(prefix)))
             sections.append(_table(of_group, titled, f"{caption} {how_to_read}".strip()))
             how_to_read = "To be read like the table of frames."
         if group == "frames":
@@ -84,7 +85,7 @@ def _series(distributions: Sequence[dict[str, Any]], axis: str) -> Series:
     groups = {row["subject"]: row["group"] for row in reversed(rows)}
     for subject in dict.fromkeys(row["subject"] for row in rows):
         of_set = [row for row in rows if row["subject"] == subject and row["group"] == groups[subject]]
-        series[subject] = ([row["centre"] for row in of_set], [row["share"] for row in of_set])
+        series[set_name(subject)] = ([row["centre"] for row in of_set], [row["share"] for row in of_set])
     return series
 
 
@@ -125,11 +126,11 @@ def _table(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
         if ratio is not None and not 0.1 < ratio < 10:
             bold.add((len(body), _RATIO_COLUMN))
         numbers, rest = [_cell(cell) for cell in cells[:2]], [_cell(cell) for cell in cells[2:]]
-        body.append([metric, *numbers, "" if ratio is None else _digits(ratio, 2), *rest])
+        body.append([metric_name(metric), *numbers, "" if ratio is None else _digits(ratio, 2), *rest])
     counts = [next((row["num_samples"] for row in rows if row["subject"] == name), 0) for name in (first, second)]
-    columns = [
-        "number", f"{first} ({counts[0]})", f"{second} ({counts[1]})", "ratio", "distance", f"floor: {first}, halves",
-    ]  # fmt: skip
+    left, right = set_name(first), set_name(second)
+    columns = ["number", f"{left} ({counts[0]})", f"{right} ({counts[1]})", "ratio", "distance"]
+    columns.append(f"floor: {left}, halves")
     return Table(title, columns, body, caption=caption, bold=bold, footnotes=["In parentheses: recordings."])
 
 

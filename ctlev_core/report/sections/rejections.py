@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ctlev_core.report.page.display_names import set_name
 from ctlev_core.report.page.html import Section, Table
 from data_contracts.manifest import Manifest
 
@@ -51,7 +52,7 @@ def rejection_sections(generated: Mapping[str, Manifest]) -> list[Section]:
     if not any(counts.num_again or counts.num_rejected for counts in found.values()):
         return []
     body = [
-        [name, counts.num_rows, counts.num_again, counts.num_rejected, ", ".join(counts.causes) or None]
+        [set_name(name), counts.num_rows, counts.num_again, counts.num_rejected, ", ".join(counts.causes) or None]
         for name, counts in found.items()
     ]
     columns = ["frames", "sampled", "sampled again", "rejected to the last", "because"]

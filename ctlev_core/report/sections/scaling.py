@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ctlev_core.report.page.display_names import metric_name, metric_words, set_name
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.score_tables import interval_over_trainings, trained_rows
 from data_contracts.training_sets import RECORDED, TrainingSet
@@ -65,11 +66,13 @@ def scaling_figure(points: Sequence[ScalePoint], metric: str = "score") -> Curve
             (series, (point.ratio, point.value)),
             (spans, (point.low, point.high)),
         ):
-            for column, value in zip(where.setdefault(point.series, ([], [])), values, strict=True):
+            for column, value in zip(where.setdefault(set_name(point.series), ([], [])), values, strict=True):
                 column.append(value)
     caption = (
         "Held-out recorded test data after training on all recorded frames and more and more synthetic ones, in equal "
         "numbers of optimiser steps; bars are 95 % intervals. At 0 there is no synthetic data."
     )
-    title = f"{metric} by the amount of synthetic data"
-    return Curves(title, series, "synthetic frames for each recorded one", metric, caption=caption, spans=spans)
+    title = f"{metric_words(metric)[0]} by the amount of synthetic data"
+    return Curves(
+        title, series, "synthetic frames for each recorded one", metric_name(metric), caption=caption, spans=spans
+    )

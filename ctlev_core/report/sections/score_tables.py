@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from ctlev_core.report.page.display_names import metric_heading, metric_name, set_name, subject_name
 from ctlev_core.report.page.tables import Cell, Table
+from ctlev_core.report.sections.verdict import made_better
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference, Trainings, paired_difference, read_trainings
@@ -32,7 +34,10 @@ ORIGINS = "classes with"
 """Groups that begin so are classes by where they were to be learnt from."""
 SUBJECTS = ("subject ", "subjects ")
 """Groups that begin so are one subject, or subjects by whether they were learnt from."""
+_FLOOR = "held-out recorded"
 _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
+_WIDEST = 7
+"""Training sets side by side that fit on a page."""
 _ENOUGH = 5
 """Trainings of a training set from which their spread is known well enough to say no more about it."""
 _SOURCES = {
@@ -73,7 +78,7 @@ def trained_rows(rows: Iterable[Row]) -> list[Row]:
 
 
 def score_tables(rows: list[Row], training_sets: Sequence[str], paired: PairedScores) -> list[Table]:
-    """The headline tables first, one a task; then labels and distances.
+    """What models score by what they were trained on, a headline and other scores for each task.
 
     Args:
         rows: of the table `scores`, of all trainings.
@@ -87,27 +92,34 @@ def score_tables(rows: list[Row], training_sets: Sequence[str], paired: PairedSc
     found = []
     for task in tasks:
         of_task = [row for row in trained if row["task"] == task]
-        found.append(_headline(of_task, "" if len(tasks) == 1 else f"{task}: ", paired))
+        found += _headline(of_task, "" if len(tasks) == 1 else f"{task}: ", paired)
         found += _one_against_rest(of_task, list(dict.fromkeys(row["subject"] for row in of_task)))
+    return found
+
+
+def frame_tables(rows: list[Row]) -> list[Table]:
+    """Whether generated frames show their labels, and how far they are from recorded ones; from the same rows."""
+    trained = [row for row in trained_rows(rows) if row["group"] == "all"]
+    found = []
     labels = [row for row in rows if row["task"] != "distance" and is_about_labels(row) and row["group"] == "all"]
     if labels:
-        floor = [{**row, "subject": "held-out recorded (floor)"} for row in trained if row["subject"] == RECORDED]
+        floor = [{**row, "subject": _FLOOR} for row in trained if row["subject"] == RECORDED]
         caption = (
             "The model trained on recorded frames, scored on synthetic frames against the labels they were sampled "
-            "from, beside its score on held-out recorded frames. Shuffled: the same frames against labels of others, "
-            "which is what frames that show nothing of their labels would score."
+            "from, beside its score on held-out recorded frames, the floor. Shuffled: the same frames against labels "
+            "of others, which is what frames that show nothing of their labels would score."
         )
-        found.append(_pivot("Do the synthetic frames show their labels?", floor + labels, "frames", caption))
+        found += _pivot("Do the synthetic frames show their labels?", floor + labels, caption)
     distances = [row for row in rows if row["task"] == "distance"]
     if distances:
         caption = (
-            "Distances to the recorded training frames in the features of a classifier trained on recorded events (fd: "
-            "Frechet distance, which is not FID). They depend on the number of frames, so read them against the row of "
-            "held-out recorded frames; alone they do not tell whether labels are right. In brackets 95 %, from halves "
-            "by recording."
+            "Distances to the recorded training frames in the features of a classifier trained on recorded events, "
+            "so that the Frechet distance is not the FID of other papers. They depend on the number of frames, so read "
+            "them against the row of held-out recorded frames; alone they do not tell whether labels are right. In "
+            "brackets 95 %, from halves by recording."
         )
         counts = ("recorded training frames", "frames compared")
-        found.append(_pivot("How far from recorded frames?", distances, "frames", caption, counts))
+        found += _pivot("How far from recorded frames?", distances, caption, counts, shown=3)
     return found
 
 
@@ -116,8 +128,9 @@ def group_tables(rows: list[Row], training_sets: Sequence[str]) -> tuple[list[Ta
     groups = [row for row in trained_rows(rows) if row["group"] != "all"]
     if not groups:
         return [], []
-    metric = groups[0]["metric"]
-    groups = [row for row in groups if row["metric"] == metric]
+    code = groups[0]["metric"]
+    groups = [row for row in groups if row["metric"] == code]
+    metric = _capital(metric_name(code))
     names = list(dict.fromkeys([*training_sets, *(row["subject"] for row in groups)]))
     by_origin = [row for row in groups if row["group"].startswith(ORIGINS)]
     by_subject = [row for row in groups if row["group"].startswith(SUBJECTS)]
@@ -125,10 +138,9 @@ def group_tables(rows: list[Row], training_sets: Sequence[str]) -> tuple[list[Ta
     caption = (
         "Held-out recorded frames by class. What synthetic frames add is seen in those that no training frame shows."
     )
-    origins = [_by_group(f"{metric}: where does it help?", by_origin, names, caption)] if by_origin else []
-    if by_subject:
-        origins.append(_by_group(f"{metric}, by subject", by_subject, names, first="subjects"))
-    classes = [_by_group(f"{metric}, class by class", by_class, names)] if by_class else []
+    origins = _by_group(f"{metric}: where does it help?", by_origin, names, caption)
+    origins += _by_group(f"{metric}: by subject", by_subject, names, first="subjects")
+    classes = _by_group(f"{metric}: class by class", by_class, names)
     return origins, classes
 
 
@@ -138,7 +150,7 @@ def baseline_tables(names: Sequence[str], metric: str, paired: PairedScores) -> 
     body: list[list[Cell]] = []
     bold: set[tuple[int, int]] = set()
     for other in others:
-        row: list[Cell] = [other]
+        row: list[Cell] = [set_name(other)]
         for before, after in (
             (other, own),
             (with_recorded(other), with_recorded(own)),
@@ -153,66 +165,98 @@ def baseline_tables(names: Sequence[str], metric: str, paired: PairedScores) -> 
         return []
     columns = [
         "baseline",
-        f"{own} - baseline",
-        f"{with_recorded(own)} - recorded+baseline",
-        "recorded+baseline - recorded",
+        f"alone: {set_name(own)} minus baseline",
+        f"beside recorded: {set_name(own)} minus baseline",
+        "recorded + baseline minus recorded",
     ]
     caption = (
-        f"Differences in `{metric}` ({_direction(metric)} is better), sample by sample on the same held-out frames; in "
-        "brackets the 95 % interval over test recordings and trainings. Bold: the interval excludes 0. All generators "
-        "were asked for the same labels; those that learn, learnt from the same frames."
+        f"Differences in {metric_name(metric)} ({'lower' if lower_is_better(metric) else 'higher'} is better), sample "
+        "by sample on the same held-out frames; in brackets the 95 % interval over test recordings and trainings. "
+        "Bold: the interval excludes 0. All generators were asked for the same labels; those that learn, learnt from "
+        "the same frames."
     )
     return [Table("Beside the baselines", columns, body, caption=caption, bold=bold)]
 
 
-def _direction(metric: str) -> str:
-    return "lower" if lower_is_better(metric) else "higher"
-
-
-def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> Table:
-    chance = [row for row in rows if row["metric"].startswith(_CHANCE)]
+def _headline(rows: list[Row], prefix: str, paired: PairedScores) -> list[Table]:
+    """The first score with its difference from recorded frames alone; then, closed, all other scores."""
+    chance = {row["metric"]: row["value"] for row in rows if row["metric"].startswith(_CHANCE)}
     rows = [row for row in rows if not row["metric"].startswith((_CHANCE, _ONE_CLASS)) or _is_mean(row["metric"])]
-    metrics = list(dict.fromkeys(row["metric"] for row in rows))
-    training_sets = list(dict.fromkeys(row["subject"] for row in rows))
+    metric, *others = dict.fromkeys(row["metric"] for row in rows)
+    by_set: dict[str, list[Row]] = {}
+    for row in rows:
+        by_set.setdefault(row["subject"], []).append(row)
     body: list[list[Cell]] = []
     bold: set[tuple[int, int]] = set()
-    for training_set in training_sets:
-        of_set = [row for row in rows if row["subject"] == training_set]
-        differences = [paired.difference(RECORDED, training_set, metric) for metric in metrics]
-        for column, (metric, difference) in enumerate(zip(metrics, differences, strict=True), 1):
-            if difference is not None and difference.is_certain:
-                better = (difference.value < 0) == lower_is_better(metric)
-                bold |= {(len(body), column)} if better else set()
-        first = differences[0] if training_set != RECORDED else None
-        if first is not None and first.is_certain:
-            bold.add((len(body), len(metrics) + 1))
-        cells: list[Cell] = [cell_text([row for row in of_set if row["metric"] == metric]) for metric in metrics]
+    for training_set, of_set in by_set.items():
+        difference = None if training_set == RECORDED else paired.difference(RECORDED, training_set, metric)
+        if difference is not None and difference.is_certain:
+            bold |= {(len(body), 2)} | ({(len(body), 1)} if made_better(difference, metric) else set())
         counts = [len({_training(row) for row in of_set}), of_set[0]["num_train"]]
-        body.append([training_set, *cells, "" if first is None else first.text(), *counts])
-    columns = ["trained on", *map(_heading, metrics), f"{metrics[0]}: minus recorded"]
-    columns += ["trainings", "frames trained on"]
+        told = "" if difference is None else difference.text()
+        body.append([set_name(training_set), _cell(of_set, metric), told, *counts])
     caption = (
         f"Scores on {rows[0]['num_samples']:,} held-out recorded test frames; equal optimiser steps for every row. "
         "Each number is the mean over the row's trainings, which differ in their seeds; in brackets the 95 % interval "
-        "over test recordings and trainings. Bold: better than `recorded`, or a difference from it that is not 0, as "
+        "over test recordings and trainings. Bold: a difference that is not 0, and a score that is better for it, as "
         "the interval of the difference says that compares sample by sample."
     )
-    parsed = [TrainingSet.parse(training_set) for training_set in training_sets]
-    notes = [f"`{name}`: {text}" for name, text in _SOURCES.items() if any(name in one.names for one in parsed)]
-    explained = {find_score(name).meaning: name for name in metrics if find_score(name).meaning}
-    notes += [f"`{name}`: {text}" for text, name in explained.items()]
+    columns = ["trained on", metric_heading(metric), "minus recorded", "trainings", "frames trained on"]
+    table = Table(
+        f"{prefix}Does synthetic data help?",
+        columns,
+        body,
+        caption=caption,
+        footnotes=_notes(by_set, metric),
+        bold=bold,
+    )
+    told = [f"{metric_name(name)}: {score_text(value)}" for name, value in chance.items()]
+    return [table, *_other_scores(by_set, others, prefix, paired, told)]
+
+
+def _other_scores(
+    by_set: dict[str, list[Row]], metrics: list[str], prefix: str, paired: PairedScores, notes: list[str]
+) -> list[Table]:
+    if not metrics:
+        return []
+    bold = {
+        (row, column)
+        for row, training_set in enumerate(by_set)
+        for column, metric in enumerate(metrics, 1)
+        if (difference := paired.difference(RECORDED, training_set, metric)) and made_better(difference, metric)
+    }
+    body = [[set_name(name), *(_cell(of_set, metric) for metric in metrics)] for name, of_set in by_set.items()]
+    caption = "As above. Bold: better than recorded frames alone, by a difference whose interval excludes 0."
+    columns = ["trained on", *map(metric_heading, metrics)]
+    notes = [*_meanings(metrics), *notes]
+    return [Table(f"{prefix}Other scores", columns, body, caption=caption, footnotes=notes, bold=bold, folded=True)]
+
+
+def _notes(by_set: dict[str, list[Row]], metric: str) -> list[str]:
+    parsed = [TrainingSet.parse(training_set) for training_set in by_set]
+    notes = [f"{set_name(name)}: {text}" for name, text in _SOURCES.items() if any(name in one.names for one in parsed)]
+    notes += _meanings([metric])
     if any(one.in_part for one in parsed):
-        notes.append("`synthetic@SHARE`: the first part of the synthetic frames")
-    notes += [
-        f"`{name}`: {score_text(value)}" for name, value in {row["metric"]: row["value"] for row in chance}.items()
-    ]
-    trainings = [{_training(row) for row in rows if row["subject"] == training_set} for training_set in training_sets]
-    if min(map(len, trainings)) < _ENOUGH:
+        notes.append("50 % of synthetic, and the like: the first part of the synthetic frames")
+    if min(len({_training(row) for row in of_set}) for of_set in by_set.values()) < _ENOUGH:
         notes.append(
             "Intervals cannot cover the spread between trainings where there is one, and cover it poorly where there "
             "are two or three."
         )
-    return Table(f"{prefix}Does synthetic data help?", columns, body, caption=caption, footnotes=notes, bold=bold)
+    return notes
+
+
+def _meanings(metrics: Sequence[str]) -> list[str]:
+    explained = {find_score(name).meaning: name for name in reversed(metrics) if find_score(name).meaning}
+    return [f"{metric_name(name)}: {text}" for text, name in reversed(explained.items())]
+
+
+def _cell(rows: Sequence[Row], metric: str) -> str:
+    return cell_text([row for row in rows if row["metric"] == metric])
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _is_mean(metric: str) -> bool:
@@ -224,37 +268,53 @@ def _one_against_rest(rows: list[Row], training_sets: Sequence[str]) -> list[Tab
     binary = [row for row in rows if row["metric"].startswith(_ONE_CLASS) and not _is_mean(row["metric"])]
     rows = [{**row, "group": row["metric"].removeprefix(_ONE_CLASS)} for row in binary]
     caption = "Accuracy of telling a class from the others with as many negatives as positives; 0.5 is chance."
-    return [_by_group("One class against the others", rows, training_sets, caption)] if rows else []
+    return _by_group("One class against the others", rows, training_sets, caption)
 
 
 def _training(row: Row) -> tuple:
     return row["seed"], row.get("model_digest")
 
 
-def _heading(metric: str) -> str:
-    return f"{metric} {'↓' if lower_is_better(metric) else '↑'}"
-
-
 def _pivot(
     title: str,
     rows: list[Row],
-    first: str,
     caption: str,
     counts: tuple[str, str] = ("frames trained on", "frames scored"),
-) -> Table:
-    """Settings down, metrics across."""
+    shown: int = 1,
+) -> list[Table]:
+    """Frames down, metrics across; those after the first `shown` in a second table, closed."""
     metrics = list(dict.fromkeys(row["metric"] for row in rows))
+    subjects = {
+        name: [row for row in rows if row["subject"] == name] for name in dict.fromkeys(r["subject"] for r in rows)
+    }
     body: list[list[Cell]] = []
-    for training_set in dict.fromkeys(row["subject"] for row in rows):
-        of_set = [row for row in rows if row["subject"] == training_set]
-        cells: list[Cell] = [cell_text([row for row in of_set if row["metric"] == metric]) for metric in metrics]
-        body.append([training_set, *cells, of_set[0]["num_train"], of_set[0]["num_samples"]])
-    return Table(title, [first, *map(_heading, metrics), *counts], body, caption=caption)
+    others: list[list[Cell]] = []
+    for subject, of_set in subjects.items():
+        cells: list[Cell] = [_cell(of_set, metric) for metric in metrics]
+        body.append([subject_name(subject), *cells[:shown], of_set[0]["num_train"], of_set[0]["num_samples"]])
+        others.append([subject_name(subject), *cells[shown:]])
+    tables = [Table(title, ["frames", *map(metric_heading, metrics[:shown]), *counts], body, caption=caption)]
+    if metrics[shown:]:
+        columns = ["frames", *map(metric_heading, metrics[shown:])]
+        tables.append(Table(f"{title} Other scores", columns, others, caption="As above.", folded=True))
+    return tables
 
 
 def _by_group(
     title: str, rows: list[Row], training_sets: Sequence[str], caption: str = "", first: str = "classes"
-) -> Table:
+) -> list[Table]:
+    """Groups down, training sets across; many of these in several tables, each with the first beside it."""
+    if not rows:
+        return []
+    if len(training_sets) > _WIDEST:
+        baseline, *others = training_sets
+        parts = [[baseline, *others[start : start + _WIDEST - 1]] for start in range(0, len(others), _WIDEST - 1)]
+        titles = [title, *(f"{title} ({number})" for number in range(2, len(parts) + 1))]
+        return [
+            table
+            for name, part in zip(titles, parts, strict=True)
+            for table in _by_group(name, rows, part, caption, first)
+        ]
     body: list[list[Cell]] = []
     for group in dict.fromkeys(row["group"] for row in rows):
         of_group = [row for row in rows if row["group"] == group]
@@ -262,7 +322,7 @@ def _by_group(
             cell_text([row for row in of_group if row["subject"] == training_set]) for training_set in training_sets
         ]
         body.append([group, *cells, of_group[0]["num_samples"]])
-    return Table(title, [first, *training_sets, "frames scored"], body, caption=caption)
+    return [Table(title, [first, *map(set_name, training_sets), "frames scored"], body, caption=caption)]
 
 
 def cell_text(rows: Sequence[Row]) -> str:

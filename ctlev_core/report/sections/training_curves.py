@@ -1,12 +1,14 @@
-"""How the frames of generators get better with training, from pre-trained weights and from random ones."""
+"""Losses over training, and how generated frames get better with it, from pre-trained weights and from random ones."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ctlev_core.report.page.display_names import metric_name, set_name
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.score_tables import interval_over_trainings
+from data_contracts.manifest import Manifest
 from data_contracts.training_sets import RECORDED, LabelAgreement, TrainingSet
 
 FEWEST_AMOUNTS = 2
@@ -60,10 +62,33 @@ def base_model_figures(
                     _append(spans.setdefault(start, ([], [])), low, high)
         if series:
             steps, far = "optimiser steps of fine-tuning", wanted == distance
-            figures.append(Curves(title, series, steps, wanted, log_x=True, log_y=far, caption=_CAPTION, spans=spans))
+            figures.append(
+                Curves(title, series, steps, metric_name(wanted), log_x=True, log_y=far, caption=_CAPTION, spans=spans)
+            )
     return figures
 
 
 def _append(columns: tuple[list[float], list[float]], first: float, second: float) -> None:
     columns[0].append(first)
     columns[1].append(second)
+
+
+def loss_curves(title: str, manifests: Sequence[Manifest], names: Sequence[str]) -> Curves:
+    """Losses over steps, of training and validation; `names` are of generators or of `TRAINING SET, seed N`."""
+
+    def told(name: str) -> str:
+        training_set, comma, seed = name.partition(", ")
+        return f"{set_name(training_set)}{comma}{seed}"
+
+    series: dict[str, tuple[list[float], list[float]]] = {}
+    for manifest, name in zip(manifests, names, strict=True):
+        for curve in dict.fromkeys(manifest.column("curve")):
+            rows = [row for row in manifest.table.to_pylist() if row["curve"] == curve]
+            label = f"{told(name)}, {'shuffled conditions' if curve == 'shuffled' else curve}"
+            series[label] = ([row["step"] for row in rows], [row["loss"] for row in rows])
+    shuffled = any(label.endswith("shuffled conditions") for label in series)
+    caption = (
+        "Validation on frames that are not learnt from, with their own conditions and with those of others: where the "
+        "two lines part, the generator heeds its conditions."
+    )
+    return Curves(title, series, x_label="optimiser step", y_label="loss", caption=caption if shuffled else "")

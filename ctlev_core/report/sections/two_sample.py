@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ctlev_core.realism.two_sample import MIN_FRAMES
+from ctlev_core.report.page.display_names import set_name
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.statistics.bootstrap import score_text
 
@@ -41,7 +42,7 @@ def two_sample_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
                 bold.add((len(body), _AREA_COLUMN))
         counts = f"{row['num_first']} + {row['num_second']}"
         body.append([_name(row["subject"]), area, deviation, counts, row["note"]])
-    columns = ["frames", "area (c2st)", "sd", "number", "note"]
+    columns = ["frames", "area", "sd", "number", "note"]
     title = "Can a network tell synthetic from recorded frames?"
     return [Table(title, columns, body, caption=_CAPTION, bold=bold)] if body else []
 
@@ -49,4 +50,4 @@ def two_sample_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
 def _name(subject: str) -> str:
     first, _, second = subject.partition(" against ")
     against = {"recorded": "recorded training frames", "test": "recorded test frames"}.get(second, second)
-    return _NAMES.get(subject, f"{first} from {against}")
+    return _NAMES.get(subject, f"{set_name(first)} from {against}")

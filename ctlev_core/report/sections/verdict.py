@@ -1,17 +1,42 @@
-"""The paragraph that says whether synthetic data helped, made from the scores and their intervals alone."""
+"""Whether synthetic data helped, in sentences made from the scores and their intervals alone."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ctlev_core.report.page.display_names import metric_words, set_name
+from ctlev_core.report.page.html import Answer
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
 from data_contracts.training_sets import ORACLE, RECORDED, SYNTHETIC, LabelAgreement, with_recorded
+
+ADDING = "adding synthetic frames to the recorded ones"
+_INSTEAD = "training on synthetic frames instead of recorded ones"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The answer of an experiment.
+
+    Attributes:
+        headline: the answer in a sentence, with number and interval.
+        details: what else the scores say, a sentence each.
+        answer: the same as the page draws it; None where nothing was compared.
+    """
+
+    headline: str
+    details: tuple[str, ...] = ()
+    answer: Answer | None = None
+
+    def __str__(self) -> str:
+        """One paragraph."""
+        return " ".join([self.headline, *self.details])
 
 
 def in_range(score: Difference, metric: str) -> Difference:
@@ -26,6 +51,31 @@ def made_better(difference: Difference, metric: str) -> bool | None:
     return (difference.value < 0) == lower_is_better(metric) if difference.is_certain else None
 
 
+def tell_change(what: str, difference: Difference, metric: str, before: float, after: float) -> str:
+    """`Adding ... helped: accuracy went from 0.6 to 0.7, a difference of +0.1 [+0.05, +0.15].`
+
+    Args:
+        what: was done: `adding synthetic frames to the recorded ones`.
+        difference: of the score, after minus before.
+        metric: code name of the score.
+        before: the score without it.
+        after: the score with it.
+    """
+    name, unit = metric_words(metric)
+    unit = unit and f" {unit}"
+    numbers = f"{name} went from {score_text(before)} to {score_text(after)}{unit}"
+    if difference.low == difference.high == 0:
+        return f"{what[:1].upper()}{what[1:]} changed nothing: {name} is {score_text(after)}{unit}."
+    numbers += f", a difference of {difference.text()}"
+    if math.isnan(difference.low):
+        return f"There are too few test recordings to say whether {what} helped: {numbers}."
+    if not difference.is_certain:
+        return f"Whether {what} helped is undecided: {numbers}."
+    share = f" ({abs(difference.value / before) * 100:.0f} %)" if before else ""
+    helped = "helped" if made_better(difference, metric) else "did harm"
+    return f"{what[:1].upper()}{what[1:]} {helped}: {numbers}{share}."
+
+
 def verdict(
     rows: list[dict[str, Any]],
     training_sets: Sequence[str],
@@ -33,7 +83,7 @@ def verdict(
     beside: Mapping[str, Difference | None] | None = None,
     oracle: tuple[Difference, Difference | None] | None = None,
     instead: Difference | None = None,
-) -> str:
+) -> Verdict:
     """Compare training on recorded data with training on recorded and synthetic data, and synthetic data with
     baselines.
 
@@ -46,34 +96,49 @@ def verdict(
             the gain is not certain).
         instead: synthetic alone minus recorded, likewise; told where nothing was trained on both together.
     Returns:
-        A few sentences. A change counts as shown only where the interval of the difference excludes zero.
+        A change counts as shown only where the interval of the difference excludes zero.
     """
     scored = [row for row in rows if row["group"] == "all" and row["subject"] in training_sets]
     if not scored:
-        return "No downstream model was scored."
+        return Verdict("No downstream model was scored.")
     metric = scored[0]["metric"]
     values = _means(rows, metric)
-    beside = beside or {}
-    both = with_recorded(SYNTHETIC)
-    own = {name: values[name] for name in (RECORDED, SYNTHETIC, both) if name in values}
-    if not own:
-        own = {name: values[name] for name in training_sets if name in values}
-    sense = f"{'lower' if lower_is_better(metric) else 'higher'} is better"
-    summary = f"{metric} ({'; '.join(filter(None, (find_score(metric).meaning, sense)))}) on held-out recorded data: "
-    summary += ", ".join(f"{training_set} {score_text(value)}" for training_set, value in own.items()) + "."
+    both, labels = with_recorded(SYNTHETIC), _labels(values)
+    name, unit = metric_words(metric)
+    meaning = find_score(metric).meaning
+    sense = "Less is better." if lower_is_better(metric) else "More is better."
+    about = f"{name[:1].upper()}{name[1:]}: {meaning}. {sense}" if meaning else f"{sense}"
+    if RECORDED in values and both in values and difference is not None:
+        details = [about]
+        if oracle is not None and with_recorded(ORACLE) in values:
+            details.append(_oracle(*oracle))
+        details += [
+            _beside(other, values[with_recorded(other)], compared, metric)
+            for other, compared in (beside or {}).items()
+            if compared is not None and with_recorded(other) in values
+        ]
+        headline = tell_change(ADDING, difference, metric, values[RECORDED], values[both])
+        return Verdict(headline, (*details, *labels), _answer(difference, metric))
     if both not in values and instead is not None and {RECORDED, SYNTHETIC} <= values.keys():
-        told = _what_it_did(instead, metric, values[RECORDED], "Training on synthetic data instead of recorded data")
-        return f"{summary} {told} {_labels(values)}".rstrip()
-    if difference is None or RECORDED not in values or both not in values:
-        return summary
-    sentences = [summary, _what_it_did(difference, metric, values[RECORDED])]
-    if oracle is not None and with_recorded(ORACLE) in values:
-        sentences.append(_oracle(*oracle))
-    for name, compared in beside.items():
-        if compared is not None and with_recorded(name) in values:
-            sentences.append(_beside(name, values[with_recorded(name)], compared, metric))
-    sentences.append(_labels(values))
-    return " ".join(sentence for sentence in sentences if sentence)
+        headline = tell_change(_INSTEAD, instead, metric, values[RECORDED], values[SYNTHETIC])
+        return Verdict(headline, (about, *labels), _answer(instead, metric))
+    own = {one: values[one] for one in (RECORDED, SYNTHETIC, both) if one in values}
+    told = ", ".join(
+        f"{set_name(one)} {score_text(value)}" for one, value in (own or values).items() if one in training_sets
+    )
+    return Verdict(f"{name[:1].upper()}{name[1:]}{unit and f', {unit}'}, by what was trained on: {told}.", (about,))
+
+
+def _answer(difference: Difference, metric: str) -> Answer:
+    """Better is positive, whatever the score."""
+    known = not math.isnan(difference.low)
+    better = made_better(difference, metric) if known else None
+    word = {True: "Helped", False: "Did harm", None: "Undecided" if known else "Too few test recordings"}[better]
+    unit = metric_words(metric)[1]
+    text = f"{difference.text()}{unit and f' {unit}'}"
+    ends = (difference.low, difference.value, difference.high)
+    low, value, high = [-end for end in reversed(ends)] if lower_is_better(metric) else ends
+    return Answer(word, {True: "good", False: "bad", None: "open"}[better], text, value, low, high)
 
 
 def _means(rows: list[dict[str, Any]], metric: str) -> dict[str, float]:
@@ -85,30 +150,16 @@ def _means(rows: list[dict[str, Any]], metric: str) -> dict[str, float]:
     return {training_set: float(np.mean(values)) for training_set, values in found.items()}
 
 
-def _what_it_did(difference: Difference, metric: str, real: float, what: str = "Adding synthetic data") -> str:
-    doing = what[0].lower() + what[1:]
-    if math.isnan(difference.low):
-        return f"There are too few test recordings to say whether {doing} helped."
-    if difference.low == difference.high == 0:
-        return f"{what} changed nothing."
-    text = f"paired difference {difference.text()}"
-    if not difference.is_certain:
-        return f"Whether {doing} helped is undecided: {text}."
-    better = made_better(difference, metric)
-    share = f", {abs(difference.value / real):.0%} of what recorded data alone gives" if real else ""
-    return f"{what} made it {'better' if better else 'worse'}: {text}{share}."
-
-
 def _oracle(gain: Difference, share: Difference | None) -> str:
     beginning = f"Recorded frames of the same poses in the place of synthetic ones change it by {gain.text()}"
     if share is None:
         return f"{beginning}."
-    interval = "" if math.isnan(share.low) else f" [{share.low:.0%}, {share.high:.0%}]"
-    return f"{beginning}; synthetic ones give {share.value:.0%}{interval} of that."
+    interval = "" if math.isnan(share.low) else f" [{share.low * 100:.0f}, {share.high * 100:.0f}]"
+    return f"{beginning}; synthetic ones give {share.value * 100:.0f}{interval} % of that."
 
 
 def _beside(name: str, value: float, difference: Difference, metric: str) -> str:
-    sentence = f"With frames of {name} in the place of its own, {with_recorded(name)} is {score_text(value)}"
+    sentence = f"With {set_name(name)} in the place of its own synthetic frames the score is {score_text(value)}"
     if math.isnan(difference.low):
         return f"{sentence}."
     if not difference.is_certain:
@@ -117,11 +168,11 @@ def _beside(name: str, value: float, difference: Difference, metric: str) -> str
     return f"{sentence}; its own are {'better' if better else 'worse'}: {difference.text()}."
 
 
-def _labels(values: Mapping[str, float]) -> str:
+def _labels(values: Mapping[str, float]) -> tuple[str, ...]:
     """Whether synthetic frames show their labels, as the model trained on recorded frames sees them."""
     own, shuffled = (values.get(str(LabelAgreement(SYNTHETIC, shuffled))) for shuffled in (False, True))
     if own is None:
-        return ""
+        return ()
     control = "" if shuffled is None else f", and {score_text(shuffled)} on them with shuffled labels"
     scores = f"scores {score_text(own)} on synthetic frames against their labels"
-    return f"The model trained on recorded frames {scores}{control}."
+    return (f"The model trained on recorded frames {scores}{control}.",)

@@ -15,16 +15,16 @@ from functools import cached_property
 import numpy as np
 import pyarrow as pa
 
+from ctlev_core.report.page.display_names import SOURCES, Name, metric_name, metric_words, set_name
 from ctlev_core.report.page.html import Curves, Folded, Section
 from ctlev_core.report.page.tables import Cell, Table
-from ctlev_core.report.sections.verdict import in_range, made_better
+from ctlev_core.report.sections.verdict import ADDING, in_range, made_better, tell_change
 from ctlev_core.report.studies.study import Part
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference
 from ctlev_core.statistics.pooled_scores import PooledScores, pool_values
 from data_contracts.training_sets import (
-    LABEL_CONSISTENT,
     ORACLE,
     RECORDED,
     SYNTHETIC,
@@ -36,16 +36,6 @@ from data_contracts.training_sets import (
 BOTH = with_recorded(SYNTHETIC)
 AUGMENTED, SIMULATED = with_recorded("augmentation"), with_recorded("simulator")
 LABELS = str(LabelAgreement(SYNTHETIC))
-_FRAMES = {
-    RECORDED: "recorded frames",
-    SYNTHETIC: "synthetic frames",
-    "augmentation": "augmented copies of recorded frames",
-    "random_weights": "synthetic frames of a generator from random weights",
-    "simulator": "simulated frames",
-    ORACLE: "more recorded frames",
-    LABEL_CONSISTENT: "the synthetic frames with the clearest labels",
-}
-"""What the parts of a training set's name stand for, in reading order."""
 _COMPARED = (
     (RECORDED, BOTH, "recorded and synthetic frames, against recorded frames alone"),
     (AUGMENTED, BOTH, "recorded and synthetic frames, against recorded frames and augmented copies"),
@@ -150,14 +140,14 @@ def pooled_chart(groups: Sequence[Group]) -> list[Curves]:
             if training_set in group.scores.training_sets
         ]
         if points:
-            name = _in_words(training_set)
+            name = set_name(training_set)
             series[name] = [place for place, _ in points], [score.value for _, score in points]
             spans[name] = [score.low for _, score in points], [score.high for _, score in points]
     metric = groups[0].metric
     caption = f"{_counts(groups)} Bars are 95 % intervals; lines stand a little apart, so that all can be seen."
     x_label = found[0][2] or "recordings"
-    title = f"Scores (`{metric}`) by the number of recordings"
-    return [Curves(title, series, x_label, metric, log_x=min(places) > 0, caption=caption, spans=spans)]
+    title = f"{metric_words(metric)[0][:1].upper()}{metric_words(metric)[0][1:]} by the number of recordings"
+    return [Curves(title, series, x_label, metric_name(metric), log_x=min(places) > 0, caption=caption, spans=spans)]
 
 
 def pooled_sections(groups: Sequence[Group], tables: Sequence[Table]) -> list[Section | Folded]:
@@ -172,7 +162,7 @@ def pooled_sections(groups: Sequence[Group], tables: Sequence[Table]) -> list[Se
     sections += [Folded(table.title, [table]) for table in probabilities]
     for group in groups:
         first = group.parts[0]
-        title = f"{group.name} (`{first.name}`): asked for, and sampled"
+        title = f"{group.name}: asked for, and sampled"
         sections.append(replace(first.summary.grid, title=title))
     return sections
 
@@ -181,42 +171,23 @@ def _sentence(group: Group) -> str:
     added = group.difference(RECORDED, BOTH)
     if added is None:
         return f"{group.name}: nothing was trained on recorded and synthetic frames together."
-    before, after = (score_text(group.score(training_set).value) for training_set in (RECORDED, BOTH))
-    what = "adding synthetic frames to the recorded ones"
-    numbers = f"{group.metric} went from {before} to {after}, a difference of {added.text()}"
-    told = f"{group.name}: {_told(added, group.metric, what)}; {numbers}"
+    before, after = (group.score(training_set).value for training_set in (RECORDED, BOTH))
+    told = tell_change(ADDING, added, group.metric, before, after)
+    told = f"{group.name}: {told[:1].lower()}{told[1:]}"
     beside = group.difference(AUGMENTED, BOTH)
     if beside is None:
-        return f"{told}."
-    better = made_better(beside, group.metric)
+        return told
     compared = {
-        True: "it did more than augmented copies of the recorded frames do",
-        False: "it did less than augmented copies of the recorded frames do",
-        None: "whether it did more than augmented copies of the recorded frames do is undecided",
-    }[better]
-    return f"{told}; {compared} ({beside.text()})."
-
-
-def _told(difference: Difference, metric: str, what: str) -> str:
-    if math.isnan(difference.low):
-        return f"there are too few test recordings to say whether {what} helped"
-    better = made_better(difference, metric)
-    return {True: f"{what} helped", False: f"{what} did harm", None: f"whether {what} helped is undecided"}[better]
-
-
-def _in_words(training_set: str) -> str:
-    """A training set in plain words: `recorded and synthetic frames`."""
-    if training_set == BOTH:
-        return "recorded and synthetic frames"
-    parts = [_FRAMES.get(part, f"frames of {part.replace('_', ' ')}") for part in TrainingSet.parse(training_set).names]
-    if len(parts) == 1:
-        return f"{parts[0]} alone"
-    return f"{', '.join(parts[:-1])} and {parts[-1]}"
+        True: "It did more than augmented copies of the recorded frames do",
+        False: "It did less than augmented copies of the recorded frames do",
+        None: "Whether it did more than augmented copies of the recorded frames do is undecided",
+    }[made_better(beside, group.metric)]
+    return f"{told} {compared} ({beside.text()})."
 
 
 def _reading_order(training_sets: Sequence[str]) -> list[str]:
-    """Recorded frames alone, recorded frames with others, then others alone; within these as `_FRAMES` names them."""
-    known = list(_FRAMES)
+    """Recorded frames alone, recorded frames with others, then others alone; within these as `SOURCES` names them."""
+    known = list(SOURCES)
 
     def place(training_set: str) -> tuple:
         parts = TrainingSet.parse(training_set).names
@@ -233,7 +204,7 @@ def _score_table(groups: Sequence[Group]) -> Table:
     body: list[list[Cell]] = []
     bold: set[tuple[int, int]] = set()
     for training_set in training_sets:
-        row: list[Cell] = [f"{_in_words(training_set)} (`{training_set}`)"]
+        row: list[Cell] = [set_name(training_set)]
         for column, group in enumerate(groups, 1):
             known = training_set in group.scores.training_sets
             row.append(_score(group.score(training_set)) if known else "")
@@ -241,17 +212,19 @@ def _score_table(groups: Sequence[Group]) -> Table:
             if difference is not None and made_better(difference, metric):
                 bold.add((len(body), column))
         body.append(row)
-    notes = [f"`{metric}`: {find_score(metric).meaning}"] if find_score(metric).meaning else []
+    notes = [f"{metric_name(metric)}: {find_score(metric).meaning}"] if find_score(metric).meaning else []
     agreed = [group.label_agreement for group in groups]
     if any(agreed):
-        body.append([f"label agreement (`{LABELS}`)", *("" if one is None else _score(one) for one in agreed)])
+        body.append(
+            [Name("synthetic, against their labels", LABELS), *("" if one is None else _score(one) for one in agreed)]
+        )
         notes.append(
-            f"Label agreement: {metric} of classifiers trained on recorded frames when they are shown synthetic frames "
-            "and the labels asked for. It says nothing of test recordings."
+            f"Against their labels: {metric_name(metric)} of classifiers trained on recorded frames when they are "
+            "shown synthetic frames and the labels asked for. It says nothing of test recordings."
         )
     sense = "lower" if lower_is_better(metric) else "higher"
     caption = (
-        f"Scores (`{metric}`) on test recordings that nothing was trained on; {sense} is better. "
+        f"{metric_name(metric)} on test recordings that nothing was trained on; {sense} is better. "
         f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: "
         "better than recorded frames alone, by a difference whose interval excludes 0."
     )
@@ -278,8 +251,8 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
         return []
     sense = "Lower" if lower_is_better(metric) else "Higher"
     caption = (
-        f"Differences in `{metric}`, the first of the two minus the second, paired by test recording and by draw. "
-        f"{sense} is better. In brackets 95 % intervals; bold: the interval excludes 0."
+        f"Differences in {metric_name(metric)}, the first of the two minus the second, paired by test recording and by "
+        f"draw. {sense} is better. In brackets 95 % intervals; bold: the interval excludes 0."
     )
     notes = []
     if any(shares):
@@ -289,8 +262,8 @@ def _difference_tables(groups: Sequence[Group]) -> list[Table]:
             "is certain."
         )
     chances = (
-        f"Share of resampled studies in which the first of the two has the better `{metric}`; 50 % is a tie. Resampled "
-        "studies are spread as widely as the intervals are."
+        f"Share of resampled studies in which the first of the two has the better {metric_name(metric)}; 50 % is a "
+        "tie. Resampled studies are spread as widely as the intervals are."
     )
     return [
         Table(

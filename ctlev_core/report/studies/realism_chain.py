@@ -43,7 +43,7 @@ _NAMES = {
 }
 _AREA_CAPTION = (
     "Recorded frames after each part of the generator, one row each. What is denoised has been encoded, is decoded "
-    "again, and its values are treated as in sampling. Area (c2st): under the ROC curve of a small network that tells "
+    "again, and its values are treated as in sampling. Area: under the ROC curve of a small network that tells "
     "the frames from what they were before; whole recordings are learnt from or held out, with what was made of them. "
     "0.5 = it cannot, 1 = it always can; frames that come out unchanged have 0.5. The first row is the floor: random "
     "halves of the recorded frames. Bold: told apart, the interval lies above 0.5. Steps: evaluations of the network "
@@ -122,7 +122,7 @@ class ChainPage:
             numbers = [row["value"] if (row := measured[name].get(key)) else None for name in shown]
             area = _cell(tested, "value", "low", "high")
             body.append([link_name(*key), tested["evaluations"] or None, area, tested["num_samples"], *numbers])
-        columns = ["frames", "steps", "area (c2st)", "number", *(COLUMNS[name] for name in shown)]
+        columns = ["frames", "steps", "area", "number", *(COLUMNS[name] for name in shown)]
         return Table("Where is realism lost?", columns, body, _AREA_CAPTION, notes, bold)
 
     def _differences(self, title: str, names: Sequence[str], caption: str = "") -> Table:

@@ -21,9 +21,9 @@ import pyarrow.parquet as pq
 
 from ctlev_core.provenance.records import Record, options_of, read_provenance, versions_of
 from ctlev_core.provenance.scores import PAIRED_SAMPLES, SCORE_LINEAGE
+from ctlev_core.report.page.display_names import metric_heading, role_name, subject_name
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import cell_text, interval_over_trainings
-from ctlev_core.scoring.score_info import lower_is_better
 from ctlev_core.statistics.paired_differences import (
     Difference,
     Trainings,
@@ -129,8 +129,8 @@ def _scores_table(first: Run, second: Run) -> Table:
         rows = [of_run.get(key, []) for of_run in found]
         subject, metric = key
         row: list[Cell] = [
-            subject,
-            f"{metric} {'↓' if lower_is_better(metric) else '↑'}",
+            subject_name(subject),
+            metric_heading(metric),
             *map(cell_text, rows),
             "",
             "",
@@ -187,13 +187,13 @@ def _options_table(first: Run, second: Run) -> Table:
             before, after = (str(of_role.get(name, _ABSENT)) for of_role in options)
             if before != after:
                 found.setdefault((name, before, after), []).append(role)
-    body: list[list[Cell]] = [[name, a, b, _where(roles)] for (name, a, b), roles in found.items()]
+    body: list[list[Cell]] = [[f"`{name}`", a, b, _where(roles)] for (name, a, b), roles in found.items()]
     caption = "Every option in which a stage of one differs from the same stage of the other, defaults included."
     return Table("Options", ["option", first.name, second.name, "of"], body, caption=caption if body else "No option.")
 
 
 def _where(roles: list[str]) -> str:
-    return roles[0] if len(roles) == 1 else f"{roles[0]}, and {len(roles) - 1} more"
+    return role_name(roles[0]) if len(roles) == 1 else f"{role_name(roles[0])}, and {len(roles) - 1} more"
 
 
 def _data_table(first: Run, second: Run) -> Table:
@@ -208,7 +208,9 @@ def _data_table(first: Run, second: Run) -> Table:
         if record.digest == other.digest:
             same += 1
             continue
-        body.append([role, record.rows, other.rows, record.digest[:12], other.digest[:12], _cause(record, other)])
+        body.append(
+            [role_name(role), record.rows, other.rows, record.digest[:12], other.digest[:12], _cause(record, other)]
+        )
     caption = f"Sets of data and generators whose content differs; {same} more are equal, bit for bit."
     columns = ["what", f"rows, {first.name}", f"rows, {second.name}", f"digest, {first.name}", f"digest, {second.name}"]
     return Table("Data", [*columns, "because of"], body, caption=caption)

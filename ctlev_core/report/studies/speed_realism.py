@@ -12,7 +12,7 @@ from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.sampling_errors import HELD_OUT, OF_HALVES
 
 _CAPTION = (
-    "c2st: area under the ROC curve of a small network that tells the frames from held-out recorded ones; 0.5 = it "
+    "Area: under the ROC curve of a small network that tells the frames from held-out recorded ones; 0.5 = it "
     "cannot, "
     "1 = it always can. Active: share of pixels with a value of 25 of 255 and more; isolated: share of these without "
     "an active one around. In brackets 95 % intervals."
@@ -29,7 +29,7 @@ def realism_table(rows: Sequence[Row], name_of: Callable[[str], str]) -> Table:
     body: list[list[Cell]] = []
     real = [_cell(rows, REFERENCE_LINE, None, *what) for what in _measured(C2ST + OF_HALVES, HELD_OUT)]
     if any(real):
-        body.append(["held-out recorded frames; c2st: their halves", None, *real])
+        body.append(["held-out recorded frames; area: their halves", None, *real])
     missing = False
     of_generator = [row for row in rows if row["study"] == "generator"]
     for line, steps in dict.fromkeys((row["line"], row["num_inference_steps"]) for row in of_generator):
@@ -40,7 +40,7 @@ def realism_table(rows: Sequence[Row], name_of: Callable[[str], str]) -> Table:
         missing = missing or not cells[0]
         body.append([name_of(line), f"{evaluations:g}", *cells])
     notes = [f"No value: fewer than {MIN_FRAMES} frames of the setting or of held-out recordings."] if missing else []
-    columns = ["sampler", "U-Net", "c2st", "active", "isolated"]
+    columns = ["sampler", "U-Net", "area", "active", "isolated"]
     return Table("How real do the frames of each setting look?", columns, body, caption=_CAPTION, footnotes=notes)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.events.windows import spread
+from ctlev_core.report.page.display_names import metric_name
 from ctlev_core.report.page.html import Curves, ImageGrid, Section, Table
 from ctlev_core.report.studies.measurement_charts import (
     CONVERGED_LINE,
@@ -243,18 +244,22 @@ class SpeedPage:
             intervals = ["" if row is None else _text(row) for row in (distance, excess)]
             body.append([self._name(point[0]), *networks, *times, *intervals, *cells])
         columns = [
-            "sampler", "U-Net", "Control Net", "ms", "CPU ms", f"{FD}: recorded", f"{FD}: excess", f"{KID}: recorded",
-            f"{FD}: ref.", "RMS",
+            "sampler", "U-Net", "Control Net", "ms", "CPU ms", "Frechet, recorded", "excess", "KID, recorded",
+            "Frechet, reference", "RMS",
         ]  # fmt: skip
-        columns += [label.replace("_", " ")] if label else []
+        columns += [metric_name(label)] if label else []
         caption = (
             "U-Net, ControlNet: evaluations an image, counted. ms: median time an image, batch by batch in one process "
-            f"with the networks loaded and warm, on the machine as busy as it was. {FD}: Frechet distance, to "
+            f"with the networks loaded and warm, on the machine as busy as it was. Frechet: distance, to "
             f"{HELD_OUT} with its 95 % interval, and between halves to the reference's samples. Excess: that to "
-            f"recorded frames minus the reference's, paired, with its 95 % interval. {KID}: kernel distance times "
+            f"recorded frames minus the reference's, paired, with its 95 % interval. KID: kernel distance times "
             "1,000, which has no bias. RMS: grey levels from the converged solution."
         )
-        caption += f" {label}: of a model trained on recorded frames, against the labels asked for." if label else ""
+        caption += (
+            f" {metric_name(label)}: of a model trained on recorded frames, against the labels asked for."
+            if label
+            else ""
+        )
         return Table("Every setting", columns, body, caption=f"{caption} Bold: recommended.", bold=bold)
 
     def _at(self, point: Point, metric: str, against: str) -> Row | None:

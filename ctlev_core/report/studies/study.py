@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from ctlev_core.report.page.html import Folded, Section, Text
+from ctlev_core.report.page.display_names import Name, metric_heading, metric_name, subject_name
+from ctlev_core.report.page.html import Chapter, Folded, Section, Text
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import PairedScores, cell_text, score_tables, trained_rows
 from ctlev_core.report.sections.verdict import made_better
 from ctlev_core.report.studies import paper_numbers
 from ctlev_core.report.studies.speed_summary import SpeedSummary
-from ctlev_core.report.studies.summary import Figure, Summary
-from ctlev_core.scoring.score_info import find_score, lower_is_better
+from ctlev_core.report.studies.summary import Summary
+from ctlev_core.scoring.score_info import find_score
 from ctlev_core.statistics.paired_differences import Difference
 from data_contracts.training_sets import RECORDED, SYNTHETIC, with_recorded
 
@@ -58,7 +59,8 @@ class Part:
     @property
     def heading(self) -> str:
         """How the sections about it begin."""
-        return f"{self.question} (`{self.name}`)"
+        name = self.name.replace("_", " ")
+        return f"{self.question} ({name})" if name != self.question else name
 
     @property
     def question(self) -> str:
@@ -86,7 +88,26 @@ class Part:
         for start, question, published in _QUESTIONS:
             if any(metric.startswith(start) for metric in metrics):
                 return question, published
-        return self.name, None
+        return self.name.replace("_", " "), None
+
+
+def study_plain(parts: Sequence[Part]) -> list[tuple[str, str]]:
+    """What a study is, and how its intervals are read, (heading, paragraph) each, for a reader new to events."""
+    compared = sum(part.compares for part in parts)
+    return [
+        (
+            "What was done",
+            "An event camera reports, pixel by pixel, when it gets brighter or darker. In each experiment a generator "
+            "learnt from recorded event images and what is known of them, and made synthetic ones for other labels. In "
+            f"{compared} of {len(parts)} experiments models were then trained on recorded images, on synthetic ones "
+            "and on both, and tested on recorded images that nothing was trained on.",
+        ),
+        (
+            "How sure is it?",
+            "Brackets hold 95 % intervals. Where the interval of a difference does not contain 0, chance alone seldom "
+            "gives such a difference; where it does, the difference may be chance.",
+        ),
+    ]
 
 
 def study_words(parts: Sequence[Part]) -> str:
@@ -110,8 +131,7 @@ def study_overview(parts: Sequence[Part]) -> Table:
             if made_better(difference, part.metric):
                 bold.add((len(body), 4))
         told = "" if difference is None else difference.text()
-        direction = "↓" if lower_is_better(part.metric) else "↑"
-        body.append([part.heading, f"{part.metric} {direction}", *map(cell_text, by_set.values()), told])
+        body.append([part.heading, metric_heading(part.metric), *map(cell_text, by_set.values()), told])
         if find_score(part.metric).meaning:
             explained[part.metric] = find_score(part.metric).meaning
     caption = (
@@ -120,7 +140,7 @@ def study_overview(parts: Sequence[Part]) -> Table:
         "whose interval excludes 0, and scores that are better for it."
     )
     columns = ["experiment", "score", "recorded", "synthetic", "both", "both minus recorded"]
-    notes = [f"`{metric}`: {words}" for metric, words in explained.items()]
+    notes = [f"{metric_name(metric)}: {words}" for metric, words in explained.items()]
     return Table("Do synthetic frames help?", columns, body, caption=caption, bold=bold, footnotes=notes)
 
 
@@ -143,24 +163,25 @@ def study_tables(parts: Sequence[Part]) -> list[list[Table]]:
     found = []
     for part in parts:
         tables = score_tables(part.rows, part.training_sets, part.paired) if part.compares else []
-        found.append([replace(table, title=f"{part.heading}: {table.title}") for table in tables if _answers(table)])
+        found.append([replace(table, title=f"{part.heading}: {table.title}") for table in tables])
     return [*found, [distances_table(parts)]]
 
 
-def _answers(table: Table) -> bool:
-    """Is it about models tested on recorded frames? What else was scored is on the experiment's own page."""
-    return table.columns[0] in ("trained on", "classes")
-
-
-def study_sections(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> list[Section | Folded]:
+def study_chapters(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> list[Chapter]:
     """Of each experiment its tables, its samples, its figures and the paper's numbers; then the distances of all."""
-    sections: list[Section | Folded] = []
+    chapters = []
     for part, shown in zip(parts, tables, strict=False):
-        sections += shown
-        sections.append(replace(part.summary.grid, title=f"{part.heading}: asked for, and sampled"))
-        sections += [_titled(part.heading, figure) for figure in part.summary.figures]
+        sections: list[Section | Folded] = [_untitled(part.heading, table) for table in shown]
+        sections.append(part.summary.grid)
+        sections += part.summary.figures
         sections += _published(part.published) if part.compares else []
-    return [*sections, *tables[-1], *_published(paper_numbers.DISTANCES)]
+        chapters.append(Chapter(part.heading, sections))
+    return [*chapters, Chapter("All experiments", [*tables[-1], *_published(paper_numbers.DISTANCES)])]
+
+
+def _untitled(heading: str, table: Table) -> Table:
+    """With the title it has on the experiment's own page."""
+    return replace(table, title=table.title.removeprefix(f"{heading}: "))
 
 
 def speed_sections(parts: Sequence[Part], speed: SpeedSummary) -> list[Section | Folded]:
@@ -168,14 +189,10 @@ def speed_sections(parts: Sequence[Part], speed: SpeedSummary) -> list[Section |
     table = speed_table(parts, speed)
     sections: list[Section | Folded] = [Text(f"Speed against error: {_heading(parts, speed)}", speed.recommendation)]
     for chart in speed.charts[:1]:
-        sections.append(_titled("Speed against error", chart))
+        sections.append(replace(chart, title=f"Speed against error: {chart.title[:1].lower()}{chart.title[1:]}"))
     others = speed.charts[1:]
     shown = [*others, replace(table, title="Costs and errors")] if others else [table]
     return [*sections, Folded(table.title, shown)]
-
-
-def _titled(heading: str, figure: Figure) -> Figure:
-    return replace(figure, title=f"{heading}: {figure.title[:1].lower()}{figure.title[1:]}")
 
 
 def speed_table(parts: Sequence[Part], speed: SpeedSummary) -> Table:
@@ -206,13 +223,20 @@ def distances_table(parts: Sequence[Part]) -> Table:
     distances = [_first_distance(part.rows) for part in parts]
     training_sets = list(dict.fromkeys(row["subject"] for rows in distances for row in rows))
     body: list[list[Cell]] = [
-        [training_set, *(cell_text([row for row in rows if row["subject"] == training_set]) for rows in distances)]
+        [
+            subject_name(training_set),
+            *(cell_text([row for row in rows if row["subject"] == training_set]) for rows in distances),
+        ]
         for training_set in training_sets
     ]
     caption = (
-        "Frechet distance to the recorded training frames, in features of a classifier trained on recorded events: "
-        "another one "
-        "for each experiment, so that only numbers below one another compare. Lower is nearer; the row of held-out "
-        "recorded frames is the floor. In brackets 95 %."
+        "Frechet distance to the recorded training frames, in features of a classifier trained on recorded events, "
+        "another one for each experiment, so that only numbers below one another compare. Lower is nearer; the row of "
+        "held-out recorded frames is the floor. In brackets 95 %."
     )
-    return Table("Quality of the frames", ["frames", *(f"{part.name} ↓" for part in parts)], body, caption=caption)
+    return Table(
+        "Quality of the frames",
+        ["frames", *(Name(f"{part.heading} ↓", part.name) for part in parts)],
+        body,
+        caption=caption,
+    )

@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ctlev_core.report.page.html import Animation, Curves, ImageGrid, Step
+from ctlev_core.report.page.html import Animation, Colours, Curves, ImageGrid, Step
 from data_contracts.errors import DataError
 
 SUMMARY_FILE = "summary.json"
@@ -32,12 +32,14 @@ class Summary:
         steps: what was done.
         grid: what was asked for, and sampled.
         figures: how scores change with the amounts of data and training, and frames in motion.
+        colours: legend of the pictures.
     """
 
     verdict: str
     steps: list[Step]
     grid: ImageGrid
     figures: Sequence[Figure] = ()
+    colours: Colours = ()
 
 
 def write_summary(folder: Path, summary: Summary) -> None:
@@ -48,6 +50,7 @@ def write_summary(folder: Path, summary: Summary) -> None:
         "steps": [{**vars(step), "picture": _picture(step.picture)} for step in steps],
         "grid": {**vars(grid), "rows": [[label, [_picture(image) for image in images]] for label, images in grid.rows]},
         "figures": [_stored(figure) for figure in summary.figures],
+        "colours": list(summary.colours),
     }
     (folder / SUMMARY_FILE).write_text(json.dumps(content), encoding="utf-8")
 
@@ -64,7 +67,8 @@ def read_summary(folder: Path) -> Summary:
         steps = [Step(**{**step, "picture": _opened(step["picture"])}) for step in content["steps"]]
         rows = [(label, [_image(image) for image in images]) for label, images in content["grid"]["rows"]]
         grid = ImageGrid(**{**content["grid"], "rows": rows})
-        return Summary(content["verdict"], steps, grid, [_figure(stored) for stored in content["figures"]])
+        figures = [_figure(stored) for stored in content["figures"]]
+        return Summary(content["verdict"], steps, grid, figures, content["colours"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: is not the summary of a report: {error}") from error
 

@@ -9,9 +9,10 @@ import re
 import pytest
 from rich.console import Console
 
+from ctlev_core.duration_text import duration_text
 from ctlev_core.progress import Progress
 from flows import run_progress
-from flows.run_progress import RunProgress, duration_text
+from flows.run_progress import RunProgress
 from flows.stage_costs import Measured, StageCost, _at, inputs_of, time_left
 from tasks.stage import PlannedStage
 

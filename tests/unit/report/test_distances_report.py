@@ -38,7 +38,7 @@ def test_distances_stand_beside_their_floor_and_the_numbers_they_depend_on():
     assert len(set(table.columns)) == len(table.columns) == len(table.rows[0])
     floor = f"{estimate.floor:.3f} [{estimate.floor_low:.3f}, {estimate.floor_high:.3f}]"
     halved = f"{estimate.halved:.3f}"
-    assert table.rows[0] == ["many", "fd", f"{estimate.value:.3f}", halved, floor, 30, 40, 3]
+    assert table.rows[0] == ["many", "Frechet distance", f"{estimate.value:.3f}", halved, floor, 30, 40, 3]
     # One recording cannot be halved.
-    assert table.rows[1] == ["few", "fd", f"{alone.value:.3f}", None, None, 30, 40, 3]
+    assert table.rows[1] == ["few", "Frechet distance", f"{alone.value:.3f}", None, None, 30, 40, 3]
     assert floor_tables([Scores()]) == []

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.report.page.figures import animation_webp, curves_svg, image_grid_png, series_style
+from ctlev_core.report.page.charts import Axis, series_class
+from ctlev_core.report.page.figures import animation_webp, image_grid_png
 from ctlev_core.report.page.html import Animation, Curves, Folded, ImageGrid, Step, Table, Text, render_report
 from ctlev_core.report.page.tables import format_column
 
@@ -75,7 +76,7 @@ def test_hostile_texts_stay_texts():
     tags = [(tag, name) for tag, name, _ in hostile.attributes]
     assert tags == [(tag, name) for tag, name, _ in plain.attributes]
     assert hostile.texts["h1"] == [HOSTILE] and HOSTILE in hostile.texts["td"] and HOSTILE in hostile.texts["svg"][0]
-    assert hostile.texts["title"] == [HOSTILE]
+    assert hostile.texts["title"][:2] == [HOSTILE, f"{HOSTILE}: 3 at 1"]
 
 
 def test_page_needs_nothing_from_outside():
@@ -105,10 +106,14 @@ def test_backticks_become_code_after_escaping():
 def test_table_aligns_numbers_and_marks_uncertainty_and_bold():
     rows = [["recorded", "6.870 [6.5, 7.2]", 1400], ["both", "6.31 ± 0.02", None]]
     page = render_report(title="t", lead="", verdict="", sections=[Table("T", ["on", "px", "n"], rows, bold={(1, 1)})])
-    assert '<td class="number" data-sort="6.870">6.870<span class="uncertainty"> [6.5, 7.2]</span></td>' in page
-    assert '<td class="number bold" data-sort="6.31">6.31<span class="uncertainty"> ± 0.02</span></td>' in page
-    assert '<td class="number" data-sort="1400">1,400</td>' in page
-    assert '<td class="number">–</td>' in page and "<td>recorded</td>" in page
+    for cell in (
+        'class="number" data-sort="6.870" data-label="px">6.870<span class="uncertainty"> [6.5, 7.2]</span>',
+        'class="number bold" data-sort="6.31" data-label="px">6.31<span class="uncertainty"> ± 0.02</span>',
+        'class="number" data-sort="1400" data-label="n">1,400',
+        'class="number" data-label="n">–',
+    ):
+        assert f"<td {cell}</td>" in page
+    assert "<td>recorded</td>" in page
 
 
 @pytest.mark.parametrize(
@@ -159,21 +164,49 @@ def test_grid_in_the_page_is_one_png():
     assert base64.b64decode(pictures[0])[:8] == b"\x89PNG\r\n\x1a\n"
 
 
-def test_curves_take_the_colours_of_the_page():
-    svg = curves_svg({"a": ([1, 2, 3], [1.0, float("nan"), 2.0])}, "step, $x$", "loss < 1")
-    assert "currentColor" in svg and "#000000" not in svg and series_style(0)[0] in svg
+def chart(*arguments, **more) -> str:
+    """The `<svg>` element of a page with one chart."""
+    page = render_report(title="t", lead="", verdict="", sections=[Curves("C", *arguments, **more)])
+    return page[page.index("<svg") : page.index("</svg>")]
+
+
+def test_curves_are_drawn_where_their_values_are():
+    svg = chart({"a": ([0, 10, 20], [1.0, float("nan"), 3.0])}, "step, $x$", "loss < 1")
     assert "step, $x$" in svg and "loss &lt; 1" in svg
-    assert svg.startswith("<svg viewBox=") and "<style" not in svg and "metadata" not in svg
+    (line,) = re.findall(r'<polyline points="([^"]*)"', svg)
+    (x0, y0), (x1, y1) = [[float(number) for number in pair.split(",")] for pair in line.split()]
+    ticks = dict(re.findall(r'<text x="([\d.]+)" y="[^"]*" text-anchor="middle">(\d+)</text>', svg))
+    places = {float(label): float(place) for place, label in ticks.items()}
+    assert (places[0], places[20]) == pytest.approx((x0, x1), abs=0.06) and y0 > y1
+    assert re.findall("<title>(.*?)</title>", svg) == ["a: 1 at 0", "a: 3 at 20"]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "logarithmic", "expected"),
+    [
+        (0, 1, False, ["0", "0.2", "0.4", "0.6", "0.8", "1"]),
+        (-3, 37, False, ["0", "10", "20", "30"]),
+        (1, 60, True, ["1", "2", "5", "10", "20", "50"]),
+        (1e-6, 1e6, True, ["0.0001", "0.001"]),
+        (2.1, 4.9, True, ["2.5", "3", "3.5", "4", "4.5"]),
+        (7.0, 7.0, False, ["6.7", "6.8"]),
+    ],
+)
+def test_ticks_are_round_numbers(low, high, logarithmic, expected):
+    axis = Axis.around(np.array([low, high], float), 0, 100, logarithmic)
+    labels = [label for _, label in axis.ticks()]
+    assert set(expected) <= set(labels) and 2 <= len(labels) <= 14
+    for place, label in axis.ticks():
+        assert float(place) == pytest.approx(float(axis.place(float(label))), abs=0.06)
 
 
 def test_curves_leave_out_what_a_logarithm_cannot_show():
-    both = curves_svg({"a": ([1, 2, 3], [1.0, 5.0, 2.0])}, "x", "y", log_y=True)
-    assert curves_svg({"a": ([1, 1.5, 2, 2.5, 3], [1.0, 0.0, 5.0, -1.0, 2.0])}, "x", "y", log_y=True) == both
-    assert "mathdefault" not in both
+    both = chart({"a": ([1, 2, 3], [1.0, 5.0, 2.0])}, "x", "y", log_y=True)
+    assert chart({"a": ([1, 1.5, 2, 2.5, 3], [1.0, 0.0, 5.0, -1.0, 2.0])}, "x", "y", log_y=True) == both
 
 
 def test_many_series_differ_in_colour_or_line():
-    assert len({series_style(index) for index in range(24)}) == 24
+    assert len({series_class(index) for index in range(24)}) == 24
 
 
 def test_empty_sections_say_so():
@@ -262,8 +295,7 @@ def test_steps_are_pictures_or_words_with_arrows_where_one_leads_to_another():
 
 def test_intervals_of_points_are_bars_where_they_are_known():
     series = {"a": ([0, 1, 2], [0.0, 2.0, 4.0])}
-    nowhere, nan = (np.nan, np.nan, np.nan), np.nan
-    bare = curves_svg(series, "x", "y", spans={"a": (nowhere, nowhere)})
-    barred = curves_svg(series, "x", "y", spans={"a": ((nan, 1.5, 3.0), (nan, 2.5, 4.0))})
-    # Within the range of the points, so that axes and grid stay as they are.
-    assert barred.count("\nL ") == bare.count("\nL ") + 2
+    nan = np.nan
+    assert 'class="bar"' not in chart(series, "x", "y")
+    svg = chart(series, "x", "y", spans={"a": ((nan, 1.5, 3.0), (nan, 2.5, 4.0))})
+    assert svg.count('class="bar"') == 2 and "a: 2 [1.5, 2.5] at 1" in svg

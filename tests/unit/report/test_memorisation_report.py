@@ -38,9 +38,9 @@ def test_generators_go_down_and_scores_across_with_the_closest_pairs_of_the_firs
     table, grid = memorisation_sections(manifest([]), [manifest([])], found)
     assert isinstance(table, Table) and isinstance(grid, ImageGrid)
     assert table.columns == [
-        "frames", "close_share, small pictures", "duplicates, small pictures", "ratio, features",
+        "frames", "close copies, share: small pictures", "exact copies: small pictures", "ratio: features",
     ]  # fmt: skip
-    assert table.rows == [["synthetic", "0.020 [0.000, 0.050]", "1", ""], ["gan", "0.000 [0.000, 0.010]", "", "1.500"]]
+    assert table.rows == [["synthetic", "0.020 [0.000, 0.050]", "1", ""], ["GAN", "0.000 [0.000, 0.010]", "", "1.500"]]
     (_, generated), (_, training) = grid.rows
     np.testing.assert_array_equal(generated, FRAMES[[3, 3]])
     np.testing.assert_array_equal(training, FRAMES[[1, 2]])

@@ -20,9 +20,18 @@ def rows(**values: float) -> list[dict]:
 @pytest.mark.parametrize(
     ("difference", "expected"),
     [
-        (Difference(-0.5, -0.8, -0.2), "Adding synthetic data made it better: paired difference "),
-        (Difference(0.5, 0.2, 0.8), "Adding synthetic data made it worse: paired difference "),
-        (Difference(0.1, -0.2, 0.4), "Whether adding synthetic data helped is undecided: paired difference "),
+        (
+            Difference(-0.5, -0.8, -0.2),
+            "Adding synthetic frames to the recorded ones helped: 2D joint error (MPJPE) went from 6.000 to 5.500 px, ",
+        ),
+        (
+            Difference(0.5, 0.2, 0.8),
+            "Adding synthetic frames to the recorded ones did harm: 2D joint error (MPJPE) went from ",
+        ),
+        (
+            Difference(0.1, -0.2, 0.4),
+            "Whether adding synthetic frames to the recorded ones helped is undecided: 2D joint error (MPJPE)",
+        ),
         (Difference(0.1, float("nan"), float("nan")), "There are too few test recordings to say whether"),
     ],
 )
@@ -30,7 +39,7 @@ def test_it_is_the_sentence_that_says_whether_synthetic_data_helped(tmp_path, di
     scores = rows(**{"recorded": 6.0, "synthetic": 6.5, "recorded+synthetic": 5.5})
     words = verdict(scores, ["recorded", "synthetic", "recorded+synthetic"], difference)
     table = Table("Scores", ["a"], [["it helped, says the table"]])
-    text = render_markdown([table], title="demo", lead="Data: simulated. It helped nobody.", verdict=words)
+    text = render_markdown([table], title="demo", lead="Data: simulated. It helped nobody.", verdict=str(words))
     (tmp_path / "tables.md").write_text(text, encoding="utf-8")
     found = read_verdict(tmp_path)
     assert found.startswith(expected) and found.endswith(".") and "\n" not in found and "6.5" not in found
@@ -44,13 +53,13 @@ def test_of_a_study_it_is_the_sentence_of_each_group(tmp_path):
 
 def test_of_several_experiments_each_has_its_heading(tmp_path):
     words = "\n\n".join(
-        f"2D pose (`{name}`): mpjpe2d_px (lower is better): recorded 6, both 5.5. Adding synthetic data {what}. More."
-        for name, what in (("few_9", "made it better: paired difference -0.5"), ("few_12", "changed nothing"))
+        f"2D pose ({name}): Less is better. Adding synthetic frames to the recorded ones {what}. More."
+        for name, what in (("few 9", "helped: a difference of -0.5"), ("few 12", "changed nothing"))
     )
     (tmp_path / "tables.md").write_text(render_markdown([], title="few", lead="Data.", verdict=words))
     assert read_verdict(tmp_path).splitlines() == [
-        "2D pose (`few_9`): Adding synthetic data made it better: paired difference -0.5.",
-        "2D pose (`few_12`): Adding synthetic data changed nothing.",
+        "2D pose (few 9): Adding synthetic frames to the recorded ones helped: a difference of -0.5.",
+        "2D pose (few 12): Adding synthetic frames to the recorded ones changed nothing.",
     ]
 
 

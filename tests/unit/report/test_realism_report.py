@@ -38,10 +38,10 @@ def test_frames_come_first_with_both_sets_their_distance_and_the_floor():
     assert isinstance(frames, Table) and isinstance(values, Curves) and isinstance(events, Table)
     assert frames.columns == ["number", "recorded (6)", "synthetic (9)", "ratio", "distance", "floor: recorded, halves"]
     assert frames.rows == [
-        ["speckle_share", "0.25 [0.2, 0.3]", "0.05", "0.2", "0.2 [0.1, 0.3]", "0.02 [0, 0.04]"],
-        ["value_js_bits", "", "", "", "0.01", "0.02 [0, 0.04]"],
+        ["speckle, share", "0.25 [0.2, 0.3]", "0.05", "0.2", "0.2 [0.1, 0.3]", "0.02 [0, 0.04]"],
+        ["brightness, Jensen-Shannon divergence, bits", "", "", "", "0.01", "0.02 [0, 0.04]"],
     ]
-    assert events.rows == [["spread", "0.5", "0.75", "1.5", "0.25", "0.1"]]
+    assert events.rows == [["spread over the sensor", "0.5", "0.75", "1.5", "0.25", "0.1"]]
 
 
 def test_bold_is_what_lies_above_the_interval_of_the_floor():
@@ -72,8 +72,8 @@ def test_frames_of_baselines_have_tables_of_their_own_and_a_line_in_the_chart():
         for one in DISTRIBUTIONS
     ]
     _, values, of_gan, _ = realism_sections([*ROWS, *baseline], [*DISTRIBUTIONS, *more])
-    assert isinstance(of_gan, Table) and of_gan.title == "How real do the frames of gan look?"
-    assert isinstance(values, Curves) and list(values.series) == ["recorded", "synthetic", "gan"]
+    assert isinstance(of_gan, Table) and of_gan.title == "How real do the frames of GAN look?"
+    assert isinstance(values, Curves) and list(values.series) == ["recorded", "synthetic", "GAN"]
     assert values.series["recorded"] == ([26.0, 27.0], [0.75, 1.0])
 
 
@@ -91,7 +91,7 @@ def test_the_chart_adds_the_shares_up():
 def test_what_is_missing_is_left_out():
     assert realism_sections([], []) == []
     (only,) = realism_sections([row("events", "train", "spread", 0.5)], [])
-    assert isinstance(only, Table) and only.rows == [["spread", "0.5", "", "", "", ""]]
+    assert isinstance(only, Table) and only.rows == [["spread over the sensor", "0.5", "", "", "", ""]]
     page = render_report(title="t", lead="", verdict="", sections=realism_sections(ROWS, DISTRIBUTIONS))
     assert "How real do the synthetic frames look?" in page and "<svg" in page
 
@@ -117,7 +117,7 @@ def test_the_two_sample_tests_of_all_generators_stand_below_those_of_recorded_fr
         ["recorded training frames: halves", "0.500 [0.375, 0.625]", "0.012", "50 + 50", ""],
         ["recorded training from recorded test frames", "0.625", "0.012", "50 + 50", ""],
         ["synthetic from recorded training frames", "0.750 [0.625, 0.875]", "0.012", "50 + 50", ""],
-        ["gan from recorded test frames", None, None, "50 + 50", "fewer than 40 frames in a set"],
+        ["GAN from recorded test frames", None, None, "50 + 50", "fewer than 40 frames in a set"],
     ]
     assert set(table.bold) == {(2, 1)}
     page = render_report(title="t", lead="", verdict="", sections=[table])

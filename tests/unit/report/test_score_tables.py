@@ -11,6 +11,7 @@ from ctlev_core.report.sections.score_tables import (
     PairedScores,
     baseline_tables,
     cell_text,
+    frame_tables,
     group_tables,
     interval_over_trainings,
     score_tables,
@@ -49,8 +50,9 @@ def test_only_what_the_paired_interval_shows_is_bold():
     parts = [scored("recorded", 0, noise=0), scored("synthetic", -0.5), scored("recorded+synthetic", 0.01, noise=0.5)]
     parts += [scored("worse", 0.5)]
     (table, *_), _, _ = tables_of(*parts, training_sets=("recorded", "synthetic", "recorded+synthetic", "worse"))
-    assert table.columns[:4] == ["trained on", f"{METRIC} ↓", f"{METRIC}: minus recorded", "trainings"]
-    assert [cells[0] for cells in table.rows] == ["recorded", "synthetic", "recorded+synthetic", "worse"]
+    assert table.columns[:4] == ["trained on", "2D joint error (MPJPE), px ↓", "minus recorded", "trainings"]
+    assert getattr(table.columns[1], "code", "") == METRIC
+    assert [cells[0] for cells in table.rows] == ["recorded", "synthetic", "recorded + synthetic", "worse"]
     # Better: score and difference; undecided: neither; worse: the difference alone.
     assert set(table.bold) == {(1, 1), (1, 2), (3, 2)}
     assert table.rows[0][2] == "" and float(str(table.rows[1][2]).split()[0]) == pytest.approx(-0.5, abs=0.05)
@@ -64,7 +66,7 @@ def test_trainings_are_averaged_and_counted_and_unknown_settings_follow_the_know
         scored("thing+other", 0),
     ]
     (table, *_), _, rows = tables_of(*parts, training_sets=("recorded",))
-    assert [cells[0] for cells in table.rows] == ["recorded", "oracle", "thing+other"]
+    assert [cells[0] for cells in table.rows] == ["recorded", "more recorded", "thing + other"]
     assert [cells[3] for cells in table.rows] == [2, 1, 1]
     mean = np.mean([one["value"] for one in rows if one["subject"] == "recorded"])
     assert table.rows[0][1] == f"{mean:.3f}"
@@ -78,9 +80,10 @@ def test_labels_shuffled_labels_and_distances_have_tables_of_their_own():
         row("held-out recorded", 3.0, task="distance", metric="fd_event_x"),
         row("synthetic", 9.0, task="distance", metric="fd_event_x", low=8.0, high=10.0),
     ]
-    (headline, labels, distances), _, _ = tables_of(scored("recorded", 0), more=more)
+    (headline,), _, rows = tables_of(scored("recorded", 0), more=more)
+    labels, distances = frame_tables(rows)
     assert [cells[0] for cells in headline.rows] == ["recorded"]
-    names = ["held-out recorded (floor)", "label agreement of synthetic", "shuffled label agreement of synthetic"]
+    names = ["held-out recorded", "synthetic", "synthetic (shuffled labels)"]
     assert [cells[0] for cells in labels.rows] == names
     assert distances.rows[1][:2] == ["synthetic", "9.00 [8.00, 10.00]"]
 
@@ -92,10 +95,11 @@ def test_two_tasks_are_two_tables_and_classes_against_the_rest_a_third():
         row("recorded", 0.8, task="classifier", metric="binary_accuracy_mean"),
         row("recorded", 0.9, task="classifier", metric="binary_accuracy_bonsai"),
     ]
-    (_, classes, binary), _, _ = tables_of(scored("recorded", 0), more=more)
+    (_, classes, others, binary), _, _ = tables_of(scored("recorded", 0), more=more)
     assert classes.title == "classifier: Does synthetic data help?"
-    assert classes.columns[1:3] == ["accuracy ↑", "binary_accuracy_mean ↑"]
-    assert "`chance_accuracy`: 0.100" in classes.footnotes
+    assert (classes.columns[1], others.columns[1:]) == ("accuracy ↑", ["one-against-rest accuracy ↑"])
+    assert others.folded and not classes.folded
+    assert "accuracy by chance: 0.100" in others.footnotes
     assert binary.rows == [["bonsai", "0.900", 40]]
 
 
@@ -124,6 +128,15 @@ def test_groups_by_origin_and_by_class_are_apart():
     assert classes.columns == ["classes", "recorded", "new", "frames scored"]
     assert classes.rows == [["walk", "5.000", "5.000", 40]]
     assert group_tables([row("recorded", 5.0)], ["recorded"]) == ([], [])
+
+
+def test_many_training_sets_are_several_tables_each_beside_recorded_frames():
+    names = ["recorded", *(f"new{number}" for number in range(10))]
+    rows = [row(training_set, 5.0, group="walk") for training_set in names]
+    _, classes = group_tables([row("recorded", 5.0), *rows], names)
+    assert len(classes) == 2 and len({table.title for table in classes}) == 2
+    assert all(table.columns[1] == "recorded" and len(table.columns) <= 9 for table in classes)
+    assert [name for table in classes for name in table.columns[2:-1]] == names[1:]
 
 
 def test_subjects_have_a_table_of_their_own():
@@ -169,9 +182,10 @@ def test_the_verdict_says_how_much_of_the_oracles_gain_was_reached_and_whether_l
     rows += [row("label agreement of synthetic", 5.5), row("shuffled label agreement of synthetic", 15.0)]
     training_sets = ("recorded", "recorded+synthetic", "recorded+oracle")
     difference, gain = Difference(-0.6, -0.8, -0.4), Difference(-1.0, -1.2, -0.8)
-    text = verdict(rows, training_sets, difference, oracle=(gain, Difference(0.6, 0.45, 0.75)))
-    assert "Adding synthetic data made it better" in text and "9% of what recorded data alone gives" in text
-    assert "synthetic ones give 60% [45%, 75%] of that." in text
+    text = str(verdict(rows, training_sets, difference, oracle=(gain, Difference(0.6, 0.45, 0.75))))
+    assert "Adding synthetic frames to the recorded ones helped" in text
+    assert "from 7.000 to 6.400 px, a difference of -0.600 [-0.800, -0.400] (9 %)." in text
+    assert "synthetic ones give 60 [45, 75] % of that." in text
     assert "scores 5.500 on synthetic frames against their labels, and 15.00 on them with shuffled labels." in text
-    unsure = verdict(rows, training_sets, difference, oracle=(Difference(-0.1, -0.3, 0.1), None))
+    unsure = str(verdict(rows, training_sets, difference, oracle=(Difference(-0.1, -0.3, 0.1), None)))
     assert "change it by -0.100 [-0.300, +0.100]." in unsure and "of that" not in unsure

@@ -65,7 +65,7 @@ def test_every_setting_has_a_row_and_what_is_missing_is_told():
     ]
     table = realism_table(rows, lambda line: line.upper())
     assert table.rows == [
-        ["held-out recorded frames; c2st: their halves", None, "0.500 [0.400, 0.600]", "0.100", None],
+        ["held-out recorded frames; area: their halves", None, "0.500 [0.400, 0.600]", "0.100", None],
         ["REFERENCE", "250", "0.750 [0.625, 0.875]", "0.125", None],
         ["UNIPC", "5", None, None, None],
     ]

@@ -21,8 +21,8 @@ from ctlev_core.report.studies.speed_summary import SpeedSummary, write_speed_su
 from ctlev_core.report.studies.study import (
     Part,
     distances_table,
+    study_chapters,
     study_overview,
-    study_sections,
     study_tables,
     study_verdict,
     study_words,
@@ -92,10 +92,10 @@ def test_speed_against_error_is_a_section_with_a_link_to_its_page(reports, tmp_p
     pq.write_table(pa.table({"line": ["UniPC"]}), folder / "speed_vs_error.parquet")
     found, home = publish_study([*reports, folder], tmp_path), tmp_path / "reports"
     page = (home / "both.html").read_text()
-    texts = ["Quality of the frames</h2>", "Speed against error: 2D pose (<code>second</code>)</h2>"]
+    texts = ["Quality of the frames</h2>", "Speed against error: 2D pose (second)</h2>"]
     texts += ["Recommended: UniPC."]
     texts += ["Speed against error: distance</h2>", "Lower is better.", "<svg"] if charts else []
-    texts += ["Speed against error, every setting: 2D pose (<code>second</code>)</h2>"]
+    texts += ["Speed against error, every setting: 2D pose (second)</h2>"]
     texts += ["Another</h3>", "<svg", "Costs and errors</h3>"] if OTHER in charts else []
     texts += ["<td", 'href="both/speed_vs_error/']
     place = page.index("<section")  # behind the list of contents
@@ -116,13 +116,18 @@ def test_the_page_has_every_experiment_its_samples_the_papers_numbers_and_all_di
         "adding synthetic frames to recorded ones helped in 2 of 2: 2D pose",
         "both minus recorded",
     ]
-    texts += ["2D pose (<code>first</code>)</td>", "2D pose (<code>second</code>)</td>", "1. A label"]
+    texts += ["2D pose (first)</td>", "2D pose (second)</td>", "1. A label"]
     for part in PARTS:
-        heading = f"2D pose (<code>{part}</code>): "
-        texts += [f"{heading}Does synthetic data help?</h2>", f"{heading}asked for, and sampled</h2>"]
+        texts += [
+            f'<p class="chapter">2D pose ({part})</p>',
+            "Does synthetic data help?</h2>",
+            "Asked for, and sampled</h2>",
+        ]
         texts += ["Paper, Table 2: 2D pose on DHP19 and CDEHP</h2>"]
     texts += ["Quality of the frames</h2>", "Paper, Table 4", "The same in words</h2>"]
-    texts += [f"2D pose (<code>{part}</code>): mpjpe2d_px (mean distance" for part in PARTS]
+    texts += [
+        f"2D pose ({part}): Adding synthetic frames to the recorded ones helped: 2D joint error" for part in PARTS
+    ]
     texts += [f'href="both/{part}/report.html"' for part in PARTS]
     place = 0
     for text in texts:
@@ -148,8 +153,10 @@ def test_an_experiment_that_trains_on_nothing_synthetic_shows_samples_and_figure
     for training_sets in (["recorded"], list(TRAINING_SETS)):
         parts = [part(training_sets)]
         tables = study_tables(parts)
-        titles = [section.title for section in study_sections(parts, tables)]
-        assert {"2D pose (`first`): asked for, and sampled", "2D pose (`first`): by amount"} <= set(titles)
+        chapter, _ = study_chapters(parts, tables)
+        assert chapter.title == "2D pose (first)"
+        titles = [section.title for section in chapter.sections]
+        assert {"g", "By amount"} <= set(titles)
         told = training_sets != ["recorded"]
         assert bool(tables[0]) == told == any("Paper, Table 2" in title for title in titles)
         assert ("the verdict" in study_words(parts)) == told
@@ -188,16 +195,16 @@ def test_the_verdict_begins_with_what_helped_in_how_many_experiments():
     ]
     others = study_words(parts).split("\n\n")
     assert study_verdict(parts) == (
-        "By 95 % intervals, adding synthetic frames to recorded ones helped in 2 of 4: 2D pose (`a`), Object "
-        "recognition (`b`); it did harm in 1 of 4: Object recognition (`c`); it made no difference that can be told in "
-        "1 of 4: 3D body (`d`)."
+        "By 95 % intervals, adding synthetic frames to recorded ones helped in 2 of 4: 2D pose (a), Object "
+        "recognition (b); it did harm in 1 of 4: Object recognition (c); it made no difference that can be told in "
+        "1 of 4: 3D body (d)."
     )
-    assert len(others) == 6 and others[0] == "2D pose (`a`): told."
+    assert len(others) == 6 and others[0] == "2D pose (a): told."
     assert study_verdict(parts[3:]) == ""  # one alone needs no summing up
     table = study_overview([*parts, replace(parts[0], training_sets=["recorded"])])
     assert [row[:2] for row in table.rows[:2]] == [
-        ["2D pose (`a`)", "mpjpe2d_px ↓"],
-        ["Object recognition (`b`)", "accuracy ↑"],
+        ["2D pose (a)", "2D joint error (MPJPE), px ↓"],
+        ["Object recognition (b)", "accuracy ↑"],
     ]
     assert [row[2:] for row in table.rows[:2]] == [
         ["6.000", "", "", "-0.300 [-0.500, -0.100]"],
@@ -217,7 +224,7 @@ def test_distances_stand_beside_each_other_by_experiment(reports):
         rows += [
             {**row, "metric": f"{row['metric']}_infinity", "value": 0.0} for row in rows if row["task"] == "distance"
         ]
-        parts.append(type("Part", (), {"name": name, "rows": rows}))
+        parts.append(type("Part", (), {"name": name, "heading": name, "rows": rows}))
     table = distances_table(parts)
     assert table.columns == ["frames", "first ↓", "second ↓"]
     (row,) = table.rows

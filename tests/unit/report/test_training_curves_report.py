@@ -49,7 +49,7 @@ def test_lines_are_means_over_fine_tunings_by_steps_and_start():
     assert distances.series == {PRE_TRAINED: ([30, 300], [1, 0]), RANDOM: ([30, 300], [3, 2])}
     assert learnt.series == {PRE_TRAINED: ([30, 300], [5, 4]), RANDOM: ([30, 300], [7, 6])}
     assert len(base_model_figures([r for r in ROWS if "recorded" not in r["subject"]], OPTIONS, "error_px")) == 2
-    assert labels.log_x and (labels.y_label, distances.y_label) == ("error_px", "fd_event_x")
+    assert labels.log_x and (labels.y_label, distances.y_label) == ("error px", "Frechet distance")
 
 
 @pytest.mark.parametrize("missing", ["few", "random_30"])
