@@ -135,6 +135,7 @@ def report(
         verdict=words.headline,
         answer=words.answer,
         plain=plain_words(rows, words, len(frame_conditions), len(own), pictures.condition_in_words(kind)),
+        details=words.details,
         steps=steps,
         colours=colours,
         sections=[
