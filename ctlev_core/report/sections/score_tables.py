@@ -36,6 +36,8 @@ SUBJECTS = ("subject ", "subjects ")
 """Groups that begin so are one subject, or subjects by whether they were learnt from."""
 _FLOOR = "held-out recorded"
 _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
+_WIDEST = 7
+"""Training sets side by side that fit on a page."""
 _ENOUGH = 5
 """Trainings of a training set from which their spread is known well enough to say no more about it."""
 _SOURCES = {
@@ -136,10 +138,9 @@ def group_tables(rows: list[Row], training_sets: Sequence[str]) -> tuple[list[Ta
     caption = (
         "Held-out recorded frames by class. What synthetic frames add is seen in those that no training frame shows."
     )
-    origins = [_by_group(f"{metric}: where does it help?", by_origin, names, caption)] if by_origin else []
-    if by_subject:
-        origins.append(_by_group(f"{metric}: by subject", by_subject, names, first="subjects"))
-    classes = [_by_group(f"{metric}: class by class", by_class, names)] if by_class else []
+    origins = _by_group(f"{metric}: where does it help?", by_origin, names, caption)
+    origins += _by_group(f"{metric}: by subject", by_subject, names, first="subjects")
+    classes = _by_group(f"{metric}: class by class", by_class, names)
     return origins, classes
 
 
@@ -267,7 +268,7 @@ def _one_against_rest(rows: list[Row], training_sets: Sequence[str]) -> list[Tab
     binary = [row for row in rows if row["metric"].startswith(_ONE_CLASS) and not _is_mean(row["metric"])]
     rows = [{**row, "group": row["metric"].removeprefix(_ONE_CLASS)} for row in binary]
     caption = "Accuracy of telling a class from the others with as many negatives as positives; 0.5 is chance."
-    return [_by_group("One class against the others", rows, training_sets, caption)] if rows else []
+    return _by_group("One class against the others", rows, training_sets, caption)
 
 
 def _training(row: Row) -> tuple:
@@ -301,7 +302,19 @@ def _pivot(
 
 def _by_group(
     title: str, rows: list[Row], training_sets: Sequence[str], caption: str = "", first: str = "classes"
-) -> Table:
+) -> list[Table]:
+    """Groups down, training sets across; many of these in several tables, each with the first beside it."""
+    if not rows:
+        return []
+    if len(training_sets) > _WIDEST:
+        baseline, *others = training_sets
+        parts = [[baseline, *others[start : start + _WIDEST - 1]] for start in range(0, len(others), _WIDEST - 1)]
+        titles = [title, *(f"{title} ({number})" for number in range(2, len(parts) + 1))]
+        return [
+            table
+            for name, part in zip(titles, parts, strict=True)
+            for table in _by_group(name, rows, part, caption, first)
+        ]
     body: list[list[Cell]] = []
     for group in dict.fromkeys(row["group"] for row in rows):
         of_group = [row for row in rows if row["group"] == group]
@@ -309,7 +322,7 @@ def _by_group(
             cell_text([row for row in of_group if row["subject"] == training_set]) for training_set in training_sets
         ]
         body.append([group, *cells, of_group[0]["num_samples"]])
-    return Table(title, [first, *map(set_name, training_sets), "frames scored"], body, caption=caption)
+    return [Table(title, [first, *map(set_name, training_sets), "frames scored"], body, caption=caption)]
 
 
 def cell_text(rows: Sequence[Row]) -> str:

@@ -130,6 +130,15 @@ def test_groups_by_origin_and_by_class_are_apart():
     assert group_tables([row("recorded", 5.0)], ["recorded"]) == ([], [])
 
 
+def test_many_training_sets_are_several_tables_each_beside_recorded_frames():
+    names = ["recorded", *(f"new{number}" for number in range(10))]
+    rows = [row(training_set, 5.0, group="walk") for training_set in names]
+    _, classes = group_tables([row("recorded", 5.0), *rows], names)
+    assert len(classes) == 2 and len({table.title for table in classes}) == 2
+    assert all(table.columns[1] == "recorded" and len(table.columns) <= 9 for table in classes)
+    assert [name for table in classes for name in table.columns[2:-1]] == names[1:]
+
+
 def test_subjects_have_a_table_of_their_own():
     groups = ("walk", "subject 14", "subjects not learnt from")
     rows = [row(training_set, 5.0, group=group) for training_set in ("recorded", "new") for group in groups]
