@@ -206,7 +206,7 @@ def test_differences_in_options_data_code_and_scores_are_listed(store):
     assert scores.rows[0][4:] == ["-0.300 [-0.300, -0.300]", "paired"] and scores.bold == {(0, 4)}
     assert options.rows == [["`windows.count`", "5", "6", "frames"]]
     causes = {row[0]: row[-1] for row in data.rows}
-    assert causes["frames"] == "options" and causes["score / training_sets / checkpoint"].startswith("nothing:")
+    assert causes["frames"] == "options" and causes["score / training sets / checkpoint"].startswith("nothing:")
     assert code.rows == [["stage ingest", "1", "2"]]
 
 
