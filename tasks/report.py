@@ -57,7 +57,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=18, schema=tables.REPORT)
+@stage(version=19, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
