@@ -57,7 +57,7 @@ FEWEST_AMOUNTS = 3
 """Amounts of synthetic data that are worth a curve."""
 
 
-@stage(version=18, schema=tables.REPORT)
+@stage(version=19, schema=tables.REPORT)
 def report(
     out: Output,
     recordings: Manifest,
@@ -135,6 +135,7 @@ def report(
         verdict=words.headline,
         answer=words.answer,
         plain=plain_words(rows, words, len(frame_conditions), len(own), pictures.condition_in_words(kind)),
+        details=words.details,
         steps=steps,
         colours=colours,
         sections=[

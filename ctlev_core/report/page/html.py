@@ -219,6 +219,7 @@ def render_report(
     steps: Sequence[Step] = (),
     answer: Answer | None = None,
     plain: Sequence[tuple[str, str]] = (),
+    details: Sequence[str] = (),
     colours: Colours = (),
 ) -> str:
     """The page as text, to be written as UTF-8.
@@ -233,6 +234,7 @@ def render_report(
         steps: what was done, in pictures; below the verdict.
         answer: the verdict as a word and a drawn interval.
         plain: what was done and what it means, (heading, paragraph) each, for a reader who knows nothing of events.
+        details: further sentences on the numbers, closed until the reader opens them.
         colours: legend of the pictures of `steps`.
     Returns:
         One HTML document. Equal arguments give equal text.
@@ -249,7 +251,8 @@ def render_report(
             chapters.append(Chapter("", [section]))
     given = {
         "title": title, "lead": lead, "verdict": verdict, "overview": overview, "footer": footer, "steps": steps,
-        "answer": answer, "plain": plain, "colours": colours, "chapters": chapters, "facts": Markup(FACTS),
+        "answer": answer, "plain": plain, "details": details, "colours": colours,
+        "chapters": chapters, "facts": Markup(FACTS),
     }  # fmt: skip
     return _templates().get_template("page.html.j2").render(given)
 

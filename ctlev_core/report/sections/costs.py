@@ -39,4 +39,6 @@ def _seconds(value: float) -> float:
 
 def versions_table(records: Sequence[Record]) -> Table:
     """Versions of stages, plug-ins, software and machine."""
-    return Table("Versions", ["what", "version"], [list(item) for item in versions_of(records).items()])
+    return Table(
+        "Versions", ["what", "version"], [[f"`{name}`", version] for name, version in versions_of(records).items()]
+    )

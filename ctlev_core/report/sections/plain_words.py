@@ -55,8 +55,6 @@ def plain_words(
     answer = verdict.answer
     if answer is not None:
         parts += [("How sure is that?", _certainty(answer.low, answer.tone)), ("What it means", _MEANINGS[answer.tone])]
-    if verdict.details:
-        parts.append(("More on the numbers", "\n\n".join(verdict.details)))
     return parts
 
 

@@ -224,7 +224,7 @@ def _score_table(groups: Sequence[Group]) -> Table:
         )
     sense = "lower" if lower_is_better(metric) else "higher"
     caption = (
-        f"{metric_name(metric)} on test recordings that nothing was trained on; {sense} is better. "
+        f"Scores in {metric_name(metric)}, on test recordings that nothing was trained on; {sense} is better. "
         f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: "
         "better than recorded frames alone, by a difference whose interval excludes 0."
     )

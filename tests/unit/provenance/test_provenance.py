@@ -18,7 +18,8 @@ from ctlev_core.provenance.records import (
     write_provenance,
 )
 from ctlev_core.provenance.scores import SCORE_LINEAGE, paired_samples, trace_lineage
-from ctlev_core.report.sections.costs import cost_table, options_table, versions_table
+from ctlev_core.report.sections.costs import cost_table, versions_table
+from ctlev_core.report.sections.lineage import record_tables
 from ctlev_core.report.studies.run_comparison import Run, compare_runs, find_run, read_run
 from data_contracts import tables
 from data_contracts.errors import DataError
@@ -128,11 +129,11 @@ def test_an_option_that_is_null_in_one_of_two_runs_of_a_stage_is_traced(store):
 def test_costs_are_added_up_by_stage_the_dearest_first(store):
     found = records_of(store)
     table = cost_table(found)
-    assert table.rows[0] == ["encode", 1, 3.0, "38%", 1.5, 3.0, 100]
+    assert table.rows[0] == ["Recorded event frames", 1, 3.0, "38%", 1.5, 3.0, 100]
     assert sum(row[1] for row in table.rows) == len(found)  # type: ignore[misc]
     assert "6 stages took 8 s and 4 CPU seconds" in table.caption
-    assert [row[0] for row in options_table(found).rows][:1] == ["frames"]
-    assert ["stage encode", "1"] in versions_table(found).rows
+    assert "frames" in [row[0] for table in record_tables(found) for row in table.rows]
+    assert ["`stage encode`", "1"] in versions_table(found).rows
 
 
 def score_rows(value, subject="recorded", samples=30):
@@ -203,9 +204,9 @@ def test_differences_in_options_data_code_and_scores_are_listed(store):
     first = run_of(store, "a", 5.0)
     scores, options, data, code = compare_runs(first, run_of(store, "b", 5.0, shift=-0.3, **changed))
     assert scores.rows[0][4:] == ["-0.300 [-0.300, -0.300]", "paired"] and scores.bold == {(0, 4)}
-    assert options.rows == [["windows.count", "5", "6", "frames"]]
+    assert options.rows == [["`windows.count`", "5", "6", "frames"]]
     causes = {row[0]: row[-1] for row in data.rows}
-    assert causes["frames"] == "options" and causes["score / training_sets / checkpoint"].startswith("nothing:")
+    assert causes["frames"] == "options" and causes["score / training sets / checkpoint"].startswith("nothing:")
     assert code.rows == [["stage ingest", "1", "2"]]
 
 
