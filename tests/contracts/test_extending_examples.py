@@ -173,9 +173,9 @@ def test_a_new_metric_says_itself_what_its_scores_are():
     values = {"recorded": 6.0, "recorded+synthetic": 5.0}
     about = {"metric": "worst_joint_px", "group": "all"}
     rows = [{"subject": name, "value": value, **about} for name, value in values.items()]
-    told = verdict.verdict(rows, list(values), Difference(-1.0, -1.5, -0.5))
-    assert "mean error of a frame's worst joint, in pixels; lower is better" in told
-    assert "better: paired difference -1.000" in told
+    told = str(verdict.verdict(rows, list(values), Difference(-1.0, -1.5, -0.5)))
+    assert "mean error of a frame's worst joint, in pixels. Less is better." in told
+    assert "helped: worst joint px went from 6.000 to 5.000, a difference of -1.000 [-1.500, -0.500]" in told
     better = verdict.made_better(Difference(-1.0, -1.5, -0.5), "worst_joint_px")
     assert better and not verdict.made_better(Difference(1.0, 0.5, 1.5), "worst_joint_px")
 

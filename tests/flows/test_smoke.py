@@ -45,7 +45,7 @@ def test_smoke_ends_in_a_report(smoke_home):
     assert "http://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", text) and "<script src" not in text
     output = (smoke_home / "first_run.txt").read_text()
     verdict, where, *_, last = output.splitlines()
-    assert "synthetic data helped" in verdict and f"reports/{report.name}" in where
+    assert "adding synthetic frames to the recorded ones helped" in verdict and f"reports/{report.name}" in where
     assert re.fullmatch(r"(\d+) stages, 0 of them cached, in .+", last)
 
 
