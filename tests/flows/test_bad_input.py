@@ -148,6 +148,6 @@ def test_what_was_computed_stays(smoke_home, tmp_path):
     before = digests(home)
     refused(home, "--set", "generator.options.batch_size=0", preset="smoke")
     line, _ = refused(home, "--set", "encoding.options.image_size=[48,48]", preset="smoke", run=run_script_here)
-    assert "the size this base model was trained on" in line
+    assert "this base model makes images of 64 x 64 px, event images are 48 x 48 px" in line
     assert before.items() <= digests(home).items()
     assert not list((home / "tmp").iterdir())

@@ -70,7 +70,7 @@ def test_the_nearest_seen_classes_are_those_of_the_generators_own_text_encoder(m
         a, b = vectors[row["unseen"]].astype(float), vectors[row["seen"]].astype(float)
         assert row["similarity"] == pytest.approx(a @ b / (a @ a) ** 0.5 / (b @ b) ** 0.5, abs=1e-6)
     page = (home / "reports" / "n_imagenet.html").read_text()
-    assert "Nearest seen classes" in page and "the generator&#x27;s, train" in page
+    assert "Nearest seen classes" in page and "the generator&#39;s, train" in page
 
 
 def test_the_tested_dataset_is_the_target():
