@@ -45,7 +45,7 @@ def test_all_combinations_are_experiments_of_one_study():
     [
         ("data_notice=one, two", "one, two"),
         ("condition.options.prompt=a hand, moving", "a hand, moving"),
-        ("encoding.options.image_size=[32, 32]", [32, 32]),
+        ("encoding.options.image_size=[64, 64]", [64, 64]),
     ],
 )
 def test_text_and_lists_keep_their_commas(option, value):

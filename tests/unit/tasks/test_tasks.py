@@ -104,48 +104,70 @@ SETTINGS = ("recorded", "synthetic", "recorded+synthetic")
 ROWS = [row("recorded", 7.0), row("recorded", 7.2), row("synthetic", 8.0), row("recorded+synthetic", 6.3)]
 
 
+def told(*arguments, **settings):
+    """The verdict as one paragraph."""
+    return str(verdict(*arguments, **settings))
+
+
 def test_verdict_averages_seeds_and_says_which_way_is_better():
-    text = verdict(ROWS, SETTINGS)
-    assert "recorded 7.100, synthetic 8.000, recorded+synthetic 6.300." in text and "lower is better" in text
+    text = told(ROWS, SETTINGS)
+    assert "recorded 7.100, synthetic 8.000, recorded + synthetic 6.300." in text and "Less is better." in text
 
 
 @pytest.mark.parametrize(
     ("metric", "difference", "expected"),
     [
-        ("mpjpe2d_px", Difference(-0.8, -1.0, -0.6), "better: paired difference -0.800 [-1.000, -0.600]"),
-        ("mpjpe2d_px", Difference(0.8, 0.6, 1.0), "worse: paired difference +0.800"),
-        ("accuracy", Difference(0.8, 0.6, 1.0), "better: paired difference +0.800"),
-        ("mpjpe2d_px", Difference(-0.8, -1.7, 0.1), "undecided: paired difference -0.800 [-1.700, +0.100]"),
-        ("mpjpe2d_px", Difference(0.0, 0.0, 0.0), "Adding synthetic data changed nothing."),
+        (
+            "mpjpe2d_px",
+            Difference(-0.8, -1.0, -0.6),
+            "recorded ones helped: 2D joint error (MPJPE) went from 7.100 to 6.300 px, a difference of -0.800 [-1.000, -0.600]",
+        ),
+        (
+            "mpjpe2d_px",
+            Difference(0.8, 0.6, 1.0),
+            "recorded ones did harm: 2D joint error (MPJPE) went from 7.100 to 6.300 px, a difference of +0.800",
+        ),
+        (
+            "accuracy",
+            Difference(0.8, 0.6, 1.0),
+            "recorded ones helped: accuracy went from 7.100 to 6.300, a difference of +0.800",
+        ),
+        (
+            "mpjpe2d_px",
+            Difference(-0.8, -1.7, 0.1),
+            "is undecided: 2D joint error (MPJPE) went from 7.100 to 6.300 px, a difference of -0.800 [-1.700, +0.100]",
+        ),
+        (
+            "mpjpe2d_px",
+            Difference(0.0, 0.0, 0.0),
+            "Adding synthetic frames to the recorded ones changed nothing: 2D joint error (MPJPE) is 6.300 px.",
+        ),
         ("mpjpe2d_px", Difference(-0.8, float("nan"), float("nan")), "too few test recordings to say"),
     ],
 )
 def test_verdict_claims_only_what_the_interval_of_the_difference_shows(metric, difference, expected):
     rows = [{**one, "metric": metric} for one in ROWS]
-    assert expected in verdict(rows, SETTINGS, difference)
+    assert expected in told(rows, SETTINGS, difference)
 
 
 def test_verdict_sets_each_baseline_beside_in_a_sentence_of_its_own():
     rows = [*ROWS, row("gan", 9.0), row("recorded+gan", 6.9), row("esim", 9.5), row("recorded+esim", 6.2)]
     settings = (*SETTINGS, "gan", "esim", "recorded+gan", "recorded+esim")
     beside = {"gan": Difference(-0.6, -0.8, -0.4), "esim": Difference(0.1, -0.1, 0.3)}
-    text = verdict(rows, settings, Difference(-0.8, -1.0, -0.6), beside)
-    assert "synthetic 8.000, recorded+synthetic 6.300. Adding" in text and "gan 9.000" not in text
-    assert "recorded+gan is 6.900; its own are better: -0.600 [-0.800, -0.400]." in text
-    assert "recorded+esim is 6.200; which is better is undecided: +0.100 [-0.100, +0.300]." in text
+    text = told(rows, settings, Difference(-0.8, -1.0, -0.6), beside)
+    assert "went from 7.100 to 6.300 px, a difference of -0.800 [-1.000, -0.600]" in text and "9.000" not in text
+    assert "the score is 6.900; " in text and "-0.600 [-0.800, -0.400]." in text
+    assert "the score is 6.200; which is better is undecided: +0.100 [-0.100, +0.300]." in text
 
 
 def test_without_both_together_synthetic_data_is_told_beside_real_data():
     rows = [{**one, "metric": "accuracy"} for one in ROWS if one["subject"] != "recorded+synthetic"]
-    text = verdict(rows, SETTINGS, instead=Difference(0.5, 0.25, 0.75))
-    assert (
-        "Training on synthetic data instead of recorded data made it better: paired difference +0.500 [+0.250" in text
-    )
-    unsure = verdict(rows, SETTINGS, instead=Difference(0.5, -0.25, 1.25))
-    assert (
-        "Whether training on synthetic data instead of recorded data helped is undecided: paired difference" in unsure
-    )
-    assert "instead" not in verdict(ROWS, SETTINGS, Difference(-0.8, -1.0, -0.6), instead=Difference(0.5, 0.25, 0.75))
+    text = told(rows, SETTINGS, instead=Difference(0.5, 0.25, 0.75))
+    assert "Training on synthetic frames instead of recorded ones helped: accuracy went from 7.100 to 8.000, a" in text
+    assert "difference of +0.500 [+0.250" in text
+    unsure = told(rows, SETTINGS, instead=Difference(0.5, -0.25, 1.25))
+    assert "Whether training on synthetic frames instead of recorded ones helped is undecided: accuracy went" in unsure
+    assert "instead" not in told(ROWS, SETTINGS, Difference(-0.8, -1.0, -0.6), instead=Difference(0.5, 0.25, 0.75))
 
 
 def test_directions():
@@ -154,7 +176,7 @@ def test_directions():
 
 
 def test_verdict_without_scores_says_so():
-    assert verdict([], SETTINGS) == "No downstream model was scored."
+    assert told([], SETTINGS) == "No downstream model was scored."
 
 
 @pytest.mark.parametrize(("module", "score"), [(mpjpe2d, "mpjpe2d_px"), (oks, "oks_mean"), (pck2d, "pck_torso0.2")])
