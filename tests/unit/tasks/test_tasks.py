@@ -120,7 +120,7 @@ def test_verdict_averages_seeds_and_says_which_way_is_better():
         (
             "mpjpe2d_px",
             Difference(-0.8, -1.0, -0.6),
-            "recorded ones helped: 2D joint error (MPJPE) went from 7.100 to 6.300 px, a difference of -0.800 [-1.000, -0.600]",
+            "helped: 2D joint error (MPJPE) went from 7.100 to 6.300 px, a difference of -0.800 [-1.000, -0.600]",
         ),
         (
             "mpjpe2d_px",
