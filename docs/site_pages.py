@@ -6,10 +6,8 @@
 from __future__ import annotations
 
 import re
-import types
 import typing
 from collections.abc import Iterable, Iterator
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,9 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
+
+from flows.option_list import OF_KIND, type_text
+from flows.preset_list import PRESETS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES_OF_FILES = {
@@ -26,15 +27,6 @@ PAGES_OF_FILES = {
     "benchmarks/RESULTS.md": "benchmarks.md",
     "CITATION.cff": "CITATION.cff",
 }
-KINDS = {
-    "datasets": "dataset",
-    "encodings": "encoding",
-    "conditions": "condition",
-    "generators": "generator",
-    "downstream": "downstream",
-    "metrics": "metrics",
-}
-"""Folders of plug-ins with options, and where a preset names them."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -44,7 +36,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, name, content=with_links_of_the_site(text, source)))
     files.append(File.generated(config, "reference/preset_files.md", content=preset_files()))
     files.append(File.generated(config, "reference/options_experiments.md", content=experiment_options()))
-    for kind in KINDS:
+    for kind in OF_KIND:
         files.append(File.generated(config, f"reference/options_{kind}.md", content=plugin_options(kind)))
     return files
 
@@ -63,8 +55,6 @@ def with_links_of_the_site(text: str, source: str) -> str:
 
 def preset_files() -> str:
     """Every bundled preset as it stands."""
-    from flows.command_line import PRESETS
-
     lines = [
         "# Preset files",
         "",
@@ -115,7 +105,7 @@ def plugin_options(kind: str) -> str:
     """Options of every plug-in of a kind."""
     from ctlev_core import plugins
 
-    where = KINDS[kind]
+    where = OF_KIND[kind]
     text = [f"# Options of {kind}", "", f"Set with `--set {where}.options.NAME=VALUE`, or in a preset.", ""]
     if kind == "metrics":
         text[2] = "Set in a preset: `metrics: [{name: oks, options: {...}}]`."
@@ -142,7 +132,8 @@ def option_tables(model: type[BaseModel], without: Iterable[str] = (), skip: tup
         extra = field.json_schema_extra
         run_setting = " *Run setting.*" if isinstance(extra, dict) and extra.get("run_setting") else ""
         shown = _default(field)
-        yield f"| `{name}` | {_type(field.annotation)} | {shown} | {_plain(field.description or '')}{run_setting} |"
+        kind, meaning = _plain(type_text(field.annotation, field.metadata)), _plain(field.description or "")
+        yield f"| `{name}` | {kind} | {shown} | {meaning}{run_setting} |"
     for found, name in inner.items():
         yield ""
         yield f"`{name}`, {_plain(str(found.__doc__).strip().splitlines()[0])}"
@@ -162,29 +153,6 @@ def _default(field: Any) -> str:
         return "none"
     text = str(value).lower() if isinstance(value, bool) else str(list(value) if isinstance(value, tuple) else value)
     return f"`{_cell(text)}`" if text else "empty"
-
-
-def _type(annotation: Any) -> str:
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin is typing.Literal:
-        return " or ".join(f"`{value}`" for value in arguments)
-    if origin is typing.Annotated:
-        return _type(arguments[0])
-    if origin in (types.UnionType, typing.Union):
-        return " or ".join(_type(one) for one in arguments)
-    if annotation is type(None):
-        return "none"
-    if origin in (tuple, list):
-        kinds = list(dict.fromkeys(_type(one) for one in arguments if one is not Ellipsis))
-        count = f"{len(arguments)} of " if Ellipsis not in arguments and origin is tuple and arguments else "list of "
-        return count + ", ".join(kinds)
-    if origin is dict:
-        return f"mapping of {_type(arguments[1])}"
-    if isinstance(annotation, type) and issubclass(annotation, Enum):
-        return " or ".join(f"`{one.value}`" for one in annotation)
-    names = {"str": "text", "int": "integer", "float": "number", "bool": "true or false", "Path": "path", "Any": "any"}
-    name = getattr(annotation, "__name__", str(annotation))
-    return names.get(name, "plug-in" if name.endswith("Choice") else "options")
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
