@@ -52,14 +52,15 @@ def test_every_batch_of_a_step_is_one_processs(count, share):
     assert {len(each) for each in shares} == {share}
 
 
-def assert_alike(one, two):
+def assert_alike(one, two, has_gradient=True):
     """Sums in another order: rounding, 1e-7 of weights of about 1.
 
     Adam divides by the gradient's size, so that where it is nothing but rounding a single weight goes elsewhere, by
-    less than a step.
+    less than a step. The key bias of an attention is such a weight throughout: softmax takes any constant away.
     """
     difference = (one - two).abs()
-    assert difference.mean() < 1e-6 and difference.max() < OPTIONS.learning_rate / 10
+    assert difference.max() < OPTIONS.learning_rate / 10
+    assert not has_gradient or difference.mean() < 1e-7
 
 
 def assert_same_run(one, two, start):
@@ -68,7 +69,7 @@ def assert_same_run(one, two, start):
     for name in ("unet", "controlnet"):
         states = [getattr(base_model, name).state_dict() for base_model in base_models]
         for key, value in states[0].items():
-            assert_alike(value, states[1][key])
+            assert_alike(value, states[1][key], has_gradient=not key.endswith("k_proj.bias"))
         assert max((states[0][key] - states[2][key]).abs().max().item() for key in states[0]) > 1e-3
 
 
@@ -95,10 +96,11 @@ def test_two_processes_end_in_the_weights_of_one(tmp_path, base_model_folder, sh
     )
     # The state is that of the run, not of its processes: one alone takes it up, and finds it finished.
     states = [torch.load(tmp_path / name / "work" / "state.pt", weights_only=True) for name in ("alone", "together")]
+    moments_of = states[0]["optimizer"]["state"]
     for name in ("parameters", "average", "best"):
-        for one, two in zip(states[0][name], states[1][name], strict=True):
-            assert_alike(one, two)
-    for index, moments in states[0]["optimizer"]["state"].items():
+        for index, (one, two) in enumerate(zip(states[0][name], states[1][name], strict=True)):
+            assert_alike(one, two, has_gradient=moments_of[index]["exp_avg_sq"].sqrt().max() > 1e-10)
+    for index, moments in moments_of.items():
         for name, value in moments.items():
             assert_alike(value, states[1]["optimizer"]["state"][index][name])
     again = trained(tmp_path / "together", base_model_folder, OPTIONS)
