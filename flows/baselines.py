@@ -18,11 +18,12 @@ from flows.prepare_dataset import (
     condition_training_frames,
     prepare_dataset,
 )
+from flows.sampling import sample_generator
 from flows.settings import flow
 from flows.train_generator import base_model_of
 from tasks.finetune import finetune
 from tasks.ingest import ingest
-from tasks.sample import sample, simulate
+from tasks.sample import simulate
 from tasks.stage import call_flow, call_together, numbered
 
 
@@ -67,14 +68,14 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
     learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition)
     base_model = base_model_of(experiment, baseline.generator)
     checkpoint = finetune(dataset.frames, learnt, base_model, generator=baseline.generator, seed=seed, label=label)
-    synthetic = sample(
+    synthetic = sample_generator(
+        experiment,
         checkpoint,
         dataset.frames,
+        learnt,
         asked,
         sampling=baseline.sampling_choice,
-        max_attempts=experiment.max_attempts,
-        rounding=experiment.rounding,
-        seed=seed,
+        number=number,
         label=label,
     )
     return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)

@@ -23,6 +23,7 @@ from data_contracts.training_sets import RECORDED, SYNTHETIC, LabelAgreement
 from flows.cli import script
 from flows.command_line import Command, load_experiment
 from flows.prepare_dataset import PreparedDataset, condition_asked_samples, prepare_dataset
+from flows.sampling import sample_generator
 from flows.settings import flow
 from flows.train_generator import train_generator
 from tasks.downstream import train_downstream
@@ -30,7 +31,6 @@ from tasks.evaluate import score_model
 from tasks.memorisation import memorisation
 from tasks.publish import claimed, next_number
 from tasks.realism import realism
-from tasks.sample import sample
 from tasks.score_version import score_beside_real
 from tasks.stage import call_flow, call_together
 from tasks.store import home_folder
@@ -89,13 +89,13 @@ def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: Mani
             dataset.frames,
             regeneration.condition,
         )
-    synthetic = sample(
+    synthetic = sample_generator(
+        regeneration,
         checkpoint,
         dataset.frames,
+        dataset.frame_conditions,
         conditions,
         sampling=regeneration.sampling_choice,
-        max_attempts=regeneration.max_attempts,
-        rounding=regeneration.rounding,
         seed=seed,
         label=regeneration.generator.name,
     )

@@ -15,11 +15,11 @@ from data_contracts.synthesis import Synthesis
 from flows.cli import script
 from flows.command_line import Command, load_experiment
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
+from flows.sampling import sample_generator
 from flows.settings import flow
 from flows.train_generator import train_generator
 from tasks.export_events import export_events
 from tasks.export_images import check_export_folder, export_images
-from tasks.sample import sample
 from tasks.stage import call_flow, numbered
 
 
@@ -38,14 +38,14 @@ def synthesize(
         dataset = call_flow(prepare_dataset, experiment)
     if checkpoint is None:
         checkpoint = call_flow(train_generator, experiment, dataset, number)
-    synthetic = sample(
+    synthetic = sample_generator(
+        experiment,
         checkpoint,
         dataset.frames,
+        dataset.frame_conditions,
         dataset.sample_conditions,
         sampling=experiment.sampling_choice,
-        max_attempts=experiment.max_attempts,
-        rounding=experiment.rounding,
-        seed=experiment.seed + number,
+        number=number,
         label=numbered(experiment.generator.name, number),
     )
     if isinstance(experiment, Synthesis) and experiment.export_folder is not None:

@@ -1,0 +1,109 @@
+"""Sample frames of a trained generator as an experiment asks: as they come, or with whole event counts."""
+
+from __future__ import annotations
+
+from ctlev_core import plugins
+from ctlev_core.count_decoder.options import CountDecoderOptions
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.plugins import PluginError, validate_options
+from data_contracts.config import SamplingChoice
+from data_contracts.experiment import Experiment
+from data_contracts.manifest import ManifestRef
+from tasks.count_decoder import decode_counts, train_count_decoder
+from tasks.sample import sample
+
+_OF_THE_SOLVER = ("scheduler", "num_inference_steps", "timestep_spacing", "noise")
+"""Sampling options that only whole sampling depends on."""
+
+
+def sample_generator(
+    experiment: Experiment,
+    checkpoint: ManifestRef,
+    frames: ManifestRef,
+    learnt: ManifestRef,
+    asked: ManifestRef,
+    *,
+    sampling: SamplingChoice,
+    number: int = 0,
+    seed: int | None = None,
+    label: str,
+) -> ManifestRef:
+    """Sampled frames, with whole event counts where the experiment asks for them.
+
+    Args:
+        experiment: what is asked for.
+        checkpoint: the trained generator.
+        frames: recorded ones.
+        learnt: conditions of the training frames.
+        asked: conditions to sample from.
+        sampling: the generator's sampling options.
+        number: of the generator, of several.
+        seed: of the noise; None = that of the experiment and of the generator's number.
+        label: of the stages.
+    """
+    decoder = train_decoder(experiment, checkpoint, frames, learnt, sampling=sampling, number=number, label=label)
+    made = sample(
+        checkpoint,
+        frames,
+        asked,
+        sampling=sampling if decoder is None else smooth(sampling),
+        max_attempts=experiment.max_attempts,
+        rounding=experiment.rounding if decoder is None else None,
+        seed=experiment.seed + number if seed is None else seed,
+        label=label,
+    )
+    if decoder is None:
+        return made
+    options = decoder_options(experiment)
+    return decode_counts(decoder, made, asked, encoding=experiment.encoding, options=options, label=label)
+
+
+def train_decoder(
+    experiment: Experiment,
+    checkpoint: ManifestRef,
+    frames: ManifestRef,
+    learnt: ManifestRef,
+    *,
+    sampling: SamplingChoice,
+    number: int = 0,
+    label: str,
+) -> ManifestRef | None:
+    """The count decoder of a generator; None where the experiment asks for none, or it is no diffusion model."""
+    if experiment.count_decoder is None or not isinstance(plugins.load_options(sampling).options, SamplingOptions):
+        return None
+    return train_count_decoder(
+        checkpoint,
+        frames,
+        learnt,
+        sampling=without_solver(smooth(sampling)),
+        decoder=decoder_options(experiment).of_training,
+        seed=experiment.seed + number,
+        label=label,
+    )
+
+
+def decoder_options(experiment: Experiment) -> CountDecoderOptions:
+    """The options of the experiment's count decoder, checked.
+
+    Raises:
+        PluginError: an option is unknown or wrong.
+    """
+    return validate_options(CountDecoderOptions, experiment.count_decoder or {}, "count_decoder")
+
+
+def smooth(sampling: SamplingChoice) -> SamplingChoice:
+    """The same, but faint values stay as the network expects them: the decoder decides where there is no event.
+
+    Raises:
+        PluginError: values are to be drawn in two ways.
+    """
+    values = sampling.options.get("values", "expected")
+    if values != "expected":
+        raise PluginError(f"count_decoder draws the values itself: leave out sampling.values, got {values!r}")
+    return sampling.model_copy(update={"options": sampling.options | {"black_threshold": 0}})
+
+
+def without_solver(sampling: SamplingChoice) -> SamplingChoice:
+    """The same without the options that only whole sampling depends on."""
+    options = {name: value for name, value in sampling.options.items() if name not in _OF_THE_SOLVER}
+    return sampling.model_copy(update={"options": options})
