@@ -17,6 +17,7 @@ from data_contracts.realism_chain import Link, RealismChain
 from flows.cli import script
 from flows.command_line import Command, load_experiment
 from flows.prepare_dataset import prepare_dataset
+from flows.sampling import decoder_options, smooth, train_decoder, without_solver
 from flows.settings import flow
 from flows.train_generator import train_generator
 from tasks.chain_report import chain_report, publish_chain_report
@@ -24,9 +25,6 @@ from tasks.condition import condition_some_frames
 from tasks.realism_chain import chain_frames, chain_realism
 from tasks.stage import call_flow
 from tasks.store import home_folder
-
-_OF_THE_SOLVER = ("scheduler", "num_inference_steps", "timestep_spacing", "noise")
-"""Sampling options that only whole sampling depends on."""
 
 
 def load_realism_chain(preset: str, overrides: list[str]) -> RealismChain:
@@ -62,12 +60,10 @@ def _num_timesteps(asked: RealismChain) -> int:
 
 def sampling_of(asked: RealismChain, link: Link) -> SamplingChoice:
     """The sampling options that a link depends on: whole sampling has its own number of steps, the rest no solver."""
-    choice = asked.sampling_choice
+    choice = asked.sampling_choice if asked.count_decoder is None else smooth(asked.sampling_choice)
     if link.kind == "sampled":
-        options = choice.options | {"num_inference_steps": link.amount}
-    else:
-        options = {name: value for name, value in choice.options.items() if name not in _OF_THE_SOLVER}
-    return choice.model_copy(update={"options": options})
+        return choice.model_copy(update={"options": choice.options | {"num_inference_steps": link.amount}})
+    return without_solver(choice)
 
 
 @flow(name="realism-chain")
@@ -88,14 +84,25 @@ def realism_chain(asked: RealismChain) -> ManifestRef:
         label=f"{asked.condition.name}, recorded frames of split {options.split}",
     )
     checkpoint = call_flow(train_generator, asked, dataset)
+    decoder = train_decoder(
+        asked,
+        checkpoint,
+        dataset.frames,
+        dataset.frame_conditions,
+        sampling=asked.sampling_choice,
+        label=asked.generator.name,
+    )
+    rounds = asked.rounding if decoder is None else asked.encoding
     processed = [
         chain_frames(
             checkpoint,
             dataset.frames,
             conditions,
+            decoder,
             sampling=sampling_of(asked, link),
             link=link,
-            rounding=None if link.kind in ("autoencoder", "values") else asked.rounding,
+            rounding=None if link.kind in ("autoencoder", "values") else rounds,
+            decoding=None if decoder is None else decoder_options(asked),
             seed=options.seed,
             label=f"{link.kind} {link.amount}" if link.amount else link.kind,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.count_decoder.options import CountDecoderOptions
+from ctlev_core.count_decoder.options import DECODER_FOLDER, CountDecoderOptions
 from ctlev_core.events.image_grid import check_whole_counts
 from ctlev_core.events.windows import spread
 from ctlev_core.progress import ProgressBar
@@ -13,8 +13,6 @@ from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice
 from data_contracts.manifest import Manifest, conditions_of, history_table, matching_rows
 from tasks.stage import Output, stage
-
-DECODER_FOLDER = "decoder"
 
 
 @stage(version=1, schema=tables.TRAINING)
@@ -90,26 +88,15 @@ def decode_counts(
         encoding: that of the recorded frames, an event histogram.
         options: number of passes, precision and device.
     """
-    from ctlev_core.count_decoder.drawing import draw_counts
-    from ctlev_core.count_decoder.files import load_decoder
-    from ctlev_core.diffusion.pretrained.loading import choose_device
+    from ctlev_core.count_decoder.decoder import open_decoder
 
-    folder, device = decoder.ref.path / DECODER_FOLDER, choose_device(options.device)
-    network, classes, conditioned = load_decoder(folder, device)
-    encoder, asked = plugins.load_options(encoding), conditions_of(conditions)
-    drawn = draw_counts(
-        network,
-        classes,
-        synthetic.array("frames"),
-        asked.images if conditioned else None,
-        seeds=synthetic.column("seed"),
-        num_passes=options.num_passes,
-        precision=options.precision,
-    )
+    opened = open_decoder(decoder.ref.path / DECODER_FOLDER, options, plugins.load_options(encoding))
+    images = conditions_of(conditions).images
+    redrawn = opened.redraw(synthetic.array("frames"), images, synthetic.column("seed"))
     with (
         out.open_array("frames") as written,
-        ProgressBar(drawn, total=len(synthetic), desc="counts", unit="image") as counts,
+        ProgressBar(redrawn, total=len(synthetic), desc="counts", unit="image") as frames,
     ):
-        for one in counts:
-            written.append(encoder.module.render_image(one[None], encoder.options))
+        for frame in frames:
+            written.append(frame[None])
     return synthetic.table

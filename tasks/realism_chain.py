@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.count_decoder.options import DECODER_FOLDER, CountDecoderOptions
 from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
 from ctlev_core.realism.chain import measure_processed, measure_recorded, summarise_recordings
 from ctlev_core.realism.two_sample import choose_rows
@@ -24,16 +25,18 @@ if TYPE_CHECKING:  # torch, which most plans do without
     from ctlev_core.realism.chain_frames import Rounding
 
 
-@stage(version=1, schema=tables.CHAIN_FRAMES)
+@stage(version=2, schema=tables.CHAIN_FRAMES)
 def chain_frames(
     out: Output,
     checkpoint: Manifest,
     frames: Manifest,
     conditions: Manifest,
+    decoder: Manifest | None = None,
     *,
     sampling: SamplingChoice,
     link: Link,
     rounding: EncodingChoice | None,
+    decoding: CountDecoderOptions | None = None,
     seed: int,
 ) -> pa.Table:
     """What recorded frames become in one part of the generator.
@@ -45,13 +48,18 @@ def chain_frames(
         conditions: of those of them that are sent through; rows join on `sample_id`.
         sampling: the generator's sampling options; with `link` of kind `sampled` their steps are the link's.
         link: the part.
-        rounding: the encoding whose levels sampled frames are rounded to, if any.
+        decoder: the count decoder that draws the levels, if any.
+        rounding: the encoding whose levels sampled frames are rounded to or drawn as, if any.
+        decoding: how the decoder draws.
         seed: of all noise.
     """
     rows = matching_rows(frames, conditions)
     seeds = sample_seeds(seed, len(rows))
+    round_frames = None
+    if rounding is not None:
+        round_frames = _rounding(frames, plugins.load_options(rounding), decoder, decoding)
     with out.open_array("frames") as written:
-        for made in _send(out, checkpoint, frames, conditions, rows, sampling, link, rounding, seeds):
+        for made in _send(out, checkpoint, frames, conditions, rows, sampling, link, round_frames, seeds):
             written.append(made)
     return pa.table(
         {
@@ -70,7 +78,7 @@ def _send(
     rows: np.ndarray,
     sampling: SamplingChoice,
     link: Link,
-    rounding: EncodingChoice | None,
+    round_frames: Rounding | None,
     seeds: list[int],
 ) -> Iterator[np.ndarray]:
     """Batches of frames after the part."""
@@ -79,10 +87,10 @@ def _send(
     from ctlev_core.realism.chain_frames import Parts, send_through
 
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
-    folder, round_frames = checkpoint.ref.path / "checkpoint", _rounding(frames, rounding)
+    folder = checkpoint.ref.path / "checkpoint"
     if link.kind == "sampled":
         made = plugin.module.sample(folder, asked, plugin.options, seeds=seeds, work=out.work)
-        yield made if round_frames is None else round_frames(made, seeds)
+        yield made if round_frames is None else round_frames(made, asked.images, seeds)
         return
     device = device_names(plugin.options.device)[0]
     base_model = load_for_sampling(folder, plugin.options, device, asked.images is not None)
@@ -90,12 +98,17 @@ def _send(
     yield from send_through(link, recorded, asked, Parts(base_model, plugin.options, round_frames), seeds)
 
 
-def _rounding(frames: Manifest, encoding: EncodingChoice | None) -> Rounding | None:
-    """To whole counts, as many as training windows have."""
-    if encoding is None:
-        return None
-    num_events, encoder = training_counts(frames), plugins.load_options(encoding)
-    return lambda made, seeds: round_frames(made, num_events, encoder, seeds)
+def _rounding(
+    frames: Manifest, encoder: plugins.Plugin, decoder: Manifest | None, decoding: CountDecoderOptions | None
+) -> Rounding:
+    """To whole counts: drawn by the decoder, or else rounded to as many as training windows have."""
+    if decoder is None or decoding is None:
+        num_events = training_counts(frames)
+        return lambda made, _, seeds: round_frames(made, num_events, encoder, seeds)
+    from ctlev_core.count_decoder.decoder import open_decoder
+
+    opened = open_decoder(decoder.ref.path / DECODER_FOLDER, decoding, encoder)
+    return lambda made, images, seeds: np.stack(list(opened.redraw(made, images, seeds)))
 
 
 @stage(version=1, schema=tables.REALISM_CHAIN)

@@ -8,6 +8,9 @@ from pydantic import Field
 
 from data_contracts.config import RUN_SETTING, Frozen
 
+DECODER_FOLDER = "decoder"
+"""In the artefact of a trained decoder."""
+
 
 class CountDecoderOptions(Frozen):
     """How the count decoder is trained, and in how many passes it draws."""

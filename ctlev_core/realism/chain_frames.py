@@ -28,11 +28,12 @@ from ctlev_core.diffusion.sampling.partial_denoising import (
 )
 from ctlev_core.diffusion.sampling.sampling import decode_frames, guided_predictions
 from data_contracts.errors import DataError
+from data_contracts.image_rows import Images
 from data_contracts.labels import Conditions
 from data_contracts.realism_chain import Link
 
-Rounding = Callable[[np.ndarray, Sequence[int]], np.ndarray]
-"""From images [B, H, W, 3] uint8 and B seeds to images of whole counts."""
+Rounding = Callable[[np.ndarray, Images | None, Sequence[int]], np.ndarray]
+"""From images [B, H, W, 3] uint8, their condition images and B seeds to images of whole counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +114,9 @@ def _process(
         images = None if conditions.images is None else conditions_to_tensor(conditions.images[rows])
         latents = _there_and_back(link, latents, parts, own, embeddings[rows], empty, images)
     made = decode_frames(parts.base_model, latents, parts.options, own)
-    return made if parts.rounding is None or link.kind == "values" else parts.rounding(made, own)
+    if parts.rounding is None or link.kind == "values":
+        return made
+    return parts.rounding(made, None if conditions.images is None else conditions.images[rows], own)
 
 
 @torch.no_grad()

@@ -108,16 +108,18 @@ def test_rows_do_not_depend_on_the_batch_and_change_with_their_seed(kind):
 
 def test_counts_come_after_values_and_each_row_is_rounded_by_its_own_seed():
     frames, conditions = smooth()
-    asked = []
+    asked, shown = [], []
 
-    def rounding(made, seeds):
+    def rounding(made, images, seeds):
         asked.extend(zip(made.copy(), seeds, strict=True))
+        shown.extend(images)
         return made // 51 * 51
 
     parts = Parts(shared_base_model(), OPTIONS, rounding)
     found = send(Link(kind="counts"), frames, conditions, parts)
     treated = send(Link(kind="values"), frames, conditions, parts)
     assert [seed for _, seed in asked] == SEEDS, "not asked for values alone"
+    np.testing.assert_array_equal(np.stack(shown), conditions.images)
     np.testing.assert_array_equal(np.stack([made for made, _ in asked]), treated)
     np.testing.assert_array_equal(found, treated // 51 * 51)
 
