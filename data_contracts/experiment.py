@@ -116,11 +116,11 @@ class Experiment(Frozen):
         description="sampled frames become, by stochastic rounding, renderings of whole event counts, as recorded ones "
         "are; of event histograms only",
     )
-    count_decoder: dict[str, Any] | None = Field(
+    pixel_decoder: dict[str, Any] | None = Field(
         None,
-        description="options of a decoder that draws whole event counts, with the noise of the sensor, from sampled "
-        "images (see `CountDecoderOptions`; {} = its defaults); of diffusion generators, in place of "
-        "stochastic_rounding; null = none",
+        description="options of a decoder that draws the pixel values of sampled images as recorded ones have them, whole "
+        "event counts and the noise of the sensor; {} = its defaults; of diffusion generators, whose frames are then "
+        "not rounded; null = none",
     )
     num_generators: int = Field(
         1,
@@ -198,9 +198,8 @@ class Experiment(Frozen):
 
     @model_validator(mode="after")
     def _only_histograms_hold_counts(self) -> Experiment:
-        for name in ("stochastic_rounding", "count_decoder"):
-            if getattr(self, name) not in (False, None) and self.encoding.name != "event_histogram":
-                raise ValueError(f"{name} needs encoding 'event_histogram', got {self.encoding.name!r}")
+        if self.stochastic_rounding and self.encoding.name != "event_histogram":
+            raise ValueError(f"stochastic_rounding needs encoding 'event_histogram', got {self.encoding.name!r}")
         return self
 
     @model_validator(mode="after")

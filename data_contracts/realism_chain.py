@@ -57,7 +57,7 @@ class RealismChain(Experiment):
         return [
             Link(kind="autoencoder"),
             Link(kind="values"),
-            *([Link(kind="counts")] if self.stochastic_rounding or self.count_decoder is not None else []),
+            *([Link(kind="counts")] if self.stochastic_rounding or self.pixel_decoder is not None else []),
             *(
                 Link(kind="denoised", amount=step, max_evaluations=options.max_evaluations)
                 for step in options.time_steps

@@ -93,7 +93,6 @@ def _check_labels(experiment: Experiment) -> None:
 def _check_counts(experiment: Experiment) -> None:
     asking = {
         "stochastic_rounding": experiment.stochastic_rounding,
-        "count_decoder": experiment.count_decoder is not None,
         "export": experiment.export is not None,
     }
     for what, is_asked in asking.items():

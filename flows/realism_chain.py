@@ -60,7 +60,7 @@ def _num_timesteps(asked: RealismChain) -> int:
 
 def sampling_of(asked: RealismChain, link: Link) -> SamplingChoice:
     """The sampling options that a link depends on: whole sampling has its own number of steps, the rest no solver."""
-    choice = asked.sampling_choice if asked.count_decoder is None else smooth(asked.sampling_choice)
+    choice = asked.sampling_choice if asked.pixel_decoder is None else smooth(asked.sampling_choice)
     if link.kind == "sampled":
         return choice.model_copy(update={"options": choice.options | {"num_inference_steps": link.amount}})
     return without_solver(choice)

@@ -1,15 +1,15 @@
-"""Sample frames of a trained generator as an experiment asks: as they come, or with whole event counts."""
+"""Sample frames of a trained generator as an experiment asks: as they come, or with the pixel values of recorded ones."""
 
 from __future__ import annotations
 
 from ctlev_core import plugins
-from ctlev_core.count_decoder.options import CountDecoderOptions
 from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.pixel_decoder.options import PixelDecoderOptions
 from ctlev_core.plugins import PluginError, validate_options
 from data_contracts.config import SamplingChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
-from tasks.count_decoder import decode_counts, train_count_decoder
+from tasks.pixel_decoder import decode_pixels, train_pixel_decoder
 from tasks.sample import sample
 
 _OF_THE_SOLVER = ("scheduler", "num_inference_steps", "timestep_spacing", "noise")
@@ -28,7 +28,7 @@ def sample_generator(
     seed: int | None = None,
     label: str,
 ) -> ManifestRef:
-    """Sampled frames, with whole event counts where the experiment asks for them.
+    """Sampled frames, drawn by a pixel decoder where the experiment asks for one.
 
     Args:
         experiment: what is asked for.
@@ -55,7 +55,7 @@ def sample_generator(
     if decoder is None:
         return made
     options = decoder_options(experiment)
-    return decode_counts(decoder, made, asked, encoding=experiment.encoding, options=options, label=label)
+    return decode_pixels(decoder, made, asked, encoding=experiment.encoding, options=options, label=label)
 
 
 def train_decoder(
@@ -68,38 +68,39 @@ def train_decoder(
     number: int = 0,
     label: str,
 ) -> ManifestRef | None:
-    """The count decoder of a generator; None where the experiment asks for none, or it is no diffusion model."""
-    if experiment.count_decoder is None or not isinstance(plugins.load_options(sampling).options, SamplingOptions):
+    """The pixel decoder of a generator; None where the experiment asks for none, or it is no diffusion model."""
+    if experiment.pixel_decoder is None or not isinstance(plugins.load_options(sampling).options, SamplingOptions):
         return None
-    return train_count_decoder(
+    return train_pixel_decoder(
         checkpoint,
         frames,
         learnt,
         sampling=without_solver(smooth(sampling)),
+        encoding=experiment.encoding,
         decoder=decoder_options(experiment).of_training,
         seed=experiment.seed + number,
         label=label,
     )
 
 
-def decoder_options(experiment: Experiment) -> CountDecoderOptions:
-    """The options of the experiment's count decoder, checked.
+def decoder_options(experiment: Experiment) -> PixelDecoderOptions:
+    """The options of the experiment's pixel decoder, checked.
 
     Raises:
         PluginError: an option is unknown or wrong.
     """
-    return validate_options(CountDecoderOptions, experiment.count_decoder or {}, "count_decoder")
+    return validate_options(PixelDecoderOptions, experiment.pixel_decoder or {}, "pixel_decoder")
 
 
 def smooth(sampling: SamplingChoice) -> SamplingChoice:
-    """The same, but faint values stay as the network expects them: the decoder decides where there is no event.
+    """The same, but faint values stay as the network expects them: the decoder decides where nothing is.
 
     Raises:
         PluginError: values are to be drawn in two ways.
     """
     values = sampling.options.get("values", "expected")
     if values != "expected":
-        raise PluginError(f"count_decoder draws the values itself: leave out sampling.values, got {values!r}")
+        raise PluginError(f"pixel_decoder draws the values itself: leave out sampling.values, got {values!r}")
     return sampling.model_copy(update={"options": sampling.options | {"black_threshold": 0}})
 
 

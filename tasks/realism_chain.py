@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.count_decoder.options import DECODER_FOLDER, CountDecoderOptions
+from ctlev_core.pixel_decoder.options import DECODER_FOLDER, PixelDecoderOptions
 from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
 from ctlev_core.realism.chain import measure_processed, measure_recorded, summarise_recordings
 from ctlev_core.realism.two_sample import choose_rows
@@ -36,7 +36,7 @@ def chain_frames(
     sampling: SamplingChoice,
     link: Link,
     rounding: EncodingChoice | None,
-    decoding: CountDecoderOptions | None = None,
+    decoding: PixelDecoderOptions | None = None,
     seed: int,
 ) -> pa.Table:
     """What recorded frames become in one part of the generator.
@@ -48,7 +48,7 @@ def chain_frames(
         conditions: of those of them that are sent through; rows join on `sample_id`.
         sampling: the generator's sampling options; with `link` of kind `sampled` their steps are the link's.
         link: the part.
-        decoder: the count decoder that draws the levels, if any.
+        decoder: the pixel decoder that draws the levels, if any.
         rounding: the encoding whose levels sampled frames are rounded to or drawn as, if any.
         decoding: how the decoder draws.
         seed: of all noise.
@@ -99,13 +99,13 @@ def _send(
 
 
 def _rounding(
-    frames: Manifest, encoder: plugins.Plugin, decoder: Manifest | None, decoding: CountDecoderOptions | None
+    frames: Manifest, encoder: plugins.Plugin, decoder: Manifest | None, decoding: PixelDecoderOptions | None
 ) -> Rounding:
     """To whole counts: drawn by the decoder, or else rounded to as many as training windows have."""
     if decoder is None or decoding is None:
         num_events = training_counts(frames)
         return lambda made, _, seeds: round_frames(made, num_events, encoder, seeds)
-    from ctlev_core.count_decoder.decoder import open_decoder
+    from ctlev_core.pixel_decoder.decoder import open_decoder
 
     opened = open_decoder(decoder.ref.path / DECODER_FOLDER, decoding, encoder)
     return lambda made, images, seeds: np.stack(list(opened.redraw(made, images, seeds)))

@@ -147,7 +147,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
     histogram = np.ascontiguousarray(histogram)
     size = histogram.shape[:1:-1]
     if options.resampling == "area" and image_grid.image_size(size, options) != size:
-        levels = image_drawing.draw_counts(histogram, options, options.normalisation, options.full_scale_count)
+        levels = image_drawing.draw_values(histogram, options, options.normalisation, options.full_scale_count)
         return _as_colours(levels)
     images = np.zeros((len(histogram), *histogram.shape[2:], 3), np.uint8)
     kernels.draw(histogram, full_scales(histogram, options), images)

@@ -71,7 +71,7 @@ def render_image(histogram: np.ndarray, options: Options) -> np.ndarray:
         ValueError: the shape or dtype is not that of counts encoded with these options.
     """
     image_grid.check_encoded(histogram, options.num_bins, np.uint16)
-    levels = image_drawing.draw_counts(histogram, options, options.normalisation, options.full_scale_count)
+    levels = image_drawing.draw_values(histogram, options, options.normalisation, options.full_scale_count)
     images = np.zeros((len(levels), *levels.shape[2:], COLOURS), np.uint8)
     images[..., : options.num_bins] = levels.transpose(0, 2, 3, 1)
     return images

@@ -28,7 +28,7 @@ FIXED_POINT = 256
 """What an average of one grey level becomes, so that fractions count when contrast is found."""
 
 
-def draw_counts(
+def draw_values(
     counts: np.ndarray, fit: ImageFit, normalisation: Normalisation, full_scale_count: int = 8
 ) -> np.ndarray:
     """Grey levels of the image of each window.

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ctlev_core.encodings import event_histogram, time_surface, voxel_grid
 from ctlev_core.events import image_grid
-from ctlev_core.events.image_drawing import draw_counts, fit_levels, full_scales, grey_levels
+from ctlev_core.events.image_drawing import draw_values, fit_levels, full_scales, grey_levels
 from ctlev_core.events.image_grid import ImageFit
 from ctlev_core.events.image_resampling import average_areas, find_overlaps
 from data_contracts.errors import DataError
@@ -51,7 +51,7 @@ def test_equal_counts_leave_no_gaps(sensor, size, how, normalisation, count):
     expected = grey_levels(counts, scale)[0, 0, 0, 0]
     if normalisation != "count" and image_grid.is_reduced(sensor, fit):
         expected = 255
-    assert (draw_counts(counts, fit, normalisation) == expected).all()
+    assert (draw_values(counts, fit, normalisation) == expected).all()
 
 
 @settings(deadline=None)
@@ -75,7 +75,7 @@ def test_an_image_of_the_sensors_size_has_the_levels_of_its_counts(sensor, how, 
     scales = full_scales(counts, normalisation)
     expected = np.minimum(255, np.floor(255.0 * counts / scales[:, None, None, None]))
     for size in (None, sensor):
-        np.testing.assert_array_equal(draw_counts(counts, ImageFit(image_size=size, fit=how), normalisation), expected)
+        np.testing.assert_array_equal(draw_values(counts, ImageFit(image_size=size, fit=how), normalisation), expected)
 
 
 @settings(deadline=None)
@@ -149,8 +149,8 @@ def test_smaller_images_are_as_bright_as_their_sensor_was():
     counts = np.zeros((1, 1, 256, 256), np.uint16)
     counts[0, 0, ::16, ::16] = 3
     fit = ImageFit(image_size=(64, 64))
-    assert draw_counts(counts, fit, "three_sigma").max() == 255 and draw_counts(counts, fit, "max").max() == 255
-    assert draw_counts(counts, fit, "count", full_scale_count=3).max() == 16, "a sixteenth of 255: counts say what is"
+    assert draw_values(counts, fit, "three_sigma").max() == 255 and draw_values(counts, fit, "max").max() == 255
+    assert draw_values(counts, fit, "count", full_scale_count=3).max() == 16, "a sixteenth of 255: counts say what is"
 
 
 def test_larger_images_have_no_gaps_where_events_put_into_pixels_leave_them():

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctlev_core.count_decoder.count_classes import NUM_SINGLE, fit_classes
+from ctlev_core.pixel_decoder.value_classes import NUM_SINGLE, fit_classes
 from data_contracts.errors import DataError
 
 COUNTS = st.lists(st.integers(0, 65535), min_size=2, max_size=60).filter(lambda counts: len(set(counts)) > 1)
@@ -54,7 +54,7 @@ def test_embeddings_are_square_roots_with_a_mean_of_0_and_a_deviation_of_1():
     assert abs(embedded.mean()) < 1e-5 and abs(embedded.std() - 1) < 1e-5
     roots = np.sqrt(counts)
     np.testing.assert_allclose(embedded, (roots - roots.mean()) / roots.std(), atol=1e-5)
-    assert classes.event_step == pytest.approx(1 / roots.std())
+    assert classes.active_step == pytest.approx(1 / roots.std())
 
 
 @pytest.mark.parametrize("counts", [np.zeros((3, 4), np.uint16), np.full((3, 4), 7, np.uint16)])

@@ -1,4 +1,4 @@
-"""Options of the count decoder. Imports nothing heavy."""
+"""Options of the pixel decoder. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ DECODER_FOLDER = "decoder"
 """In the artefact of a trained decoder."""
 
 
-class CountDecoderOptions(Frozen):
-    """How the count decoder is trained, and in how many passes it draws."""
+class PixelDecoderOptions(Frozen):
+    """How the pixel decoder is trained, and in how many passes it draws."""
 
     num_steps: int = Field(default=600, ge=1, description="optimiser steps")
     batch_size: int = Field(default=16, ge=1, description="crops a step")
@@ -49,6 +49,6 @@ class CountDecoderOptions(Frozen):
     )
 
     @property
-    def of_training(self) -> CountDecoderOptions:
+    def of_training(self) -> PixelDecoderOptions:
         """What the trained decoder depends on: not in how many passes it will draw."""
-        return self.model_copy(update={"num_passes": CountDecoderOptions.model_fields["num_passes"].default})
+        return self.model_copy(update={"num_passes": PixelDecoderOptions.model_fields["num_passes"].default})

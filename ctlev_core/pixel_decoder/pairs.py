@@ -1,7 +1,7 @@
-"""What a count decoder learns from: recorded frames, and what the generator makes of them.
+"""What a pixel decoder learns from: recorded frames, and what the generator makes of them.
 
 A recorded frame is noised to a time step of the generator's schedule and denoised again. What comes out is as smooth as
-what the generator samples, and shows the frame whose counts are known. At several time steps it is more or less like
+what the generator samples, and shows the frame whose values are known. At several time steps it is more or less like
 that frame, so that the decoder does not learn to trust every detail.
 """
 
@@ -11,15 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.count_decoder.options import CountDecoderOptions
-from ctlev_core.count_decoder.training import TrainingPairs
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel
 from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.pixel_decoder.drawing import image_planes
+from ctlev_core.pixel_decoder.options import PixelDecoderOptions
+from ctlev_core.pixel_decoder.training import TrainingPairs
 from ctlev_core.progress import ProgressBar
 from ctlev_core.realism.chain_frames import Parts, send_through
 from ctlev_core.seeds import sample_seeds
 from data_contracts.arrays import ArrayWriter
-from data_contracts.image_rows import Images
+from data_contracts.image_rows import Images, image_chunks
 from data_contracts.labels import Conditions
 from data_contracts.realism_chain import Link
 
@@ -28,11 +29,11 @@ _CHUNK = 256
 
 def make_pairs(
     base_model: PretrainedModel,
-    counts: Images,
     frames: Images,
+    counts: Images | None,
     conditions: Conditions,
     sampling: SamplingOptions,
-    options: CountDecoderOptions,
+    options: PixelDecoderOptions,
     *,
     seed: int,
     work: Path,
@@ -41,8 +42,8 @@ def make_pairs(
 
     Args:
         base_model: the fine-tuned generator.
-        counts: [N, P, H, W] uint16 of the training frames.
-        frames: [N, H, W, 3] uint8, their event images.
+        frames: [N, H, W, 3] uint8 training frames.
+        counts: [N, P, H, W] uint16 event counts of their pixels; None = the grey levels of the frames are learnt.
         conditions: N prompts, with N condition images where the generator has a ControlNet.
         sampling: how the generator's frames are sampled: palette, guidance, precision.
         options: time steps, and evaluations of the network.
@@ -69,4 +70,21 @@ def make_pairs(
                             bar.update(len(made))
                 unfinished.replace(path)
             images.append(np.load(path, mmap_mode="r", allow_pickle=False))
-    return TrainingPairs(counts, images, conditions.images)
+    return TrainingPairs(level_planes(frames, work) if counts is None else counts, images, conditions.images)
+
+
+def level_planes(frames: Images, work: Path) -> np.ndarray:
+    """The grey levels of frames [N, H, W, 3] as planes [N, P, H, W] uint8, in a file of the work folder.
+
+    One plane where all frames are grey, two where none has green, else three.
+    """
+    is_grey, has_green = True, False
+    for part in image_chunks(frames):
+        is_grey = is_grey and bool((part == part[..., :1]).all())
+        has_green = has_green or bool(part[..., 1].any())
+    num_planes = 1 if is_grey else 3 if has_green else 2
+    path = work / "levels.npy"
+    with ArrayWriter(path) as written:
+        for part in image_chunks(frames):
+            written.append(image_planes(part, num_planes).astype(np.uint8))
+    return np.load(path, mmap_mode="r", allow_pickle=False)

@@ -1,4 +1,4 @@
-"""Count decoder in a whole run: frames of whole counts, labels unchanged, and nothing trained twice."""
+"""Pixel decoder in a whole run: frames of whole counts, labels unchanged, and nothing trained twice."""
 
 import numpy as np
 from flow_scripts import artefacts, run_script_here
@@ -20,7 +20,7 @@ DECODER = "num_steps: 4, batch_size: 2, width: 16, depth: 1, time_steps: [500], 
 
 
 def run(home, decoder, *further, script="synthesize"):
-    asked = (*SMALL, f"count_decoder={decoder}", *further)
+    asked = (*SMALL, f"pixel_decoder={decoder}", *further)
     options = [word for setting in asked for word in ("--set", setting)]
     return run_script_here(script, "--preset", "pose", *options, home=home)
 
@@ -28,7 +28,7 @@ def run(home, decoder, *further, script="synthesize"):
 def test_sampled_frames_become_renderings_of_whole_counts(tmp_path):
     finished = run(tmp_path, f"{{{DECODER}}}")
     assert finished.status == 0, finished.errors
-    (smooth,), (drawn,) = artefacts(tmp_path, "sample"), artefacts(tmp_path, "decode_counts")
+    (smooth,), (drawn,) = artefacts(tmp_path, "sample"), artefacts(tmp_path, "decode_pixels")
     assert drawn.table.equals(smooth.table), "labels, seeds and rejections stay"
     frames = np.asarray(drawn.array("frames"))
     assert frames.shape == smooth.array("frames").shape and frames.any(axis=(1, 2, 3)).all()
@@ -41,16 +41,15 @@ def test_sampled_frames_become_renderings_of_whole_counts(tmp_path):
     # Drawn in another number of passes: neither the generator nor the decoder is trained again.
     finished = run(tmp_path, f"{{{DECODER}, num_passes: 1}}")
     assert finished.status == 0, finished.errors
-    assert len(artefacts(tmp_path, "train_count_decoder")) == len(artefacts(tmp_path, "sample")) == 1
-    first, other = (np.asarray(each.array("frames")) for each in artefacts(tmp_path, "decode_counts"))
+    assert len(artefacts(tmp_path, "train_pixel_decoder")) == len(artefacts(tmp_path, "sample")) == 1
+    first, other = (np.asarray(each.array("frames")) for each in artefacts(tmp_path, "decode_pixels"))
     assert (first != other).any()
 
 
 def test_what_does_not_go_together_is_refused_before_anything_runs(tmp_path):
     for decoder, further, message in (
-        ("{num_step: 4}", (), "count_decoder: unknown option 'num_step'"),
-        ("{}", ("sampling.values=nearest",), "count_decoder draws the values itself"),
-        ("{}", ("stochastic_rounding=false", "encoding={name: voxel_grid}"), "count_decoder needs encoding"),
+        ("{num_step: 4}", (), "pixel_decoder: unknown option 'num_step'"),
+        ("{}", ("sampling.values=nearest",), "pixel_decoder draws the values itself"),
     ):
         finished = run(tmp_path, decoder, *further)
         assert finished.status == 2 and message in finished.errors, finished.errors

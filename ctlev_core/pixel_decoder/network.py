@@ -1,12 +1,12 @@
-"""The network of the count decoder, and the noise that it takes counts out of.
+"""The network of the pixel decoder, and the noise that it takes pixel values out of.
 
-    noisy counts, sampled image, condition image, noise level
+    noisy values, sampled image, condition image, noise level
     -> half the resolution: residual blocks, which see some 40 px around
     -> full resolution: two convolutions beside the inputs themselves
-    -> for each pixel and polarity a logit a class of counts
+    -> for each pixel and plane (polarity, or colour) a logit a class of values
 
-To the logits is added what the noisy value of a pixel says about its own count, the logarithm of a Gaussian: with
-hardly any noise left the counts follow exactly, and the network only has to learn what the surroundings say.
+To the logits is added what the noisy value of a pixel says about its own value, the logarithm of a Gaussian: with
+hardly any noise left the values follow exactly, and the network only has to learn what the surroundings say.
 
 Source: Dieleman et al., Continuous diffusion for categorical data, 2022: noise on embeddings, cross-entropy at all
 noise levels. We add the Gaussian term, and draw whole classes between the passes in place of a mean (Austin et al.,
@@ -20,7 +20,8 @@ import torch
 from torch import Tensor, nn
 
 MAX_NOISE, MIN_NOISE = 8.0, 0.2
-"""First and last noise level of drawing, in steps from no event to one: nothing is known, and nearly everything."""
+"""First and last noise level of drawing, in steps from no event to the median of active pixels: all hidden, and hardly
+anything."""
 TRAINED_NOISE, TRAINED_SPREAD = 0.8, 1.0
 """Median of the noise levels that are trained, likewise, and standard deviation of their logarithm."""
 _DETAIL = 24
@@ -41,12 +42,12 @@ class _ResidualBlock(nn.Module):
         return x + self.second(nn.functional.silu(self.second_norm(hidden)))
 
 
-class CountNetwork(nn.Module):
-    """Logits of the classes of counts of every pixel.
+class PixelNetwork(nn.Module):
+    """Logits of the classes of every pixel.
 
     Args:
-        embeddings: [K] float32 of the classes, see `CountClasses.embeddings`.
-        polarities: of the counts, 1 or 2.
+        embeddings: [K] float32 of the classes, see `ValueClasses.embeddings`.
+        num_planes: of an image, 1 to 3.
         condition_channels: of the condition image; 0 = there is none.
         width: channels at half the resolution.
         depth: residual blocks.
@@ -54,11 +55,11 @@ class CountNetwork(nn.Module):
 
     embeddings: Tensor
 
-    def __init__(self, embeddings: Tensor, polarities: int, condition_channels: int, width: int, depth: int) -> None:
+    def __init__(self, embeddings: Tensor, num_planes: int, condition_channels: int, width: int, depth: int) -> None:
         super().__init__()
-        self.polarities = polarities
+        self.num_planes = num_planes
         self.register_buffer("embeddings", embeddings)
-        inputs = 2 * polarities + condition_channels + 1
+        inputs = 2 * num_planes + condition_channels + 1
         self.first = nn.Conv2d(4 * inputs, width, 3, padding=1)
         self.blocks = nn.Sequential(*(_ResidualBlock(width) for _ in range(depth)))
         self.up = nn.Conv2d(width, 4 * _DETAIL, 1)
@@ -67,14 +68,14 @@ class CountNetwork(nn.Module):
             nn.ReLU(),
             nn.Conv2d(2 * _DETAIL, 2 * _DETAIL, 3, padding=1),
             nn.ReLU(),
-            nn.Conv2d(2 * _DETAIL, polarities * len(embeddings), 1),
+            nn.Conv2d(2 * _DETAIL, num_planes * len(embeddings), 1),
         )
 
     def forward(self, noisy: Tensor, noise_level: Tensor, images: Tensor, conditions: Tensor | None) -> Tensor:
         """Unnormalised log-probabilities.
 
         Args:
-            noisy: [B, P, H, W] embeddings of the counts with noise; H and W even.
+            noisy: [B, P, H, W] embeddings of the values with noise; H and W even.
             noise_level: [B] its standard deviation.
             images: [B, P, H, W] sampled images in [-1, 1].
             conditions: [B, C, H, W] in [0, 1], or None.
@@ -89,6 +90,6 @@ class CountNetwork(nn.Module):
         hidden = self.blocks(self.first(nn.functional.pixel_unshuffle(inputs, 2)))
         detail = nn.functional.pixel_shuffle(self.up(nn.functional.silu(hidden)), 2)
         logits = self.detail(torch.cat([detail, inputs.to(detail)], dim=1)).float()
-        logits = logits.unflatten(1, (self.polarities, len(self.embeddings)))
+        logits = logits.unflatten(1, (self.num_planes, len(self.embeddings)))
         distances = noisy.float()[:, :, None] - self.embeddings[:, None, None]
         return logits - distances.square() / (2 * level[:, None] ** 2)

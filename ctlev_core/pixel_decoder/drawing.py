@@ -1,7 +1,7 @@
-"""Draw the counts of sampled images: from nothing but noise to whole counts in a few passes of the network.
+"""Draw the pixel values of sampled images: from nothing but noise to whole counts in a few passes of the network.
 
-Each pass gives, for every pixel, the probability of every class of counts. Classes are drawn, and the noisy counts of
-the next, lower noise level given them and the noisy counts before (the posterior of a Gaussian diffusion). What is
+Each pass gives, for every pixel, the probability of every class of values. Classes are drawn, and the noisy values of
+the next, lower noise level given them and the noisy values before (the posterior of a Gaussian diffusion). What is
 drawn in one pass is drawn pixel by pixel; the passes after it see the neighbours, so that an edge becomes an edge. One
 pass alone would leave pixels independent of one another.
 
@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctlev_core.count_decoder.count_classes import CountClasses
-from ctlev_core.count_decoder.network import MAX_NOISE, MIN_NOISE, CountNetwork
+from ctlev_core.pixel_decoder.network import MAX_NOISE, MIN_NOISE, PixelNetwork
+from ctlev_core.pixel_decoder.value_classes import ValueClasses
 from data_contracts.image_rows import Images
 
 BATCH = 16
@@ -26,15 +26,34 @@ DRAW_STREAM = 11
 """Entropy that keeps what is drawn here apart from the noise an image was sampled from, whose seed is the same."""
 
 
-def noise_levels(num_passes: int, classes: CountClasses) -> np.ndarray:
+def noise_levels(num_passes: int, classes: ValueClasses) -> np.ndarray:
     """[num_passes] float64 descending, geometric; a single pass sees nothing but noise."""
-    return np.geomspace(MAX_NOISE, MIN_NOISE, num_passes) * classes.event_step
+    return np.geomspace(MAX_NOISE, MIN_NOISE, num_passes) * classes.active_step
 
 
-def image_planes(frames: np.ndarray, polarities: int) -> np.ndarray:
-    """[N, H, W, 3] uint8 as planes [N, P, H, W] float32 in [-1, 1]: red and blue, or the mean of all channels."""
-    planes = frames[..., [0, 2]] if polarities == 2 else frames.mean(axis=3, keepdims=True)
-    return np.ascontiguousarray(planes.transpose(0, 3, 1, 2), np.float32) / 127.5 - 1
+def image_planes(frames: np.ndarray, num_planes: int) -> np.ndarray:
+    """The colours of frames [N, H, W, 3] that tell something, as planes [N, P, H, W] of the same dtype or float.
+
+    One plane: the mean of all channels; two: red and blue, which polarities are; three: all.
+    """
+    if num_planes == 1:
+        planes = frames.mean(axis=3, keepdims=True)
+    else:
+        planes = frames[..., [0, 2]] if num_planes == 2 else frames
+    return np.ascontiguousarray(planes.transpose(0, 3, 1, 2))
+
+
+def frames_of_planes(planes: np.ndarray) -> np.ndarray:
+    """Frames [N, H, W, 3] uint8 of planes [N, P, H, W] of grey levels; the inverse of `image_planes`."""
+    levels = planes.astype(np.uint8)
+    if levels.shape[1] == 2:
+        levels = np.stack([levels[:, 0], np.zeros_like(levels[:, 0]), levels[:, 1]], axis=1)
+    return np.ascontiguousarray(np.broadcast_to(levels, (len(levels), 3, *levels.shape[2:])).transpose(0, 2, 3, 1))
+
+
+def as_input(planes: np.ndarray) -> Tensor:
+    """Grey levels as float32 in [-1, 1]."""
+    return torch.from_numpy(planes.astype(np.float32) / 127.5 - 1)
 
 
 def condition_planes(images: np.ndarray) -> np.ndarray:
@@ -49,9 +68,9 @@ def even_sided(planes: Tensor) -> Tensor:
 
 
 @torch.inference_mode()
-def draw_counts(
-    network: CountNetwork,
-    classes: CountClasses,
+def draw_values(
+    network: PixelNetwork,
+    classes: ValueClasses,
     frames: Images,
     conditions: Images | None,
     *,
@@ -59,11 +78,11 @@ def draw_counts(
     num_passes: int,
     precision: str = "float32",
 ) -> Iterator[np.ndarray]:
-    """Counts of sampled images, one after another; image i depends on image, condition and seed i alone.
+    """Values of sampled images, one after another; image i depends on image, condition and seed i alone.
 
     Args:
         network: trained, on the device to compute on.
-        classes: of its counts.
+        classes: of its values.
         frames: [N, H, W, 3] uint8 as the generator gives them.
         conditions: [N, H, W, 3] uint8 that they were asked for, where the network takes some; else None.
         seeds: N non-negative integers.
@@ -80,7 +99,7 @@ def draw_counts(
     levels = noise_levels(num_passes, classes)
     for start in range(0, len(frames), BATCH):
         rows = slice(start, min(start + BATCH, len(frames)))
-        images = torch.from_numpy(image_planes(np.asarray(frames[rows]), network.polarities))
+        images = as_input(image_planes(np.asarray(frames[rows]), network.num_planes))
         asked = None if conditions is None else torch.from_numpy(condition_planes(np.asarray(conditions[rows])))
         streams = [np.random.default_rng([seed, DRAW_STREAM]) for seed in seeds[rows]]
         drawn = _draw_batch(network, levels, images, asked, streams, getattr(torch, precision))
@@ -89,7 +108,7 @@ def draw_counts(
 
 
 def _draw_batch(
-    network: CountNetwork,
+    network: PixelNetwork,
     levels: np.ndarray,
     images: Tensor,
     conditions: Tensor | None,

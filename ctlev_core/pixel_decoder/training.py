@@ -1,4 +1,4 @@
-"""Train a count decoder on recorded frames, beside what the generator makes of them when they are noised and denoised.
+"""Train a pixel decoder on recorded frames, beside what the generator makes of them when they are noised and denoised.
 
 Everything random is a function of (seed, step), so that a run that is killed and resumed ends in the same weights.
 """
@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctlev_core.count_decoder.count_classes import CountClasses, fit_classes
-from ctlev_core.count_decoder.drawing import condition_planes, image_planes
-from ctlev_core.count_decoder.network import TRAINED_NOISE, TRAINED_SPREAD, CountNetwork
-from ctlev_core.count_decoder.options import CountDecoderOptions
 from ctlev_core.diffusion.pretrained.loading import choose_device
 from ctlev_core.diffusion.training.loop import sample_rows
 from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.diffusion.training.trainer import Trainer
+from ctlev_core.pixel_decoder.drawing import as_input, condition_planes, image_planes
+from ctlev_core.pixel_decoder.network import TRAINED_NOISE, TRAINED_SPREAD, PixelNetwork
+from ctlev_core.pixel_decoder.options import PixelDecoderOptions
+from ctlev_core.pixel_decoder.value_classes import ValueClasses, fit_classes
 from ctlev_core.progress import ProgressBar
 from data_contracts.errors import TrainingError
 from data_contracts.image_rows import Images, as_image_rows
@@ -34,40 +34,40 @@ _ORDER_STREAM, _CROP_STREAM, _NOISE_STREAM, _WEIGHT_STREAM, _SPLIT_STREAM = 1, 2
 
 
 class TrainingPairs:
-    """Recorded counts, and for each the images that the generator makes of the frame.
+    """Recorded pixel values, and for each the images that the generator makes of the frame.
 
     Args:
-        counts: [N, P, H, W] uint16.
+        values: [N, P, H, W] uint8 or uint16, such as counts by polarity.
         images: one or more [N, H, W, 3] uint8, such as of several noise levels.
         conditions: [N, H, W, 3] uint8, or None.
     Raises:
         ValueError: numbers or sizes differ.
     """
 
-    def __init__(self, counts: Images, images: Sequence[Images], conditions: Images | None) -> None:
-        shape = (len(counts), *counts.shape[2:], 3)
+    def __init__(self, values: Images, images: Sequence[Images], conditions: Images | None) -> None:
+        shape = (len(values), *values.shape[2:], 3)
         given = [*images, *([] if conditions is None else [conditions])]
-        if not images or not len(counts) or any(tuple(each.shape) != shape for each in given):
+        if not images or not len(values) or any(tuple(each.shape) != shape for each in given):
             raise ValueError(f"expected images and conditions of shape {shape}, got {[each.shape for each in given]}")
-        self.counts, self.images, self.conditions = counts, images, conditions
+        self.values, self.images, self.conditions = values, images, conditions
 
     def __len__(self) -> int:
-        return len(self.counts)
+        return len(self.values)
 
     def digest(self) -> str:
         """Of the pixels."""
-        arrays = [self.counts, *self.images, *([] if self.conditions is None else [self.conditions])]
+        arrays = [self.values, *self.images, *([] if self.conditions is None else [self.conditions])]
         return " ".join(as_image_rows(array).digest() for array in arrays)
 
     def crops(
-        self, rows: np.ndarray, crop_px: int, polarities: int, rng: np.random.Generator
+        self, rows: np.ndarray, crop_px: int, num_planes: int, rng: np.random.Generator
     ) -> tuple[np.ndarray, Tensor, Tensor | None]:
-        """Counts [B, P, h, w], images [B, P, h, w] and conditions [B, 3, h, w] of square crops, turned and mirrored.
+        """Values [B, P, h, w], images [B, P, h, w] and conditions [B, 3, h, w] of square crops, turned and mirrored.
 
         All three are cut, turned and mirrored together; which of the images of a frame is drawn.
         """
-        counts, images, conditions = [], [], []
-        height, width = self.counts.shape[2:]
+        values, images, conditions = [], [], []
+        height, width = self.values.shape[2:]
         side = min(crop_px, height, width) // 2 * 2
         for row in rows.tolist():
             top, left = (int(rng.integers(0, length - side + 1)) for length in (height, width))
@@ -80,25 +80,25 @@ class TrainingPairs:
                 return planes[..., ::-1] if mirrored else planes
 
             one = slice(row, row + 1)
-            counts.append(moved(np.asarray(self.counts[one])))
-            images.append(moved(image_planes(np.asarray(chosen[one]), polarities)))
+            values.append(moved(np.asarray(self.values[one])))
+            images.append(moved(image_planes(np.asarray(chosen[one]), num_planes)))
             if self.conditions is not None:
                 conditions.append(moved(condition_planes(np.asarray(self.conditions[one]))))
         stacked = None if self.conditions is None else torch.from_numpy(np.stack(conditions))
-        return np.stack(counts), torch.from_numpy(np.stack(images)), stacked
+        return np.stack(values), as_input(np.stack(images)), stacked
 
 
-def build_network(classes: CountClasses, polarities: int, conditioned: bool, width: int, depth: int) -> CountNetwork:
+def build_network(classes: ValueClasses, num_planes: int, conditioned: bool, width: int, depth: int) -> PixelNetwork:
     """A network with weights from torch's random stream."""
     embeddings = torch.from_numpy(classes.embeddings)
-    return CountNetwork(embeddings, polarities, 3 if conditioned else 0, width, depth).to(
+    return PixelNetwork(embeddings, num_planes, 3 if conditioned else 0, width, depth).to(
         memory_format=torch.channels_last  # pyright: ignore[reportCallIssue]
     )
 
 
-def train_count_decoder(
-    pairs: TrainingPairs, options: CountDecoderOptions, *, seed: int, work: Path
-) -> tuple[CountNetwork, CountClasses, History]:
+def train_pixel_decoder(
+    pairs: TrainingPairs, options: PixelDecoderOptions, *, seed: int, work: Path
+) -> tuple[PixelNetwork, ValueClasses, History]:
     """Train the network; its weights are moving averages.
 
     Args:
@@ -107,16 +107,16 @@ def train_count_decoder(
         seed: of weights, order, crops and noise.
         work: folder of the resumable state.
     Returns:
-        Network, classes and loss curves: the cross-entropy of the class of a pixel and polarity, in nats.
+        Network, classes and loss curves: the cross-entropy of the class of a pixel and plane, in nats.
     Raises:
         DataError: training frames have no events.
         TrainingError: losses or gradients stayed not finite.
     """
     device, state = choose_device(options.device), work / "state.pt"
-    classes, polarities = fit_classes(pairs.counts), pairs.counts.shape[1]
+    classes, num_planes = fit_classes(pairs.values), pairs.values.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(np.random.SeedSequence([seed, _WEIGHT_STREAM]).generate_state(1)[0]))
-        network = build_network(classes, polarities, pairs.conditions is not None, options.width, options.depth)
+        network = build_network(classes, num_planes, pairs.conditions is not None, options.width, options.depth)
     network = network.to(device)
     learning = TrainingOptions(
         num_steps=options.num_steps,
@@ -135,7 +135,7 @@ def train_count_decoder(
     held_back, learnt = np.split(order, [min(MAX_VALIDATION, len(pairs) // 10)])
     step = _Step(network, classes, pairs, options, seed, device)
     saved = time.monotonic()
-    with ProgressBar(total=options.num_steps, initial=trainer.step, desc="count decoder", unit="step") as bar:
+    with ProgressBar(total=options.num_steps, initial=trainer.step, desc="pixel decoder", unit="step") as bar:
         while trainer.step < options.num_steps:
             rows = learnt[sample_rows(seed, trainer.step, options.batch_size, len(learnt))]
             trainer.optimizer.zero_grad(set_to_none=True)
@@ -172,10 +172,10 @@ class _Step:
 
     def __init__(
         self,
-        network: CountNetwork,
-        classes: CountClasses,
+        network: PixelNetwork,
+        classes: ValueClasses,
         pairs: TrainingPairs,
-        options: CountDecoderOptions,
+        options: PixelDecoderOptions,
         seed: int,
         device: torch.device,
     ) -> None:
@@ -184,11 +184,11 @@ class _Step:
 
     def loss(self, rows: np.ndarray, number: int) -> Tensor:
         rng = np.random.default_rng([self.seed, _CROP_STREAM, number])
-        counts, images, conditions = self.pairs.crops(rows, self.options.crop_px, self.network.polarities, rng)
-        classes = torch.from_numpy(self.classes.classes_of(counts)).to(self.device)
+        values, images, conditions = self.pairs.crops(rows, self.options.crop_px, self.network.num_planes, rng)
+        classes = torch.from_numpy(self.classes.classes_of(values)).to(self.device)
         levels = np.exp(np.log(TRAINED_NOISE) + TRAINED_SPREAD * rng.standard_normal(len(rows))).clip(0.1, 10)
-        noise = torch.from_numpy(rng.standard_normal(counts.shape, np.float32)).to(self.device)
-        level = torch.from_numpy((levels * self.classes.event_step).astype(np.float32)).to(self.device)
+        noise = torch.from_numpy(rng.standard_normal(values.shape, np.float32)).to(self.device)
+        level = torch.from_numpy((levels * self.classes.active_step).astype(np.float32)).to(self.device)
         noisy = self.network.embeddings[classes] + level[:, None, None, None] * noise
         enabled = self.options.precision != "float32"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=enabled):
@@ -201,7 +201,7 @@ class _Step:
         return torch.nn.functional.cross_entropy(logits.transpose(1, 2), classes)
 
 
-def _check_finite(network: CountNetwork) -> None:
+def _check_finite(network: PixelNetwork) -> None:
     for name, value in network.state_dict().items():
         if not bool(torch.isfinite(value).all()):
-            raise TrainingError(f"count decoder: weights {name} are not finite; lower the learning rate")
+            raise TrainingError(f"pixel decoder: weights {name} are not finite; lower the learning rate")

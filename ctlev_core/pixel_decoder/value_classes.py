@@ -1,11 +1,11 @@
-"""Event counts as classes: every small count one of its own, large ones together.
+"""Pixel values, event counts or grey levels, as classes: every small one its own, large ones together.
 
 A network that gives a probability for every class can say what a mean cannot: that a pixel has one event or none, but
-not half of one. Counts below `NUM_SINGLE` are classes of their own; beyond, each class is a quarter wider than the one
-before, and the counts within it are drawn as training frames have them.
+not half of one. Values below `NUM_SINGLE` are classes of their own; beyond, each class is a quarter wider than the one
+before, and the values within it are drawn as training frames have them.
 
-Noise is added to the square root of the count, scaled to a standard deviation of 1 over all training pixels: the
-spread of a count of independent events is the square root of its mean, so that all counts are equally hard to tell.
+Noise is added to the square root of the value, scaled to a standard deviation of 1 over all training pixels: the spread
+of a count of independent events is the square root of its mean, so that all counts are equally hard to tell.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _GROWTH = 1.25
 
 
 @dataclass(frozen=True, eq=False)
-class CountClasses:
-    """Classes of counts.
+class ValueClasses:
+    """Classes of values.
 
     Attributes:
-        starts: [K] int64 smallest count of each class; the first is 0.
-        values: [V] int64 counts that training frames have, ascending.
+        starts: [K] int64 smallest value of each class; the first is 0.
+        values: [V] int64 values that training frames have, ascending.
         shares: [V] float64 how often, of all pixels.
-        mean: of the square roots of the counts of all training pixels.
+        mean: of the square roots of the values of all training pixels.
         deviation: their standard deviation.
     """
 
@@ -48,21 +48,24 @@ class CountClasses:
         members = self.classes_of(self.values)
         weights = np.bincount(members, self.shares, len(self))
         means = np.bincount(members, self.shares * np.sqrt(self.values), len(self)) / np.maximum(weights, 1e-300)
-        # A class that no training pixel is in stands for its smallest count.
+        # A class that no training pixel is in stands for its smallest value.
         roots = np.where(weights > 0, means, np.sqrt(self.starts))
         return ((roots - self.mean) / self.deviation).astype(np.float32)
 
     @property
-    def event_step(self) -> float:
-        """From no event to one, in the same space: the scale of the noise that hides single events."""
-        return 1.0 / self.deviation
+    def active_step(self) -> float:
+        """From 0 to the median of the other values, in the same space: the scale of the noise that hides pixels."""
+        active = self.values > 0
+        cumulated = np.cumsum(self.shares[active])
+        median = self.values[active][np.searchsorted(cumulated, cumulated[-1] / 2)]
+        return float(np.sqrt(median)) / self.deviation
 
-    def classes_of(self, counts: np.ndarray) -> np.ndarray:
-        """Class of each count, int64, of the same shape."""
-        return np.searchsorted(self.starts, counts, side="right") - 1
+    def classes_of(self, values: np.ndarray) -> np.ndarray:
+        """Class of each value, int64, of the same shape."""
+        return np.searchsorted(self.starts, values, side="right") - 1
 
     def draw(self, classes: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-        """A count of each class: its own, or for one of several counts as training pixels of the class have it.
+        """A value of each class: its own, or for one of several values as training pixels of the class have it.
 
         Args:
             classes: [...] int64.
@@ -70,7 +73,7 @@ class CountClasses:
         Returns:
             [...] uint16.
         """
-        counts = self.starts[classes]
+        drawn = self.starts[classes]
         several = np.flatnonzero((classes >= NUM_SINGLE).ravel())
         if len(several):
             members = self.classes_of(self.values)
@@ -79,29 +82,29 @@ class CountClasses:
             places = before[first] + uniform.ravel()[several] * (before[last] - before[first])
             found = np.clip(np.searchsorted(before, places, side="right") - 1, first, np.maximum(last - 1, first))
             known = last > first
-            counts.reshape(-1)[several[known]] = self.values[found[known]]
-        return counts.astype(np.uint16)
+            drawn.reshape(-1)[several[known]] = self.values[found[known]]
+        return drawn.astype(np.uint16)
 
 
-def fit_classes(counts: Images) -> CountClasses:
+def fit_classes(training_values: Images) -> ValueClasses:
     """The classes of training frames.
 
     Args:
-        counts: [N, ...] uint16, read in parts where they are on disk.
+        training_values: [N, ...] uint8 or uint16, read in parts where they are on disk.
     Raises:
-        DataError: there is no event, or all pixels have equally many.
+        DataError: all pixels have the same value, as where there is no event.
     """
     found = np.zeros(1 << 16, np.int64)
-    for part in image_chunks(counts):
+    for part in image_chunks(training_values):
         found += np.bincount(part.ravel(), minlength=len(found))
     values = np.flatnonzero(found)
     frequencies = found[values]
     if len(values) < 2:
         raise DataError(
-            f"a count decoder needs training frames with events in some pixels and fewer in others, and all have "
-            f"{values.tolist()[:1] or 'no pixels'}"
+            "a pixel decoder needs training frames with events in some pixels and fewer in others; all pixels have the "
+            f"value {values.tolist()[0] if len(values) else 'of none'}"
         )
-    starts = list(range(NUM_SINGLE))
+    starts = list(range(NUM_SINGLE + 1))
     width = 1.0
     while starts[-1] + width <= values[-1]:
         width *= _GROWTH
@@ -110,4 +113,4 @@ def fit_classes(counts: Images) -> CountClasses:
     shares = frequencies / frequencies.sum()
     roots = np.sqrt(values)
     mean = float(shares @ roots)
-    return CountClasses(used, values, shares, mean, float(np.sqrt(shares @ (roots - mean) ** 2)))
+    return ValueClasses(used, values, shares, mean, float(np.sqrt(shares @ (roots - mean) ** 2)))

@@ -1,4 +1,4 @@
-"""A trained count decoder, ready to draw event images anew."""
+"""A trained pixel decoder, ready to draw event images anew."""
 
 from __future__ import annotations
 
@@ -8,36 +8,38 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.count_decoder.count_classes import CountClasses
-from ctlev_core.count_decoder.drawing import draw_counts
-from ctlev_core.count_decoder.files import load_decoder
-from ctlev_core.count_decoder.network import CountNetwork
-from ctlev_core.count_decoder.options import CountDecoderOptions
 from ctlev_core.diffusion.pretrained.loading import choose_device
+from ctlev_core.pixel_decoder.drawing import draw_values, frames_of_planes
+from ctlev_core.pixel_decoder.files import load_decoder
+from ctlev_core.pixel_decoder.network import PixelNetwork
+from ctlev_core.pixel_decoder.options import PixelDecoderOptions
+from ctlev_core.pixel_decoder.value_classes import ValueClasses
 from ctlev_core.plugins import Plugin
 from data_contracts.image_rows import Images
 
 
 @dataclass(frozen=True, eq=False)
-class CountDecoder:
+class PixelDecoder:
     """What `redraw` needs.
 
     Attributes:
         network: on the device to compute on.
         classes: of its counts.
         conditioned: whether it takes condition images.
+        whole_counts: whether its values are event counts, which `encoder` renders, or grey levels.
         options: number of passes and precision.
-        encoder: the event histogram that counts are rendered as.
+        encoder: the encoding of the recorded frames.
     """
 
-    network: CountNetwork
-    classes: CountClasses
+    network: PixelNetwork
+    classes: ValueClasses
     conditioned: bool
-    options: CountDecoderOptions
+    whole_counts: bool
+    options: PixelDecoderOptions
     encoder: Plugin
 
     def redraw(self, frames: Images, conditions: Images | None, seeds: Sequence[int]) -> Iterator[np.ndarray]:
-        """Event images of whole counts, one after another.
+        """Event images with the pixel values of recorded ones, one after another.
 
         Args:
             frames: [N, H, W, 3] uint8 as the generator gives them.
@@ -46,7 +48,7 @@ class CountDecoder:
         Yields:
             [H, W, 3] uint8.
         """
-        drawn = draw_counts(
+        drawn = draw_values(
             self.network,
             self.classes,
             frames,
@@ -55,19 +57,22 @@ class CountDecoder:
             num_passes=self.options.num_passes,
             precision=self.options.precision,
         )
-        for counts in drawn:
-            yield self.encoder.module.render_image(counts[None], self.encoder.options)[0]
+        for values in drawn:
+            if self.whole_counts:
+                yield self.encoder.module.render_image(values[None], self.encoder.options)[0]
+            else:
+                yield frames_of_planes(values[None])[0]
 
 
-def open_decoder(folder: Path, options: CountDecoderOptions, encoder: Plugin) -> CountDecoder:
+def open_decoder(folder: Path, options: PixelDecoderOptions, encoder: Plugin) -> PixelDecoder:
     """Load a decoder.
 
     Args:
         folder: of `save_decoder`.
         options: number of passes, precision and device.
-        encoder: the event histogram of the recorded frames.
+        encoder: the encoding of the recorded frames.
     Raises:
-        DataError: the folder holds no count decoder.
+        DataError: the folder holds no pixel decoder.
     """
-    network, classes, conditioned = load_decoder(folder, choose_device(options.device))
-    return CountDecoder(network, classes, conditioned, options, encoder)
+    network, classes, conditioned, whole_counts = load_decoder(folder, choose_device(options.device))
+    return PixelDecoder(network, classes, conditioned, whole_counts, options, encoder)

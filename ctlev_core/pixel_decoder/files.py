@@ -1,4 +1,4 @@
-"""A trained count decoder on disk: its weights as `decoder.safetensors`, classes and sizes as `decoder.json`."""
+"""A trained pixel decoder on disk: its weights as `decoder.safetensors`, classes and sizes as `decoder.json`."""
 
 from __future__ import annotations
 
@@ -9,24 +9,31 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from ctlev_core.count_decoder.count_classes import CountClasses
-from ctlev_core.count_decoder.network import CountNetwork
-from ctlev_core.count_decoder.options import CountDecoderOptions
-from ctlev_core.count_decoder.training import build_network
+from ctlev_core.pixel_decoder.network import PixelNetwork
+from ctlev_core.pixel_decoder.options import PixelDecoderOptions
+from ctlev_core.pixel_decoder.training import build_network
+from ctlev_core.pixel_decoder.value_classes import ValueClasses
 from data_contracts.errors import DataError
 
 WEIGHTS_FILE, CONFIG_FILE = "decoder.safetensors", "decoder.json"
 
 
 def save_decoder(
-    folder: Path, network: CountNetwork, classes: CountClasses, options: CountDecoderOptions, *, conditioned: bool
+    folder: Path,
+    network: PixelNetwork,
+    classes: ValueClasses,
+    options: PixelDecoderOptions,
+    *,
+    conditioned: bool,
+    whole_counts: bool,
 ) -> None:
-    """Write both files."""
+    """Write both files; `whole_counts` = the values are event counts, not grey levels."""
     folder.mkdir(parents=True, exist_ok=True)
     save_file({name: value.cpu().contiguous() for name, value in network.state_dict().items()}, folder / WEIGHTS_FILE)
     config = {
-        "polarities": network.polarities,
+        "num_planes": network.num_planes,
         "conditioned": conditioned,
+        "whole_counts": whole_counts,
         "width": options.width,
         "depth": options.depth,
         "classes": {
@@ -40,24 +47,29 @@ def save_decoder(
     (folder / CONFIG_FILE).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
 
 
-def load_decoder(folder: Path, device: torch.device) -> tuple[CountNetwork, CountClasses, bool]:
-    """What was saved: network, classes, and whether it takes condition images.
+def load_decoder(folder: Path, device: torch.device) -> tuple[PixelNetwork, ValueClasses, bool, bool]:
+    """What was saved: network, classes, whether it takes condition images, and whether it draws counts.
 
     Raises:
-        DataError: a file is missing or is not that of a count decoder.
+        DataError: a file is missing or is not that of a pixel decoder.
     """
     try:
         config = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
         found = config["classes"]
-        classes = CountClasses(
+        classes = ValueClasses(
             np.array(found["starts"], np.int64),
             np.array(found["values"], np.int64),
             np.array(found["shares"], np.float64),
             float(found["mean"]),
             float(found["deviation"]),
         )
-        network = build_network(classes, config["polarities"], config["conditioned"], config["width"], config["depth"])
+        network = build_network(classes, config["num_planes"], config["conditioned"], config["width"], config["depth"])
         network.load_state_dict(load_file(folder / WEIGHTS_FILE))
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise DataError(f"{folder}: no count decoder can be read: {str(error)[:300]}") from error
-    return network.to(device).eval().requires_grad_(False), classes, bool(config["conditioned"])
+        raise DataError(f"{folder}: no pixel decoder can be read: {str(error)[:300]}") from error
+    return (
+        network.to(device).eval().requires_grad_(False),
+        classes,
+        bool(config["conditioned"]),
+        bool(config["whole_counts"]),
+    )
