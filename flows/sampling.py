@@ -1,4 +1,4 @@
-"""Sample frames of a trained generator as an experiment asks: as they come, or with the pixel values of recorded ones."""
+"""Sample frames of a trained generator: as they come, or with the pixel values of recorded ones."""
 
 from __future__ import annotations
 
