@@ -119,8 +119,8 @@ class Experiment(Frozen):
     pixel_decoder: dict[str, Any] | None = Field(
         None,
         description="options of a decoder that draws the pixel values of sampled images as recorded ones have "
-        "them, whole event counts and the noise of the sensor; {} = its defaults; of diffusion generators, whose frames "
-        "are then not rounded; null = none",
+        "them, whole event counts and the noise of the sensor; {} = its defaults; of diffusion generators, whose "
+        "frames are then not rounded; null = none",
     )
     num_generators: int = Field(
         1,
