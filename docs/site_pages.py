@@ -73,6 +73,7 @@ def preset_files() -> str:
 def experiment_options() -> str:
     """Options of experiments and of what is built of them."""
     from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
+    from ctlev_core.pixel_decoder.options import PixelDecoderOptions
     from data_contracts.experiment import Experiment
     from data_contracts.realism_chain import RealismChain
     from data_contracts.regeneration import Regeneration
@@ -96,6 +97,7 @@ def experiment_options() -> str:
         ("`flows/realism_chain.py`: further options", RealismChain, common),
         ("`flows/speed_vs_error.py`", SpeedVsErrorOptions, set()),
         ("`flows/pretrain.py`, and `base_model` of an experiment", PretrainingOptions, set()),
+        ("`pixel_decoder` of an experiment", PixelDecoderOptions, set()),
     ):
         text += [f"## {heading}", "", *option_tables(model, without, skip=(Experiment,)), ""]
     return "\n".join(text)
