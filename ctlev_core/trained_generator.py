@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ctlev_core import plugins
+from ctlev_core.pixel_decoder.options import DECODER_FOLDER
 from ctlev_core.plugins import validate_options
-from ctlev_core.provenance.records import read_provenance
+from ctlev_core.provenance.records import Record, read_provenance
 from ctlev_core.seeds import sample_seeds
+from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 from data_contracts.manifest import RUN_FILE
@@ -25,16 +28,32 @@ PROMPT = "A moving human"
 """What ControlNets are told, where nothing else is said."""
 
 
+@dataclass(frozen=True)
+class DecoderChoice:
+    """A trained pixel decoder, and how a run used it.
+
+    Attributes:
+        folder: of its weights.
+        options: `PixelDecoderOptions`, as a run recorded them.
+        encoding: that of the recorded frames.
+    """
+
+    folder: Path
+    options: dict[str, Any]
+    encoding: EncodingChoice
+
+
 class TrainedGenerator:
     """A checkpoint, and how to sample from it.
 
     Attributes:
         folder: of the checkpoint; of diffusion models an ordinary diffusers folder.
         name: of the plug-in in `ctlev_core/generators` that made it.
+        decoder: draws the pixel values of what is sampled, where the run had one.
     """
 
-    def __init__(self, folder: Path, name: str) -> None:
-        self.folder, self.name = folder, name
+    def __init__(self, folder: Path, name: str, decoder: DecoderChoice | None = None) -> None:
+        self.folder, self.name, self.decoder = folder, name, decoder
 
     def __repr__(self) -> str:
         return f"TrainedGenerator({self.name!r}, {str(self.folder)!r})"
@@ -64,18 +83,29 @@ class TrainedGenerator:
         """
         asked = _conditions(prompts, images)
         module: Any = plugins.load("generators", self.name)
+        if self.decoder is not None:
+            options = {"black_threshold": 0} | options
         chosen = validate_options(module.SampleOptions, options, f"generators {self.name!r}")
+        seeds = sample_seeds(seed, len(asked))
         with tempfile.TemporaryDirectory(prefix="ctlev_sample_") as work:
-            seeds = sample_seeds(seed, len(asked))
-            return module.sample(self.folder, asked, chosen, seeds=seeds, work=Path(work))
+            frames = module.sample(self.folder, asked, chosen, seeds=seeds, work=Path(work))
+        return frames if self.decoder is None else self._decoded(self.decoder, frames, asked, seeds)
+
+    def _decoded(self, choice: DecoderChoice, frames: np.ndarray, asked: Conditions, seeds: list[int]) -> np.ndarray:
+        from ctlev_core.pixel_decoder.decoder import open_decoder
+        from ctlev_core.pixel_decoder.options import PixelDecoderOptions
+
+        options = validate_options(PixelDecoderOptions, choice.options, f"pixel decoder {choice.folder}")
+        decoder = open_decoder(choice.folder, options, plugins.load_options(choice.encoding))
+        return np.stack(list(decoder.redraw(frames, asked.images, seeds)))
 
 
 def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] | None = None) -> TrainedGenerator:
     """The generator of a run, or of a folder.
 
     Args:
-        place: name of a report (its experiment's own generator), the path of an artefact of the stage `finetune`, or of
-            a diffusers folder that training wrote.
+        place: name of a report (its experiment's own generator, with its pixel decoder), the path of an artefact of the
+            stage `finetune`, or of a diffusers folder that training wrote.
         home: folder of all state, where `place` is a name; None = CTLEV_HOME, else `.ctlev`.
     Raises:
         DataError: there is no such run or folder, or it holds no generator.
@@ -91,17 +121,30 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
             f"generator {str(place)!r}: is neither a folder nor a report of {state}, which has "
             f"{', '.join(known) or 'none'}; of a study name the folder of a checkpoint"
         )
-    records = [one for one in read_provenance(report / "provenance.json") if one.stage == "finetune"]
-    own = next((one for one in records if one.role == "checkpoint of synthetic"), None)
+    records = read_provenance(report / "provenance.json")
+    own = next((one for one in records if one.role == "checkpoint of synthetic" and one.stage == "finetune"), None)
     if own is None:
         raise DataError(f"{report}: no generator was trained in this run")
-    folder = state / "artefacts" / own.stage / own.key
+    decoded = next((one for one in records if one.role == "synthetic" and one.stage == "decode_pixels"), None)
+    return _of_folder(_in_store(state, own.stage, own.key), None if decoded is None else _decoder_of(state, decoded))
+
+
+def _in_store(state: Path, stage: str, key: str) -> Path:
+    folder = state / "artefacts" / stage / key
     if not folder.is_dir():
         raise DataError(f"{folder}: is not in the store any more; run the experiment again")
-    return _of_folder(folder)
+    return folder
 
 
-def _of_folder(folder: Path) -> TrainedGenerator:
+def _decoder_of(state: Path, decoded: Record) -> DecoderChoice:
+    """What drew the synthetic frames of a run."""
+    asked = decoded.arguments
+    encoding = EncodingChoice(name=asked["encoding"]["plugin"].rpartition("/")[2], options=asked["encoding"]["options"])
+    folder = _in_store(state, "train_pixel_decoder", asked["decoder"]["manifest"])
+    return DecoderChoice(folder / DECODER_FOLDER, asked["options"], encoding)
+
+
+def _of_folder(folder: Path, decoder: DecoderChoice | None = None) -> TrainedGenerator:
     """The generator of an artefact, or of the checkpoint alone."""
     if not (folder / RUN_FILE).is_file() and (folder.parent / RUN_FILE).is_file() and folder.name == CHECKPOINT:
         folder = folder.parent
@@ -110,7 +153,7 @@ def _of_folder(folder: Path) -> TrainedGenerator:
             plugin = json.loads((folder / RUN_FILE).read_text())["arguments"]["generator"]["plugin"]
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{folder}: is no artefact of the stage finetune") from error
-        return TrainedGenerator(folder / CHECKPOINT, plugin.rpartition("/")[2])
+        return TrainedGenerator(folder / CHECKPOINT, plugin.rpartition("/")[2], decoder)
     if not (folder / "model_index.json").is_file():
         raise DataError(
             f"{folder}: expected an artefact of the stage finetune or a diffusers folder; no model_index.json"

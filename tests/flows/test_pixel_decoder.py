@@ -5,6 +5,9 @@ from flow_scripts import artefacts, run_script_here
 
 from ctlev_core import plugins
 from ctlev_core.postprocessing.image_counts import estimate_counts, fit_counts
+from ctlev_core.provenance.records import read_records
+from ctlev_core.seeds import sample_seeds
+from ctlev_core.trained_generator import TrainedGenerator, _decoder_of, load_generator
 from data_contracts.config import EncodingChoice
 
 SMALL = (
@@ -13,6 +16,7 @@ SMALL = (
     "generator.options={tune: both, num_steps: 2, batch_size: 2}",
     "sampling.num_inference_steps=2",
     "num_synthetic=6",
+    "max_attempts=1",
     "baselines={}",
     "oracle=null",
 )
@@ -37,6 +41,16 @@ def test_sampled_frames_become_renderings_of_whole_counts(tmp_path):
     encoder = plugins.load_options(EncodingChoice(name="event_histogram", options={"polarity": False}))
     model = fit_counts(np.asarray(encoded.array("histograms")), encoder.options)
     assert estimate_counts(frames, model, seeds=range(len(frames))).is_exact.all(), "each is a rendering of counts"
+
+    # From Python the same frames come, of the same conditions and seeds.
+    generator = load_generator(artefacts(tmp_path, "finetune")[0].ref.path)
+    choice = _decoder_of(tmp_path, read_records([("synthetic", drawn.ref.path)])[0])
+    (asked,) = artefacts(tmp_path, "condition_samples")
+    again = TrainedGenerator(generator.folder, "controlnet", choice).sample(
+        asked.column("prompt"), images=asked.array("images"), num_inference_steps=2, palette="grey"
+    )
+    assert drawn.column("seed") == sample_seeds(0, len(drawn)), "none was sampled again"
+    np.testing.assert_array_equal(again, frames)
 
     # Drawn in another number of passes: neither the generator nor the decoder is trained again.
     finished = run(tmp_path, f"{{{DECODER}, num_passes: 1}}")
