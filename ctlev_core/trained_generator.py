@@ -125,7 +125,7 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
     own = next((one for one in records if one.role == "checkpoint of synthetic" and one.stage == "finetune"), None)
     if own is None:
         raise DataError(f"{report}: no generator was trained in this run")
-    decoded = next((one for one in records if one.role == "synthetic" and one.stage == "decode_pixels"), None)
+    decoded = next((one for one in records if one.role == "frames of synthetic" and one.stage == "decode_pixels"), None)
     return _of_folder(_in_store(state, own.stage, own.key), None if decoded is None else _decoder_of(state, decoded))
 
 

@@ -5,9 +5,9 @@ from flow_scripts import artefacts, run_script_here
 
 from ctlev_core import plugins
 from ctlev_core.postprocessing.image_counts import estimate_counts, fit_counts
-from ctlev_core.provenance.records import read_records
+from ctlev_core.provenance.records import read_records, write_provenance
 from ctlev_core.seeds import sample_seeds
-from ctlev_core.trained_generator import TrainedGenerator, _decoder_of, load_generator
+from ctlev_core.trained_generator import load_generator
 from data_contracts.config import EncodingChoice
 
 SMALL = (
@@ -43,10 +43,11 @@ def test_sampled_frames_become_renderings_of_whole_counts(tmp_path):
     assert estimate_counts(frames, model, seeds=range(len(frames))).is_exact.all(), "each is a rendering of counts"
 
     # From Python the same frames come, of the same conditions and seeds.
-    generator = load_generator(artefacts(tmp_path, "finetune")[0].ref.path)
-    choice = _decoder_of(tmp_path, read_records([("synthetic", drawn.ref.path)])[0])
-    (asked,) = artefacts(tmp_path, "condition_samples")
-    again = TrainedGenerator(generator.folder, "controlnet", choice).sample(
+    (tuned,), (asked,) = artefacts(tmp_path, "finetune"), artefacts(tmp_path, "condition_samples")
+    roles = [("checkpoint of synthetic", tuned.ref.path), ("frames of synthetic", drawn.ref.path)]
+    (tmp_path / "reports" / "mine").mkdir(parents=True)
+    write_provenance(tmp_path / "reports" / "mine" / "provenance.json", read_records(roles))
+    again = load_generator("mine", home=tmp_path).sample(
         asked.column("prompt"), images=asked.array("images"), num_inference_steps=2, palette="grey"
     )
     assert drawn.column("seed") == sample_seeds(0, len(drawn)), "none was sampled again"
