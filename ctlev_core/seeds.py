@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+
 import numpy as np
 
 
 def sample_seeds(seed: int, count: int) -> list[int]:
     """Seeds of rows 0 .. count - 1, the same for every `count`."""
     return [int(np.random.SeedSequence([seed, row]).generate_state(1)[0]) for row in range(count)]
+
+
+def distinct_seeds(seeds: Sequence[int]) -> list[int]:
+    """The same seeds, but of those that are equal only the first: the k-th gets one that follows from it and from k.
+
+    Frames of one motion share the noise they are sampled from; a sensor's noise is another in every frame.
+    """
+    seen: Counter[int] = Counter()
+    found = []
+    for seed in seeds:
+        number, seen[seed] = seen[seed], seen[seed] + 1
+        found.append(seed if number == 0 else int(np.random.SeedSequence([seed, number]).generate_state(1)[0]))
+    return found

@@ -9,6 +9,7 @@ from ctlev_core import plugins
 from ctlev_core.events.windows import spread
 from ctlev_core.pixel_decoder.options import DECODER_FOLDER, PixelDecoderOptions
 from ctlev_core.progress import ProgressBar
+from ctlev_core.seeds import distinct_seeds
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, SamplingChoice
 from data_contracts.manifest import Manifest, conditions_of, history_table, matching_rows
@@ -109,7 +110,7 @@ def decode_pixels(
 
     opened = open_decoder(decoder.ref.path / DECODER_FOLDER, options, plugins.load_options(encoding))
     images = conditions_of(conditions).images
-    redrawn = opened.redraw(synthetic.array("frames"), images, synthetic.column("seed"))
+    redrawn = opened.redraw(synthetic.array("frames"), images, distinct_seeds(synthetic.column("seed")))
     with (
         out.open_array("frames") as written,
         ProgressBar(redrawn, total=len(synthetic), desc="pixel values", unit="image") as frames,

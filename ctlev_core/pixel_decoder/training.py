@@ -6,6 +6,7 @@ Everything random is a function of (seed, step), so that a run that is killed an
 from __future__ import annotations
 
 import json
+import logging
 import math
 import time
 from collections.abc import Sequence
@@ -28,6 +29,9 @@ from data_contracts.errors import TrainingError
 from data_contracts.image_rows import Images, as_image_rows
 from data_contracts.labels import History
 
+logger = logging.getLogger(__name__)
+
+FEW_FRAMES = 50
 MAX_VALIDATION = 64
 """Frames held back for the validation curve, a tenth of all at most."""
 _ORDER_STREAM, _CROP_STREAM, _NOISE_STREAM, _WEIGHT_STREAM, _SPLIT_STREAM = 1, 2, 3, 4, 5
@@ -112,6 +116,13 @@ def train_pixel_decoder(
         DataError: training frames have no events.
         TrainingError: losses or gradients stayed not finite.
     """
+    if len(pairs) < FEW_FRAMES:
+        logger.warning(
+            "the pixel decoder learns from %d frames; fewer than %d are soon learnt by heart: compare the training and "
+            "validation losses, or lower pixel_decoder.num_steps",
+            len(pairs),
+            FEW_FRAMES,
+        )
     device, state = choose_device(options.device), work / "state.pt"
     classes, num_planes = fit_classes(pairs.values), pairs.values.shape[1]
     with torch.random.fork_rng(devices=[]):

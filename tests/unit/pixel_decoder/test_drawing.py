@@ -13,6 +13,7 @@ from ctlev_core.pixel_decoder.drawing import (
 )
 from ctlev_core.pixel_decoder.training import build_network
 from ctlev_core.pixel_decoder.value_classes import fit_classes
+from ctlev_core.seeds import distinct_seeds
 
 PRIOR = np.array([0.8, 0.12, 0.05, 0.03])
 
@@ -108,3 +109,10 @@ def test_planes_of_frames_and_back(num_planes):
     assert frames.shape == (4, 5, 6, 3) and frames.dtype == np.uint8
     np.testing.assert_array_equal(image_planes(frames, num_planes), planes)
     assert (frames[..., 1] == (planes[:, 0] if num_planes == 1 else 0)).all() or num_planes == 3
+
+
+def test_frames_that_share_a_seed_are_drawn_differently():
+    assert distinct_seeds([7, 9, 4]) == [7, 9, 4]
+    found = distinct_seeds([7, 7, 9, 7])
+    assert found[0] == 7 and found[2] == 9 and len(set(found)) == 4
+    assert distinct_seeds([7, 7]) == found[:2], "nothing depends on the rows after"

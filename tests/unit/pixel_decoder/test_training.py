@@ -97,8 +97,9 @@ def test_a_decoder_on_disk_is_the_one_that_was_saved(tmp_path):
         load_decoder(tmp_path / "decoder", torch.device("cpu"))
 
 
-def test_ten_frames_are_enough_to_train_on(tmp_path):
+def test_ten_frames_are_enough_to_train_on_and_few_enough_to_say_so(tmp_path, caplog):
     _, _, history = train_pixel_decoder(make_pairs(10), SMALL, seed=0, work=tmp_path)
+    assert "learns from 10 frames; fewer than 50 are soon learnt by heart" in caplog.text
     assert np.isfinite(history.loss).all() and np.isfinite(history.validation_loss).all()
 
 
