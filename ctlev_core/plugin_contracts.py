@@ -318,8 +318,8 @@ class DownstreamOfLabels(Downstream, Protocol):
 
     `PREDICTS` are those of the following that `predict` returns, N rows each: `joints2d` [N, J, 2] px; `joints3d`
     [N, J, 3] mm, camera frame; `smpl`, that is `smpl_pose` [N, 72] rad, `smpl_betas` [N, 10] and `smpl_transl`
-    [N, 3] m, camera frame; `classes`, that is `probability` [N, K] and `classes` [K], the names of its columns. None:
-    the model has features alone.
+    [N, 3] m, camera frame; `classes`, that is `probability` [N, K] and `classes` [K], the names of its columns, and of
+    binary classifiers also `binary_probability` [N, K], of each class by its own. None: the model has features alone.
     """
 
     PREDICTS: tuple[str, ...]

@@ -4,18 +4,22 @@ The paper trains a pre-trained ResNet-34 with a randomly initialised MLP head (N
 here is a ResNet-10 of a quarter of the width from random weights, which two CPU cores train in a minute;
 `architecture="resnet34"`, a `head_width` and a folder of `weights` (microsoft/resnet-34) give the paper's model.
 The class list is the sorted list of the classes in the training labels.
+
+The paper's Table 5 trains binary classifiers: `binary` makes one network of each class, which tells it from the others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from ctlev_core.networks.resnet_files import ARCHITECTURES, SMALL_CNN, check_batch, check_resnet_folder
+from ctlev_core.supervised.binary_tasks import Negatives, is_binary, predict_each, train_each
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
@@ -53,6 +57,20 @@ class Options(SupervisedOptions):
         description="a recording has the mean of the probabilities of its frames: where a recording is cut into "
         "windows, scores are then by recording",
     )
+    binary: Negatives | None = Field(
+        default=None,
+        description="one network of each class, that tells it from the others, as in the paper's Table 5; it learns "
+        "from all frames of other classes, or from as many as there are of its own (balanced); null = one network of "
+        "all classes",
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A network of all classes is the same model, of the same key, as before there were binary ones."""
+        values = serialize(self)
+        if self.binary is None:
+            values.pop("binary", None)
+        return values
 
 
 def input_files(options: Options) -> list[Path]:
@@ -79,6 +97,8 @@ def train(
 ) -> History:
     """Train on frames with class names and write `model.safetensors` and `config.json` to `out`.
 
+    With `binary` there is a folder with both of each class (`ctlev_core.supervised.binary_tasks`).
+
     Args:
         frames: [N, H, W, 3] uint8.
         labels: N rows with class names, at least two different ones.
@@ -100,6 +120,12 @@ def train(
     from ctlev_core.supervised.loop import train_model
 
     classes, targets = _check_training_set(frames, labels, options)
+    if options.binary is not None:
+        train_one = partial(train, options=options.model_copy(update={"binary": None}), seed=seed)
+        return train_each(
+            train_one, frames, labels, classes, options.binary,
+            seed=seed, out=out, work=work, parts=parts, groups=groups,
+        )  # fmt: skip
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups, classes=targets)
     weights = models.file_digests(input_files(options))
     device = models.resolve_device(options.device)
@@ -144,8 +170,11 @@ def predict(model: Path, frames: Images) -> Mapping[str, np.ndarray]:
         model: folder written by `train`.
         frames: [N, H, W, 3] uint8.
     Returns:
-        `probability` [N, K] float32 and `classes` [K] str, the name of each column.
+        `probability` [N, K] float32 and `classes` [K] str, the name of each column; of binary classifiers also what
+        `predict_each` adds.
     """
+    if is_binary(model):
+        return predict_each(lambda folder: predict(folder, frames), model)
     network, config = _read_model(model)
     probability = _run(network, lambda images: network(images).softmax(dim=-1), frames)
     classes = np.array(config["classes"])
@@ -162,6 +191,8 @@ def predict_recordings(model: Path, frames: Images, recordings: Sequence[str]) -
     """
     from ctlev_core.supervised import models
 
+    if is_binary(model):
+        return predict_each(lambda folder: predict_recordings(folder, frames, recordings), model)
     found = predict(model, frames)
     if not models.read_config(model, NAME)["options"]["by_recording"]:
         return found
@@ -173,7 +204,13 @@ def predict_recordings(model: Path, frames: Images, recordings: Sequence[str]) -
 
 
 def features(model: Path, frames: Images) -> np.ndarray:
-    """Pooled features [N, D] float32 in front of the head: what the Frechet distance compares."""
+    """Pooled features [N, D] float32 in front of the head: what the Frechet distance compares.
+
+    Raises:
+        DataError: the model is one of binary classifiers, each of which has features of its own.
+    """
+    if is_binary(model):
+        raise DataError("feature_extractor: expected a classifier of all classes, got one with option `binary`")
     network, config = _read_model(model)
     return _run(network, network.features, frames).reshape(len(frames), _num_features(config["shape"]))
 

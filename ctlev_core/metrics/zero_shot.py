@@ -1,8 +1,9 @@
 """Binary accuracy of telling each held-out class from the others, with balanced negatives: the paper's Table 5.
 
-For each class, the images of that class are the positives and those of the other classes the negatives; an image is
-called positive where the class has the highest probability of all. With a two-class model, "bonsai" against anything
-else, that is a binary classifier as in the paper; with a model of all held-out classes it is one against the rest.
+For each class, the images of that class are the positives and those of the other classes the negatives. Of binary
+classifiers, one of each class as in the paper (option `binary` of the downstream model), an image is called positive
+where the classifier of the class gives it more than one half. Of one model of all classes it is where the class has the
+highest probability of all: one against the rest.
 
 Accuracy is given as expected for as many negatives as positives, drawn at random: the mean of the shares of positives
 and negatives told right (`ctlev_core.scoring.zero_shot`). Chance is 0.5, whatever the numbers of images are. The paper
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ctlev_core.scoring.classification import read_guesses
+from ctlev_core.scoring.classification import Guesses, read_guesses
 from ctlev_core.scoring.score_info import ScoreInfo
 from ctlev_core.scoring.zero_shot import balanced_accuracy
 from data_contracts.config import Frozen
@@ -44,7 +45,8 @@ def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> d
     """`binary_accuracy_mean` over the classes, and `binary_accuracy_CLASS` of each.
 
     Args:
-        predicted: `probability` [N, K] and `classes` [K], the names of the columns.
+        predicted: `probability` [N, K] and `classes` [K], the names of the columns; of binary classifiers also
+            `binary_probability` [N, K].
         target: N rows with class names. A class the model does not know is never called: 0.5.
         options: classes.
     Returns:
@@ -63,13 +65,14 @@ def prepare(predicted: Mapping[str, Any], target: Labels, options: Options) -> C
     guesses = read_guesses(predicted, target)
     names = options.classes or tuple(sorted(set(target.class_names)))
     numbers = {name: number for number, name in enumerate(guesses.classes.tolist())}
+    called = _calls(predicted, guesses)
     if missing := [name for name in names if name not in target.class_names]:
         raise ValueError(f"no target row is of class {', '.join(missing)}")
 
     def compute_of(rows: np.ndarray) -> dict[str, float]:
         found = {}
         for name in names:
-            is_positive, is_called = (column[rows] == numbers[name] for column in (guesses.truth, guesses.guess))
+            is_positive, is_called = guesses.truth[rows] == numbers[name], called[rows, numbers[name]]
             count = int(np.count_nonzero(is_positive))
             if count in (0, len(rows)):
                 raise ValueError(f"class {name!r} has {count} of {len(rows)} rows; it needs some and not all")
@@ -91,9 +94,20 @@ def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options)
     names = options.classes or tuple(sorted(set(target.class_names)))
     prepare(predicted, target, options)(np.arange(len(target)))  # raises
     numbers = {name: number for number, name in enumerate(guesses.classes.tolist())}
-    total = np.zeros(len(target))
+    total, called = np.zeros(len(target)), _calls(predicted, guesses)
     for name in names:
-        is_positive, is_called = (column == numbers[name] for column in (guesses.truth, guesses.guess))
+        is_positive, is_called = guesses.truth == numbers[name], called[:, numbers[name]]
         share = np.where(is_positive, 1 / is_positive.sum(), 1 / (~is_positive).sum())
         total += share * (is_positive == is_called)
     return total * len(target) / (2 * len(names))
+
+
+def _calls(predicted: Mapping[str, Any], guesses: Guesses) -> np.ndarray:
+    """Which classes [N, K] each row is called; K as in `guesses`, which may hold classes the model does not know."""
+    called = guesses.guess[:, None] == np.arange(len(guesses.classes))
+    if "binary_probability" in predicted:
+        known = np.asarray(predicted["binary_probability"]) > 0.5
+        if known.shape != np.shape(predicted["probability"]):
+            raise ValueError(f"binary_probability must be {np.shape(predicted['probability'])}, got {known.shape}")
+        called[:, : known.shape[1]] = known
+    return called

@@ -14,7 +14,8 @@ from flows.command_line import load_experiment
 
 TINY = (
     "generator.options.num_steps=2", "generator.options.batch_size=2", "sampling.num_inference_steps=2",
-    "downstream={name: classifier, options: {num_steps: 2, batch_size: 2}}", "num_synthetic=6", "max_attempts=1",
+    "downstream={name: classifier, options: {num_steps: 2, batch_size: 2, binary: balanced}}",
+    "num_synthetic=6", "max_attempts=1",
     "feature_extractor={name: classifier, options: {num_steps: 2, batch_size: 2}}",
 )  # fmt: skip
 SEEN = {names.partition(",")[0] for names in CLASSES.values()}
@@ -56,8 +57,11 @@ def test_only_the_targets_classes_are_sampled_learnt_and_tested(made):
     assert {row["metric"] for row in scored} >= {"binary_accuracy_bonsai", "binary_accuracy_crocodile head"}
     # The judge of labels knows the target's classes; the features are those of what the generator has learnt.
     learnt = {json.dumps(sorted(json.loads(path.read_text())["classes"])) for path in home.glob(
-        "artefacts/train_downstream/*/model/config.json")}  # fmt: skip
+        "artefacts/train_downstream/*/model/[cb]*.json")}  # fmt: skip
     assert learnt == {json.dumps(sorted(SEEN)), json.dumps(sorted(UNSEEN))}
+    # As in the paper's Table 5, each of the target's classes has a network of its own.
+    folders = [path.parent for path in home.glob("artefacts/train_downstream/*/model/binary.json")]
+    assert folders and all(len(list(folder.glob("*/model.safetensors"))) == len(UNSEEN) for folder in folders)
 
 
 def test_the_nearest_seen_classes_are_those_of_the_generators_own_text_encoder(made):

@@ -120,6 +120,28 @@ def test_zero_shot_by_hand():
     assert both["binary_accuracy_ferry"] == 0.5
 
 
+def test_zero_shot_of_binary_classifiers_asks_each_of_them():
+    """Two of a fair half are called at once, or none: the highest of all says nothing about that."""
+    truth = ["bonsai", "bonsai", "ferry", "ferry", "pagoda"]
+    binary = np.array([[0.9, 0.8], [0.4, 0.3], [0.6, 0.7], [0.2, 0.1], [0.45, 0.55]])
+    predicted = {
+        "probability": binary / binary.sum(axis=1, keepdims=True),
+        "binary_probability": binary,
+        "classes": np.array(["bonsai", "ferry"]),
+    }
+    found = zero_shot.compute(predicted, class_labels(truth), zero_shot.Options())
+    assert found == {
+        "binary_accuracy_bonsai": pytest.approx((1 / 2 + 2 / 3) / 2),
+        "binary_accuracy_ferry": pytest.approx((1 / 2 + 1 / 3) / 2),
+        "binary_accuracy_pagoda": 0.5,
+        "binary_accuracy_mean": pytest.approx((7 / 12 + 5 / 12 + 1 / 2) / 3),
+    }
+    rows = zero_shot.compute_rows(predicted, class_labels(truth), zero_shot.Options())
+    assert rows.mean() == pytest.approx(found["binary_accuracy_mean"])
+    with pytest.raises(ValueError, match="binary_probability must be"):
+        zero_shot.compute({**predicted, "binary_probability": binary[:, :1]}, class_labels(truth), zero_shot.Options())
+
+
 def test_zero_shot_is_the_mean_over_balanced_draws():
     random = np.random.default_rng(2)
     truth = np.array(["a"] * 30 + ["b"] * 70 + ["c"] * 70)

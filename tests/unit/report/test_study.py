@@ -409,6 +409,9 @@ def test_a_path_that_is_given_is_no_longer_missing(tmp_path):
     learnt = (body.condition.options, body.downstream.options, metric.options)
     for options in (*learnt, recorded.condition.options, recorded.sampling):
         assert options["body"] == str(tmp_path / "body.npz")
+    # Table 5 is of binary classifiers, Table 1 of one of all classes.
+    assert parts["zero_shot"].downstream.options["binary"] == "balanced"
+    assert "binary" not in parts["recognition"].downstream.options
     # The same lines of the file serve several experiments, and each has a ControlNet of its own.
     controlnets = {name: part.generator.options["controlnet"] for name, part in parts.items() if "pose" in name}
     assert set(controlnets.values()) == {"paths.controlnet_openpose"}
