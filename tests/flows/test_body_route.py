@@ -10,6 +10,7 @@ SMALL = (
     "windows.max_windows=1",
     "generator.options={tune: both, num_steps: 3, batch_size: 2, learning_rate: 1.0e-3}",
     "sampling.num_inference_steps=2",
+    "pixel_decoder={num_steps: 2, batch_size: 2, width: 16, depth: 1, time_steps: [500], evaluations: 2}",
     "downstream.options={num_steps: 4, batch_size: 4, warmup_steps: 1}",
     "downstream_seeds=[0]",
     "feature_extractor=null",
