@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 
 class Frozen(BaseModel):
@@ -99,3 +99,29 @@ class Windows(Frozen):
         default=None, gt=0, description="at most so many of each split of a recording, evenly spread"
     )
     min_events: int = Field(default=1, ge=1, description="drop windows with fewer events (duration, whole)")
+    anchor: Literal["first_event", "labels"] = Field(
+        default="first_event",
+        description="one window after another from the first event; or one that ends at each label (count, duration), "
+        "which overlap where labels follow faster",
+    )
+    labels: Literal["mean", "interpolated"] = Field(
+        default="mean",
+        description="label of a window that has none of its own: the mean of the positions in it and the last body, or "
+        "those nearest to it, as DHP19; or those at its end, between the labels before and after, without which, or "
+        "with a gap between them, there is no window",
+    )
+
+    @model_validator(mode="after")
+    def _labels_end_what_can_be_moved(self) -> Windows:
+        if self.anchor == "labels" and self.method not in ("count", "duration"):
+            raise ValueError(f"windows.anchor 'labels' needs method count or duration, got {self.method!r}")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Frames of other windows keep the keys that they had before there was a choice."""
+        values = serialize(self)
+        for name, off in (("anchor", "first_event"), ("labels", "mean")):
+            if values.get(name) == off:
+                values.pop(name)
+        return values

@@ -108,10 +108,12 @@ def condition_samples(
     virtual camera. New views turn each body, or in order of time each recording, to a camera of its own.
 
     Whatever the condition, the same moments are chosen, so that generators can be compared on the same poses. The
-    window around a label-only moment is as long as the median one of training. For pictures in windows of equal `count`
+    window around a label-only moment, or before it where windows end at labels, is as long as the median one of
+    training. For pictures in windows of equal `count`
     it is as long as it takes them to change as much as the pictures of training do.
     """
     half_us = half_window_us(frames)
+    before_us, after_us = (2 * half_us, 0) if windows.anchor == "labels" else (half_us, half_us)
     moments = _label_only(poses)
     if moments.num_rows:
         inner = surrounded(moments["recording_id"].to_pylist(), moments["t_us"].to_numpy(), half_us)
@@ -126,8 +128,8 @@ def condition_samples(
             recordings=poses,
             recording_ids=names,
             subjects=chosen["subject"].to_pylist(),
-            t_start_us=np.maximum(times - half_us, 0),
-            t_end_us=times + half_us,
+            t_start_us=np.maximum(times - before_us, 0),
+            t_end_us=times + after_us,
             labelled=labelled,
             labels=_seen(labelled, _sensors(poses, names), recordings, frames, encoding, turned, seed),
         )

@@ -14,7 +14,8 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
-from ctlev_core.events.windows import cut_chunks, spread
+from ctlev_core.events.windows import cut_at_labels, cut_chunks, spread
+from ctlev_core.labels.interpolation import interpolate_labels, is_between_labels
 from ctlev_core.labels.labelling import has_label, labels_at_windows, labels_in_image
 from ctlev_core.progress import ProgressBar
 from data_contracts import tables
@@ -238,8 +239,12 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
     for part in source.parts:
         start, stop = part["event_start"], part["event_stop"]
         held = event_files.read_events_range(path, start, stop) if stop - start <= MAX_EVENTS else None
-        if source.windows is None:
-            ranges, labels = start + cut_chunks(_time_stamps(path, start, stop, held), windows), None
+        stamps = _time_stamps(path, start, stop, held)
+        if windows.anchor == "labels":
+            ranges, own_labels = cut_at_labels(stamps, source.track.t_us, windows)
+            ranges, labels = start + ranges, source.track.take(own_labels)
+        elif source.windows is None:
+            ranges, labels = start + cut_chunks(stamps, windows), None
         else:
             inside = (source.windows[:, 0] >= start) & (source.windows[:, 1] <= stop)
             chosen = np.flatnonzero(inside & (np.diff(source.windows)[:, 0] >= windows.min_events))
@@ -255,17 +260,29 @@ def _encode_events(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
             local = ranges[rows] - first
             t_start, t_end = events.t[local[:, 0]], events.t[local[:, 1] - 1]
             if labels is None:
-                known = has_label(source.track, t_start, t_end)
+                known = _is_labelled(source.track, t_start, t_end, windows)
                 rows, local, t_start, t_end = (array[known] for array in (rows, local, t_start, t_end))
                 if not len(rows):
                     continue
             counts = plugin.module.encode(events, local, plugin.options)
             _tell_full(counts, source.recording["recording_id"], rows)
             frames = plugin.module.render_image(counts, plugin.options)
-            own = labels_at_windows(source.track, t_start, t_end) if labels is None else labels.take(rows)
+            own = _label(source.track, t_start, t_end, windows) if labels is None else labels.take(rows)
             own = _to_image(own, events.sensor_size, plugin, (frames.shape[2], frames.shape[1]))
             described = _rows(source.recording, part["split"], rows, t_start, t_end, local[:, 1] - local[:, 0])
             yield _Samples(described, counts, frames, own)
+
+
+def _is_labelled(track: Labels, t_start: np.ndarray, t_end: np.ndarray, windows: Windows) -> np.ndarray:
+    """Which windows [N] `_label` has something to say of."""
+    return is_between_labels(track, t_end) if windows.labels == "interpolated" else has_label(track, t_start, t_end)
+
+
+def _label(track: Labels, t_start: np.ndarray, t_end: np.ndarray, windows: Windows) -> Labels:
+    """One row for each of N windows."""
+    if windows.labels == "interpolated":
+        return interpolate_labels(track, t_end)
+    return labels_at_windows(track, t_start, t_end)
 
 
 def _tell_full(counts: np.ndarray, name: str, rows: np.ndarray) -> None:
@@ -326,7 +343,10 @@ def _encode_images(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
     images = np.load(source.file, mmap_mode="r", allow_pickle=False)
     t_us = np.load(source.file.with_suffix(".t_us.npy"), mmap_mode="r", allow_pickle=False)
     sensor_size = _sensor_size(recording)
-    chosen = spread(len(images), windows.max_windows)
+    known = np.arange(len(images))
+    if windows.labels == "interpolated":
+        known = np.flatnonzero(is_between_labels(source.track, t_us))
+    chosen = known[spread(len(known), windows.max_windows)]
     at_once = _windows_at_once(plugin, sensor_size)
     for first in range(0, len(chosen), at_once):
         rows = chosen[first : first + at_once]
@@ -334,7 +354,7 @@ def _encode_images(source: _Source, plugin: plugins.Plugin, windows: Windows) ->
         frames = plugin.module.render_levels(grey, plugin.options)
         times = np.asarray(t_us[rows])
         image_size = (frames.shape[2], frames.shape[1])
-        labels = _to_image(labels_at_windows(source.track, times, times), sensor_size, plugin, image_size)
+        labels = _to_image(_label(source.track, times, times, windows), sensor_size, plugin, image_size)
         numbers = np.arange(first, first + len(rows))
         described = _rows(recording, source.parts[0]["split"], numbers, times, times, np.zeros(len(times), np.int64))
         yield _Samples(described, grey.astype(np.uint16), frames, labels)

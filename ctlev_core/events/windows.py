@@ -25,7 +25,8 @@ def cut(events: Events, windows: Windows) -> np.ndarray:
     Returns:
         [W, 2] int64, start and stop of each window in events, in order; W may be 0.
     Raises:
-        DataError: the method is `dataset`, whose ranges come from the dataset and not from the events.
+        DataError: the method is `dataset`, whose ranges come from the dataset and not from the events, or windows end
+            at labels (`cut_at_labels`).
     """
     return cut_chunks([events.t], windows)
 
@@ -49,18 +50,58 @@ def cut_chunks(chunks: Iterable[np.ndarray], windows: Windows) -> np.ndarray:
     return ranges[spread(len(ranges), windows.max_windows)]
 
 
+def cut_at_labels(
+    chunks: Iterable[np.ndarray], labels_us: np.ndarray, windows: Windows
+) -> tuple[np.ndarray, np.ndarray]:
+    """One window that ends at each label, with its last event at that time or before.
+
+    With `duration` it begins so long before, itself excluded; with `count` it has so many events. Windows that begin
+    before the first event, and labels after the last one, are left out. Windows overlap where labels follow one another
+    faster.
+
+    Args:
+        chunks: as `cut_chunks`.
+        labels_us: [L] int64, ascending; of equal times the first counts.
+        windows: how to cut, by `count` or `duration`.
+    Returns:
+        [W, 2] int64, start and stop of each window in events, and [W] int64, the label that it ends at.
+    """
+    times, rows = np.unique(np.asarray(labels_us, np.int64), return_index=True)
+    starts, stops, count = np.zeros(len(times), np.int64), np.zeros(len(times), np.int64), 0
+    first_us = last_us = 0
+    for t in chunks:
+        if len(t):
+            first_us, last_us = int(t[0]) if count == 0 else first_us, int(t[-1])
+            starts += np.searchsorted(t, times - windows.duration_us, side="right")
+            stops += np.searchsorted(t, times, side="right")
+            count += len(t)
+    if windows.method == "count":
+        starts = stops - windows.num_events
+        kept = starts >= 0
+    else:
+        kept = (times - windows.duration_us + 1 >= first_us) & (stops - starts >= windows.min_events)
+    chosen = np.flatnonzero(kept & (times <= last_us) & (count > 0))
+    chosen = chosen[spread(len(chosen), windows.max_windows)]
+    return np.stack([starts, stops], axis=1)[chosen], rows[chosen].astype(np.int64)
+
+
 def window_around(t_us: np.ndarray, moment_us: int, duration_us: int, windows: Windows) -> tuple[int, int]:
     """The one window around a moment, as `cut` would make it if recordings started half a window before.
 
+    Where windows end at labels it ends at the moment, as those of `cut_at_labels` do.
+
     Args:
         t_us: [N] int64, times of events, non-decreasing.
-        moment_us: the middle of the window.
+        moment_us: the middle of the window, or its end.
         duration_us: its length where `windows` does not fix it (`whole`, `dataset`).
         windows: how to cut.
     Returns:
         Start and stop in events. With `count` as many events on either side, as far as there are so many; fewer in all
         only where the recording has fewer.
     """
+    if windows.anchor == "labels":
+        start, stop = np.searchsorted(t_us, [moment_us - windows.duration_us, moment_us], side="right").tolist()
+        return (max(stop - windows.num_events, 0), stop) if windows.method == "count" else (start, stop)
     if windows.method == "count":
         middle = int(np.searchsorted(t_us, moment_us))
         start = min(max(middle - windows.num_events // 2, 0), max(len(t_us) - windows.num_events, 0))
@@ -82,6 +123,8 @@ class Cutter:
             raise DataError(
                 "windows.method 'dataset': the ranges come from the dataset; cut by count, duration or whole instead"
             )
+        if windows.anchor == "labels":
+            raise DataError("windows.anchor 'labels': windows end at labels, which events do not have; leave it out")
         self.windows = windows
         self.num_events = 0
         """Time stamps seen so far."""

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.events.windows import Cutter, check_ranges, cut, cut_chunks, spread
-from data_contracts.config import Windows
+from ctlev_core.events.windows import Cutter, check_ranges, cut, cut_at_labels, cut_chunks, spread, window_around
+from data_contracts.config import Windows, cache_material
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -185,3 +185,56 @@ def test_ranges_are_checked_against_the_events():
             check_ranges(np.array(wrong), 3)
     with pytest.raises(ValueError, match=r"must be \[N, 2\]"):
         check_ranges(np.zeros((2, 3)), 3)
+
+
+# Windows that end at labels ----------------------------------------------------------------------------------------
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    TIMES,
+    st.lists(st.integers(-20, 220), max_size=12).map(sorted),
+    st.lists(st.integers(0, 60), max_size=4),
+    st.sampled_from(["count", "duration"]),
+    st.integers(1, 30),
+    st.integers(1, 4),
+)
+def test_windows_at_labels_equal_a_slow_search(times, labels, bounds, method, size, min_events):
+    windows = Windows(anchor="labels", method=method, num_events=size, duration_us=size, min_events=min_events)
+    edges = [0, *sorted(min(bound, len(times)) for bound in bounds), len(times)]
+    chunks = [np.array(times[a:b], np.int64) for a, b in itertools.pairwise(edges)]
+    expected, ended = [], []
+    for row, label in enumerate(labels):
+        if label in labels[:row] or not times or label > times[-1]:
+            continue
+        before = [i for i, t in enumerate(times) if t <= label]
+        if method == "count":
+            inside = before[-size:] if len(before) >= size else []
+        else:
+            inside = [i for i in before if times[i] > label - size] if label - size + 1 >= times[0] else []
+            inside = inside if len(inside) >= min_events else []
+        if inside:
+            expected.append([inside[0], inside[-1] + 1])
+            ended.append(row)
+    found, rows = cut_at_labels(iter(chunks), np.array(labels, np.int64), windows)
+    assert found.tolist() == expected and rows.tolist() == ended
+    assert found.dtype == rows.dtype == np.int64 and found.shape[1:] == (2,)
+    for (start, stop), row in zip(expected, ended, strict=True):
+        assert window_around(np.array(times), labels[row], 0, windows) == (start, stop)
+
+
+def test_windows_at_labels_are_spread_and_need_labels():
+    windows = Windows(anchor="labels", num_events=2, max_windows=2)
+    _, rows = cut_at_labels([np.arange(20)], np.arange(3, 13), windows)
+    assert rows.tolist() == [2, 7]
+    with pytest.raises(DataError, match="windows end at labels, which events do not have"):
+        cut(events_at([1, 2]), windows)
+    with pytest.raises(ValueError, match="'labels' needs method count or duration, got 'whole'"):
+        Windows(anchor="labels", method="whole")
+
+
+def test_windows_of_before_keep_their_keys():
+    assert list(cache_material(Windows())) == ["method", "num_events", "duration_us", "max_windows", "min_events"]
+    asked = cache_material(Windows(anchor="labels", labels="interpolated"))
+    assert (asked["anchor"], asked["labels"]) == ("labels", "interpolated")
+    assert Windows.model_validate(Windows(anchor="labels").model_dump()) == Windows(anchor="labels")

@@ -215,6 +215,35 @@ def test_labels_of_the_datasets_windows_are_taken_as_they_are(frames_of):
     assert frames.labels.joints2d[:2, 0, 0].tolist() == [10.0, 8.0], "the middle one belongs to the empty window"
 
 
+@pytest.mark.parametrize("held", [1 << 22, 10])
+def test_a_window_that_ends_at_a_label_has_that_label(frames_of, monkeypatch, held):
+    """Labels are 500 us apart: windows of 100 us that tile a recording are up to 300 us from any."""
+    monkeypatch.setattr("tasks.encode.MAX_EVENTS", held)
+    monkeypatch.setattr(encode, "version", 10**6 + held)  # not the cached artefact
+    _, frames = frames_of(make_dataset(), Windows(method="duration", duration_us=100, anchor="labels"))
+    assert frames.column("recording_id") == ["train/one", "test/one"], "at 0 and 1000 us there are no whole windows"
+    assert frames.labels.joints2d[:, 0].tolist() == [[9, 9], [9, 9]]
+    for name, row in zip(frames.column("recording_id"), frames.table.to_pylist(), strict=True):
+        inside = [t for t in make_events(len(name)).t.tolist() if 400 < t <= 500]
+        assert (row["t_start_us"], row["t_end_us"]) == (inside[0], inside[-1])
+        assert row["num_events"] == len(inside)
+
+
+def test_interpolated_labels_are_those_of_the_windows_end(frames_of):
+    windows = Windows(method="duration", duration_us=100, labels="interpolated")
+    _, frames = frames_of(make_dataset(), windows)
+    ends = np.array(frames.column("t_end_us"))
+    assert len(frames) == 18, "all windows are between labels"
+    np.testing.assert_allclose(frames.labels.joints2d[:, 0, 0], 8 + ends / 500, rtol=1e-6)
+
+
+def test_images_where_there_is_no_label_are_left_out(frames_of):
+    track = ImageTrack(np.full((4, SENSOR[1], SENSOR[0]), 9, np.uint8), np.array([0, 250, 1000, 1001], np.int64))
+    _, frames = frames_of(make_dataset(release=track), Windows(labels="interpolated"), polarity=False)
+    assert frames.column("t_end_us") == [0, 250, 1000] * 2
+    assert frames.labels.joints2d[:3, 0, 0].tolist() == [8, 8.5, 10]
+
+
 @pytest.mark.parametrize("method", ["count", "duration", "whole"])
 def test_recordings_larger_than_what_is_held_give_the_same_frames(frames_of, monkeypatch, method):
     windows = Windows(method=method, num_events=7, duration_us=90, min_events=3, max_windows=9)
