@@ -178,7 +178,7 @@ STUBBORN = """
     local_server._log = Path("LOG")
     local_server.END_TIMEOUT_S = 1.0
     import threading
-    server = subprocess.Popen([sys.executable, "-c", ""])
+    server = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(2)"])  # the run is in its loop by then
     threading.Thread(target=local_server._watch, args=(server, threading.Event()), daemon=True).start()
     while True:
         try:

@@ -99,26 +99,31 @@ def test_versions_differ_and_can_be_made_again(home, make_version, tmp_path):
     assert again.model_dump(exclude={"made"}) == second.model_dump(exclude={"made"})
 
 
-def test_versions_are_sampled_as_the_experiments_own_frames_are(monkeypatch, tmp_path):
+@pytest.mark.parametrize("decoder", [[], ["pixel_decoder={num_passes: 2}"]])
+def test_versions_are_sampled_as_the_experiments_own_frames_are(monkeypatch, tmp_path, decoder):
     """What the experiment heeds of sampling the versions heed: the plans differ in seed and label alone."""
     monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
-    from flows import full_experiment, regenerate, synthesize
+    from flows import full_experiment, regenerate, sampling
     from flows.command_line import load_experiment
 
-    asked = []
-    for module in (regenerate, synthesize):
+    asked, decoded = [], []
 
-        def sample(*inputs, made=module.sample, **settings):
-            asked.append(settings)
+    def noting(made, noted):
+        def call(*inputs, **settings):
+            noted.append(settings)
             return made(*inputs, **settings)
 
-        monkeypatch.setattr(module, "sample", sample)
-    options = ["baselines={}", "oracle=null", "stochastic_rounding=true", "max_attempts=3"]
+        return call
+
+    monkeypatch.setattr(sampling, "sample", noting(sampling.sample, asked))
+    monkeypatch.setattr(sampling, "decode_pixels", noting(sampling.decode_pixels, decoded))
+    options = ["baselines={}", "oracle=null", "stochastic_rounding=true", "max_attempts=3", *decoder]
     with planning():
         regenerate.make_next_version(regenerate.load_regeneration("smoke", options))
         full_experiment.full_experiment.fn(load_experiment("smoke", options))
     own = [{name: value for name, value in named.items() if name not in ("seed", "label")} for named in asked]
-    assert own[0] == own[1] and own[0]["rounding"] is not None
+    assert own[0] == own[1] and (own[0]["rounding"] is None) == bool(decoder)
+    assert len(decoded) == 2 * len(decoder) and all(one["options"].num_passes == 2 for one in decoded)
 
 
 def test_without_new_poses_only_the_noise_is_new(home, make_version):
