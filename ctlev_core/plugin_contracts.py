@@ -3,13 +3,18 @@
 A plug-in is a module of `ctlev_core/<kind>/`, found by its name (`ctlev_core.plugins`). Beside the functions below each
 has `VERSION` (raise it when its output changes) and `class Options(Frozen)`. Heavy imports (torch, diffusers, numba) go
 inside functions, because the plan of an experiment loads every plug-in's options and nothing else.
+
+What only some plug-ins of a kind can do is a Protocol of its own that extends the kind's. A plug-in can do it by having
+its functions, and callers ask with `isinstance(module, DatasetWithChunks)`.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from types import ModuleType
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,6 +26,16 @@ from data_contracts.image_rows import Images
 from data_contracts.labels import BodyMotions, Conditions, History, ImageTrack, Labels, Recording
 
 
+@runtime_checkable
+class PluginWithFiles(Protocol):
+    """A plug-in of any kind that reads files of its own: weights, a body, pictures."""
+
+    def input_files(self, options: Any) -> list[Path]:
+        """The files it reads, checked to be there; options that name them put their content into the cache key."""
+        ...
+
+
+@runtime_checkable
 class Dataset(Protocol):
     """Where recordings come from. `list_recordings` is cheap and raises before anything long starts."""
 
@@ -40,6 +55,7 @@ class Dataset(Protocol):
         ...
 
 
+@runtime_checkable
 class DatasetWithChunks(Dataset, Protocol):
     """A dataset whose recordings may be larger than memory."""
 
@@ -48,6 +64,7 @@ class DatasetWithChunks(Dataset, Protocol):
         ...
 
 
+@runtime_checkable
 class DatasetWithWindows(Dataset, Protocol):
     """A dataset whose authors cut recordings into windows in a way of their own."""
 
@@ -56,6 +73,7 @@ class DatasetWithWindows(Dataset, Protocol):
         ...
 
 
+@runtime_checkable
 class DatasetWithWindowLabels(DatasetWithWindows, Protocol):
     """A dataset whose authors also have a rule of their own for the label of a window."""
 
@@ -64,6 +82,7 @@ class DatasetWithWindowLabels(DatasetWithWindows, Protocol):
         ...
 
 
+@runtime_checkable
 class DatasetWithSynonyms(Dataset, Protocol):
     """A dataset whose classes have several names, such as the WordNet lemmas of N-ImageNet."""
 
@@ -72,6 +91,7 @@ class DatasetWithSynonyms(Dataset, Protocol):
         ...
 
 
+@runtime_checkable
 class DatasetWithEventImages(Dataset, Protocol):
     """A dataset that releases finished event images of some recordings."""
 
@@ -80,6 +100,7 @@ class DatasetWithEventImages(Dataset, Protocol):
         ...
 
 
+@runtime_checkable
 class DatasetWithIntensity(Dataset, Protocol):
     """A dataset with grey pictures taken beside the events, what Event-GAN learns from."""
 
@@ -88,14 +109,16 @@ class DatasetWithIntensity(Dataset, Protocol):
         ...
 
 
+@runtime_checkable
 class Format(Protocol):
     """A raw event file format.
 
-    One whose files carry no signature says `HAS_SIGNATURE = False`: its `sniff` takes what is merely plausible, and
-    is asked only where no other format knows the file (`ctlev_core.events.files.find_format`).
+    `HAS_SIGNATURE` is False where files carry none: `sniff` then takes what is merely plausible, and is asked only
+    where no other format knows the file (`ctlev_core.events.files.find_format`).
     """
 
     VERSION: int
+    HAS_SIGNATURE: bool
     SUFFIXES: tuple[str, ...]
 
     def sniff(self, path: Path) -> bool:
@@ -114,13 +137,24 @@ class Format(Protocol):
         ...
 
 
+@runtime_checkable
+class FormatWithWriter(Format, Protocol):
+    """A format that is written too."""
+
+    def write(self, path: Path, events: Events) -> None:
+        """Write one recording, in the form that `read` gives back."""
+        ...
+
+
+@runtime_checkable
 class MotionFormat(Protocol):
     """A file format of motions: poses over time.
 
-    `HAS_SIGNATURE = False` has the meaning that it has for a `Format` (`ctlev_core.body.motion.files.find_format`).
+    `HAS_SIGNATURE` has the meaning that it has for a `Format` (`ctlev_core.body.motion.files.find_format`).
     """
 
     VERSION: int
+    HAS_SIGNATURE: bool
     SUFFIXES: tuple[str, ...]
 
     def sniff(self, path: Path) -> bool:
@@ -132,6 +166,7 @@ class MotionFormat(Protocol):
         ...
 
 
+@runtime_checkable
 class MotionFormatWithoutRate(MotionFormat, Protocol):
     """A motion format whose files need not say how fast they are; `RATE_HZ` is what it assumes."""
 
@@ -142,6 +177,7 @@ class MotionFormatWithoutRate(MotionFormat, Protocol):
         ...
 
 
+@runtime_checkable
 class Encoding(Protocol):
     """Events to arrays, arrays to images and back."""
 
@@ -165,10 +201,16 @@ class Encoding(Protocol):
         ...
 
 
+@runtime_checkable
 class Condition(Protocol):
-    """Labels to what the generator is asked for."""
+    """Labels to what the generator is asked for.
+
+    `NEEDS` is what it is made of beside labels: nothing (""), `intensity` (`ConditionOfPairs`) or `motion`
+    (`ConditionOfMotions`).
+    """
 
     VERSION: int
+    NEEDS: str
     Options: type[Frozen]
 
     def render(self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int]) -> Conditions:
@@ -176,6 +218,7 @@ class Condition(Protocol):
         ...
 
 
+@runtime_checkable
 class ConditionOfClasses(Condition, Protocol):
     """A condition that has something to show of certain classes only."""
 
@@ -184,6 +227,16 @@ class ConditionOfClasses(Condition, Protocol):
         ...
 
 
+@runtime_checkable
+class ConditionThatTurns(Condition, Protocol):
+    """A condition whose images are not turned as pictures are: their colours are directions."""
+
+    def turn(self, images: np.ndarray, turns: np.ndarray, options: Any) -> np.ndarray:
+        """Square images [B, S, S, 3] in `turns` [B] quarter turns against the clock."""
+        ...
+
+
+@runtime_checkable
 class ConditionOfPairs(Protocol):
     """A condition made of the grey pictures taken at a window's start and end: `NEEDS = "intensity"`."""
 
@@ -198,6 +251,7 @@ class ConditionOfPairs(Protocol):
         ...
 
 
+@runtime_checkable
 class ConditionOfMotions(Protocol):
     """A condition that is what a body does around the moment it is labelled at: `NEEDS = "motion"`."""
 
@@ -212,6 +266,7 @@ class ConditionOfMotions(Protocol):
         ...
 
 
+@runtime_checkable
 class Generator(Protocol):
     """Learns frames from conditions, then makes new frames for new conditions."""
 
@@ -236,6 +291,7 @@ class Generator(Protocol):
         ...
 
 
+@runtime_checkable
 class GeneratorFromWeights(Generator, Protocol):
     """A generator whose base model has a size and perhaps colours of its own."""
 
@@ -244,6 +300,7 @@ class GeneratorFromWeights(Generator, Protocol):
         ...
 
 
+@runtime_checkable
 class GeneratorOfNames(Generator, Protocol):
     """A generator that reads words, and can tell which names are alike to it."""
 
@@ -252,6 +309,7 @@ class GeneratorOfNames(Generator, Protocol):
         ...
 
 
+@runtime_checkable
 class EventGenerator(Protocol):
     """Simulates events instead of frames, and learns nothing; its events are encoded as the recorded ones are."""
 
@@ -269,6 +327,7 @@ class EventGenerator(Protocol):
         ...
 
 
+@runtime_checkable
 class CalibratedEventGenerator(EventGenerator, Protocol):
     """A simulator that can be fitted to the training recordings of an experiment."""
 
@@ -283,10 +342,19 @@ class CalibratedEventGenerator(EventGenerator, Protocol):
         ...
 
 
+@runtime_checkable
 class Downstream(Protocol):
-    """A model of the task the synthetic data is for."""
+    """A model of the task the synthetic data is for.
+
+    `PREDICTS` are those of the following that `predict` returns, N rows each: `joints2d` [N, J, 2] px; `joints3d`
+    [N, J, 3] mm, camera frame; `smpl`, that is `smpl_pose` [N, 72] rad, `smpl_betas` [N, 10] and `smpl_transl`
+    [N, 3] m, camera frame; `classes`, that is `probability` [N, K] and `classes` [K], the names of its columns, and of
+    binary classifiers also `binary_probability` [N, K], of each class by its own. None: the model has features alone.
+    A metric that compares something else is refused where it is planned.
+    """
 
     VERSION: int
+    PREDICTS: tuple[str, ...]
     Options: type[Frozen]
 
     def train(
@@ -313,18 +381,7 @@ class Downstream(Protocol):
         ...
 
 
-class DownstreamOfLabels(Downstream, Protocol):
-    """A model that says what it predicts: a metric that compares something else is refused where it is planned.
-
-    `PREDICTS` are those of the following that `predict` returns, N rows each: `joints2d` [N, J, 2] px; `joints3d`
-    [N, J, 3] mm, camera frame; `smpl`, that is `smpl_pose` [N, 72] rad, `smpl_betas` [N, 10] and `smpl_transl`
-    [N, 3] m, camera frame; `classes`, that is `probability` [N, K] and `classes` [K], the names of its columns, and of
-    binary classifiers also `binary_probability` [N, K], of each class by its own. None: the model has features alone.
-    """
-
-    PREDICTS: tuple[str, ...]
-
-
+@runtime_checkable
 class DownstreamOfSequences(Downstream, Protocol):
     """A model that can look at several frames of a recording at once. It has both functions, and they are called."""
 
@@ -352,6 +409,7 @@ class DownstreamOfSequences(Downstream, Protocol):
         ...
 
 
+@runtime_checkable
 class DownstreamOfRecordings(Downstream, Protocol):
     """A model that learns from single frames, and whose answers about the frames of a recording may be joined."""
 
@@ -360,14 +418,7 @@ class DownstreamOfRecordings(Downstream, Protocol):
         ...
 
 
-class DownstreamWithFiles(Downstream, Protocol):
-    """A model that starts from weights of its own from outside the store."""
-
-    def input_files(self, options: Any) -> list[Path]:
-        """The files it reads, checked to be there; their content enters the cache key."""
-        ...
-
-
+@runtime_checkable
 class FeatureExtractor(Downstream, Protocol):
     """A model in whose features images are compared."""
 
@@ -376,6 +427,7 @@ class FeatureExtractor(Downstream, Protocol):
         ...
 
 
+@runtime_checkable
 class NamedFeatureExtractor(FeatureExtractor, Protocol):
     """An extractor that learns nothing; by its checksum it knows what scores in its features may be called."""
 
@@ -384,6 +436,7 @@ class NamedFeatureExtractor(FeatureExtractor, Protocol):
         ...
 
 
+@runtime_checkable
 class Metric(Protocol):
     """A score. `INPUT` names what it compares: `joints2d`, `joints3d`, `smpl`, `classes` or `features`.
 
@@ -400,14 +453,7 @@ class Metric(Protocol):
         ...
 
 
-class MetricWithFiles(Metric, Protocol):
-    """A metric that reads files of its own, such as a body."""
-
-    def input_files(self, options: Any) -> list[Path]:
-        """The files it reads, checked to be there; options that name them put their content into the cache key."""
-        ...
-
-
+@runtime_checkable
 class MetricOfSkeletons(Metric, Protocol):
     """A metric that needs certain joints: hips to align by, or a head to measure with."""
 
@@ -416,6 +462,7 @@ class MetricOfSkeletons(Metric, Protocol):
         ...
 
 
+@runtime_checkable
 class MetricOfRows(Metric, Protocol):
     """A metric that is a mean over rows, so that two models can be compared row by row."""
 
@@ -424,6 +471,7 @@ class MetricOfRows(Metric, Protocol):
         ...
 
 
+@runtime_checkable
 class PreparedMetric(Metric, Protocol):
     """A metric that can look at all rows once and then score any of them quickly."""
 
@@ -432,6 +480,7 @@ class PreparedMetric(Metric, Protocol):
         ...
 
 
+@runtime_checkable
 class MetricOfSums(Metric, Protocol):
     """A metric whose scores are quotients of sums over rows, so that resampling rows need not compare them again."""
 
@@ -440,14 +489,29 @@ class MetricOfSums(Metric, Protocol):
         ...
 
 
-BY_KIND: dict[str, type] = {
-    "datasets": Dataset,
-    "formats": Format,
-    "motions": MotionFormat,
-    "encodings": Encoding,
-    "conditions": Condition,
-    "generators": Generator,
-    "downstream": Downstream,
-    "metrics": Metric,
+BY_KIND: dict[str, tuple[type, ...]] = {
+    "datasets": (Dataset,),
+    "formats": (Format,),
+    "motions": (MotionFormat,),
+    "encodings": (Encoding,),
+    "conditions": (Condition, ConditionOfPairs, ConditionOfMotions),
+    "generators": (Generator, EventGenerator),
+    "downstream": (Downstream,),
+    "metrics": (Metric,),
 }
-"""What every module of a kind has; the other Protocols are for those that can do more, or it otherwise."""
+"""Every module of a kind keeps one of these; the other Protocols are for those that can do more."""
+
+
+def missing_names(kind: str, module: ModuleType) -> tuple[str, list[str]]:
+    """The Protocol that a module of a kind comes nearest to, and the names that it lacks of it; none: it keeps it."""
+    lacking = {
+        protocol.__name__: [name for name in _members(protocol) if not hasattr(module, name)]
+        for protocol in BY_KIND[kind]
+    }
+    name = min(lacking, key=lambda name: len(lacking[name]))
+    return name, lacking[name]
+
+
+def _members(protocol: type) -> list[str]:
+    names = {name for part in protocol.__mro__ for name in (*vars(part), *inspect.get_annotations(part))}
+    return sorted(name for name in names if not name.startswith("_"))

@@ -84,7 +84,7 @@ def recognise(formats: Mapping[str, ModuleType], path: Path) -> ModuleType | Non
         DataError: the file cannot be read, or several formats recognise it.
     """
     for has_signature in (True, False):
-        asked = [name for name in formats if getattr(formats[name], "HAS_SIGNATURE", True) == has_signature]
+        asked = [name for name in formats if has_signature == formats[name].HAS_SIGNATURE]
         try:
             claims = [name for name in asked if formats[name].sniff(path)]
         except OSError as error:
@@ -100,16 +100,28 @@ def load(kind: str, name: str) -> ModuleType:
     """Import the module `ctlev_core.<kind>.<name>`.
 
     Raises:
-        PluginError: there is no such plug-in; the message lists the known ones.
+        PluginError: there is no such plug-in, then the message lists the known ones; or it lacks what its kind has.
     """
     path = f"ctlev_core.{kind}.{name}"
-    # The folder of one that was imported before is not read once more, which plans would do a thousand times.
+    # One that was loaded before is not looked at once more, which plans would do a thousand times.
     if not (kind in KINDS and name.isidentifier() and not name.startswith("_") and path in sys.modules):
         known = names(kind)
         if name not in known:
             hint = name_hint(name, known, RENAMED_VALUES)
             raise PluginError(f"unknown plug-in {name!r} in {kind}{hint}; known: {', '.join(known)}")
+        _check_contract(kind, importlib.import_module(path))
     return importlib.import_module(path)  # which waits where another thread has begun to import it
+
+
+def _check_contract(kind: str, module: ModuleType) -> None:
+    from ctlev_core.plugin_contracts import missing_names
+
+    protocol, missing = missing_names(kind, module)
+    if missing:
+        raise PluginError(
+            f"{module.__file__}: expected the names of {protocol} in ctlev_core/plugin_contracts.py, "
+            f"lacks {', '.join(missing)}"
+        )
 
 
 def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: str) -> Any:

@@ -6,6 +6,7 @@ import sys
 from functools import partial
 
 from ctlev_core import plugins
+from ctlev_core.plugin_contracts import EventGenerator
 from ctlev_core.report.sections.rejections import count_rejections
 from data_contracts.config import Frozen
 from data_contracts.experiment import Experiment
@@ -53,7 +54,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
     if baseline.poses is not None:
         poses = ingest(dataset=baseline.poses, label=f"{baseline.poses.name}, poses of {name}")
     asked = condition_asked_samples(experiment, poses, dataset.recordings, dataset.frames, baseline.condition)
-    if hasattr(plugins.load("generators", baseline.generator.name), "sample_events"):
+    if isinstance(plugins.load("generators", baseline.generator.name), EventGenerator):
         synthetic = simulate(
             dataset.recordings,
             dataset.frames,

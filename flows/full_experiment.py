@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 from ctlev_core import plugins
+from ctlev_core.plugin_contracts import GeneratorOfNames
 from ctlev_core.report.page.report_files import publish_report, read_verdict
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
@@ -76,7 +77,8 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         for name, frames in zip(experiment.generator_names, generated, strict=True)
     ]
     names = None
-    if experiment.target is not None and hasattr(plugins.load("generators", experiment.generator.name), "embed_names"):
+    generator = plugins.load("generators", experiment.generator.name)
+    if experiment.target is not None and isinstance(generator, GeneratorOfNames):
         names = nearest_seen(
             checkpoint,
             dataset.frames,

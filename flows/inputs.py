@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from ctlev_core import plugins
+from ctlev_core.plugin_contracts import ConditionOfClasses, Dataset, Generator, PluginWithFiles
 from ctlev_core.plugins import PluginError
 from ctlev_core.scoring.checks import check_dataset
 from data_contracts.config import Choice, ConditionChoice, DatasetChoice
@@ -75,15 +75,13 @@ def _problems(experiments: Mapping[str, Experiment]) -> list[str]:
 def _look_for(choice: Choice) -> None:
     """Load a plug-in, and let it look for its files."""
     plugin = plugins.load_options(choice)
-    look: Any = None
-    if choice.KIND == "datasets":
-        look = plugin.module.list_recordings
-    elif choice.KIND == "generators" and choice.OPTIONS == "Options":
-        look = getattr(plugin.module, "base_model_folders", None)  # some record instead of learning
-    elif choice.KIND != "generators":
-        look = getattr(plugin.module, "input_files", None)
-    if look is not None:
-        look(plugin.options)
+    if isinstance(plugin.module, Dataset):
+        plugin.module.list_recordings(plugin.options)
+    elif isinstance(plugin.module, Generator):
+        if choice.OPTIONS == "Options":
+            plugin.module.base_model_folders(plugin.options)
+    elif choice.KIND != "generators" and isinstance(plugin.module, PluginWithFiles):
+        plugin.module.input_files(plugin.options)
 
 
 def _check_labels(experiment: Experiment) -> None:
@@ -124,7 +122,7 @@ def check_whole_counts(experiment: Experiment, what: str) -> None:
 def _check_intensity(experiment: Experiment) -> None:
     """Raise `PluginError` where a condition needs intensity frames and a dataset has none, before anything is read."""
     for name, (condition, poses) in _conditions(experiment).items():
-        if getattr(plugins.load("conditions", condition.name), "NEEDS", "") != "intensity":
+        if plugins.load("conditions", condition.name).NEEDS != "intensity":
             continue
         for dataset in (experiment.dataset, poses):
             if dataset is not None and not _has_intensity(dataset):
@@ -137,11 +135,11 @@ def _check_classes(experiment: Experiment) -> None:
     """Raise `DataError` where a condition has nothing to show of a class that is to be sampled."""
     for condition, poses in _conditions(experiment).values():
         plugin = plugins.load_options(condition)
-        check = getattr(plugin.module, "check_classes", None)
-        if check is not None:
+        if isinstance(plugin.module, ConditionOfClasses):
             dataset = plugins.load_options(poses or experiment.dataset)
             recordings = dataset.module.list_recordings(dataset.options)
-            check({recording.class_name for recording in recordings if recording.class_name}, plugin.options)
+            names = {recording.class_name for recording in recordings if recording.class_name}
+            plugin.module.check_classes(names, plugin.options)
 
 
 def _check_base_models(experiment: Experiment) -> None:

@@ -138,7 +138,7 @@ def condition_samples(
     else:
         learnt = frames.rows_where(split="train")
         rows = rows_of_frames(recordings, frames, _choose(frames.table, learnt, count, order, seed))
-    if getattr(plugins.load_options(condition).module, "NEEDS", "") == "intensity":
+    if plugins.load("conditions", condition.name).NEEDS == "intensity":
         if views == "new":
             raise DataError(f"condition {condition.name!r} shows pictures as they were; set view to 'labelled'")
         if windows.method == "count" and moments.num_rows:
@@ -246,7 +246,7 @@ def _render(
 ) -> pa.Table:
     plugin = _load_condition(condition, recordings)
     labels, seeds = rows.labels, sample_seeds(seed, len(rows.labels))
-    needs = getattr(plugin.module, "NEEDS", None)
+    needs = plugin.module.NEEDS
     motions = read_motions(rows, recordings, frames, encoding) if needs == "motion" else None
     prompts: list[str] = []
     with ExitStack() as opened:

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.plugin_contracts import DownstreamOfSequences
 from ctlev_core.supervised.frame_sequences import name_recordings
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
@@ -34,7 +35,7 @@ def train_downstream(
     # Bodies of another dataset may carry more labels than the frames do.
     labels = concat_labels([m.labels.take(r) for m, r in zip(training_sets, rows, strict=True)], common=True)
     train = plugin.module.train
-    if hasattr(plugin.module, "train_sequences"):
+    if isinstance(plugin.module, DownstreamOfSequences):
         named = [name_recordings(m, r) for m, r in zip(training_sets, rows, strict=True)]
         train = partial(plugin.module.train_sequences, recordings=[name for names in named for name in names])
     history = train(

@@ -11,6 +11,13 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.plugin_contracts import (
+    DownstreamOfRecordings,
+    DownstreamOfSequences,
+    MetricOfRows,
+    MetricOfSums,
+    PreparedMetric,
+)
 from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
 from ctlev_core.scoring.pose import quotients
 from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, subject_groups
@@ -109,7 +116,7 @@ def score_model(
                 if group == "all":
                     raise
                 continue  # a class without a visible joint, for example, has no score of its own
-            if group == "all" and hasattr(metric.module, "compute_rows"):
+            if group == "all" and isinstance(metric.module, MetricOfRows):
                 columns = {"sample_id": sample_ids, "recording_id": recordings}
                 sample_scores.append(pa.table(columns | _of_samples(metric, prediction, labels, scores)))
             found += [
@@ -131,9 +138,9 @@ def score_model(
 
 def _predict_of(module: Any, data: Manifest, rows: np.ndarray) -> Any:
     """The function that predicts for frames: told which of them follow one another, or belong together, if it asks."""
-    if hasattr(module, "predict_sequences"):
+    if isinstance(module, DownstreamOfSequences):
         return partial(module.predict_sequences, recordings=name_recordings(data, rows))
-    if hasattr(module, "predict_recordings"):
+    if isinstance(module, DownstreamOfRecordings):
         return partial(module.predict_recordings, recordings=np.array(data.column("recording_id"))[rows].tolist())
     return module.predict
 
@@ -148,7 +155,9 @@ def _of_samples(
     """
     values = metric.module.compute_rows(prediction, labels, metric.options)
     sums = (
-        metric.module.compute_sums(prediction, labels, metric.options) if hasattr(metric.module, "compute_sums") else {}
+        metric.module.compute_sums(prediction, labels, metric.options)
+        if isinstance(metric.module, MetricOfSums)
+        else {}
     )
     of = {name: np.asarray(sums[name][1] if name in sums else np.ones(len(values)), np.float64) for name in scores}
 
@@ -217,14 +226,14 @@ def _score(
 
     every = np.arange(len(members))
     few = len(set(recordings.tolist())) < MIN_RECORDINGS
-    if hasattr(metric.module, "compute_sums"):
+    if isinstance(metric.module, MetricOfSums):
         sums = metric.module.compute_sums(pick(every), labels, metric.options)
         if not all(count.any() for _, count in sums.values()):
             raise ValueError("nothing to score in these rows")
         scores = quotients(sums)
         return (scores, {}, {}) if few else (scores, *ratio_bootstrap(sums, recordings))
     # Names are compared once rather than for each of many resamplings.
-    prepared = hasattr(metric.module, "prepare")
+    prepared = isinstance(metric.module, PreparedMetric)
     resampled = metric.module.prepare(pick(every), labels, metric.options) if prepared else compute
     scores = resampled(every)
     return (scores, {}, {}) if few else (scores, *cluster_bootstrap(resampled, recordings))

@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from ctlev_core.events import files as event_files
 from ctlev_core.events.decoding import event_chunks
 from ctlev_core.events.image_grid import check_whole_counts, count_size, pixel_bins
 from ctlev_core.events.windows import spread
+from ctlev_core.plugin_contracts import FormatWithWriter
 from ctlev_core.postprocessing.event_streams import TimeModel, fit_times, sample_streams
 from ctlev_core.postprocessing.image_counts import CountModel, estimate_counts, fit_counts
 from ctlev_core.progress import ProgressBar
@@ -54,7 +54,7 @@ def export_events(
     plugin, writer = plugins.load_options(encoding), plugins.load("formats", export.format)
     if plugin.name != _ENCODING:
         raise DataError(f"events can be drawn from counts, encoding {_ENCODING!r}, alone; got {plugin.name!r}")
-    if not hasattr(writer, "write"):
+    if not isinstance(writer, FormatWithWriter):
         raise DataError(f"format {export.format!r} is read, not written; choose parquet, evt2 or evt3, for example")
     counts, times = _learn(frames, recordings, plugin)
     folder = out.folder / "events"
@@ -180,7 +180,7 @@ def _seed(seed: int, stream: int) -> int:
 
 
 def _write_together(
-    path: Path, streams: Iterator[Events], rows: list[dict[str, Any]], export: EventExport, writer: ModuleType
+    path: Path, streams: Iterator[Events], rows: list[dict[str, Any]], export: EventExport, writer: FormatWithWriter
 ) -> None:
     """All streams in one file, one after another on one clock."""
 
@@ -209,13 +209,13 @@ def _place(path: Path, events: Events, event_start: int) -> dict[str, Any]:
     }
 
 
-def _suffix(name: str, writer: ModuleType) -> str:
+def _suffix(name: str, writer: FormatWithWriter) -> str:
     """The format's own suffix: where several formats share one, that with its name."""
     own = f".{name}"
     return own if own in writer.SUFFIXES else writer.SUFFIXES[0]
 
 
-def _write(path: Path, chunks: Iterable[Events], name: str, writer: ModuleType) -> None:
+def _write(path: Path, chunks: Iterable[Events], name: str, writer: FormatWithWriter) -> None:
     """Parquet chunk by chunk; other formats write a recording as a whole, which must fit into memory."""
     if name == "parquet":
         event_files.write_event_chunks_parquet(path, chunks)

@@ -13,6 +13,12 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
+from ctlev_core.plugin_contracts import (
+    DatasetWithChunks,
+    DatasetWithSynonyms,
+    DatasetWithWindowLabels,
+    DatasetWithWindows,
+)
 from ctlev_core.plugins import Plugin
 from ctlev_core.progress import ProgressBar
 from data_contracts import tables
@@ -82,7 +88,8 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     ingested = list(ProgressBar(results, "ingest", len(recordings), unit="recording"))
     out.write_table(pa.Table.from_pylist([p for i in ingested for p in i.parts], tables.PARTS.arrow()), tables.PARTS)
     out.write_table(_window_table(recordings, ingested), tables.WINDOWS)
-    synonyms = plugin.module.read_synonyms(plugin.options) if hasattr(plugin.module, "read_synonyms") else {}
+    named_further = isinstance(plugin.module, DatasetWithSynonyms)
+    synonyms = plugin.module.read_synonyms(plugin.options) if named_further else {}
     named = [{"class_name": name, "names": list(names)} for name, names in sorted(synonyms.items())]
     out.write_table(pa.Table.from_pylist(named, tables.SYNONYMS.arrow()), tables.SYNONYMS)
     out.write_table(_label_table(recordings, [i.labels for i in ingested]), tables.LABELS)
@@ -142,7 +149,7 @@ def _ingest_events(plugin: Plugin, recording: Recording, out: Output, where: str
         for chunk in watched(event_files.read_event_chunks(finished)):
             summary.add(chunk)
     else:
-        if hasattr(plugin.module, "read_event_chunks"):
+        if isinstance(plugin.module, DatasetWithChunks):
             chunks = plugin.module.read_event_chunks(recording, plugin.options)
         else:
             chunks = [check_events(plugin.module.read_events(recording, plugin.options), where)]
@@ -180,7 +187,7 @@ def _dataset_windows(
     plugin: Plugin, recording: Recording, count: int, where: str
 ) -> tuple[np.ndarray | None, Labels | None]:
     """Ranges [W, 2] and, where the authors have a rule for them too, their W labels."""
-    if not recording.has_events or not hasattr(plugin.module, "read_windows"):
+    if not recording.has_events or not isinstance(plugin.module, DatasetWithWindows):
         return None, None
     ranges = np.asarray(plugin.module.read_windows(recording, plugin.options))
     if ranges.ndim != 2 or ranges.shape[1] != 2 or ranges.dtype != np.int64:
@@ -190,7 +197,7 @@ def _dataset_windows(
         raise DataError(
             f"{where}: windows must be ascending ranges within {count} events, got {ranges.tolist()[:4]} ..."
         )
-    if not hasattr(plugin.module, "read_window_labels"):
+    if not isinstance(plugin.module, DatasetWithWindowLabels):
         return ranges, None
     labels = check_labels(plugin.module.read_window_labels(recording, plugin.options), f"{where}, windows")
     if len(labels) != len(ranges):

@@ -20,6 +20,7 @@ from ctlev_core.diffusion.sampling.shards import SHARD
 from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import spread, window_around
 from ctlev_core.labels.sources import sensor_size_of
+from ctlev_core.plugin_contracts import CalibratedEventGenerator
 from ctlev_core.postprocessing.quality_filter import (
     QualityFilter,
     find_causes,
@@ -166,7 +167,7 @@ def simulate(
 
 def _calibrated(plugin: plugins.Plugin, recordings: Manifest, conditions: Manifest, out: Output) -> plugins.Plugin:
     """The simulator with its options fitted to training recordings, where it has something to fit."""
-    if not hasattr(plugin.module, "calibrate"):
+    if not isinstance(plugin.module, CalibratedEventGenerator):
         return plugin
     ranges = _training_ranges(recordings)
     if not ranges:

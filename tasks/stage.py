@@ -42,6 +42,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from ctlev_core import plugins
+from ctlev_core.plugin_contracts import PluginWithFiles
 from ctlev_core.progress import Progress, current_report, reporting_to
 from ctlev_core.provenance.raw_file_digests import digest_raw_files
 from data_contracts.arrays import ArrayWriter
@@ -340,7 +341,7 @@ def input_files_of(argument: str) -> RawFiles:
 
     def find(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
         plugin = plugins.load_options(arguments[argument])
-        files = plugin.module.input_files(plugin.options) if hasattr(plugin.module, "input_files") else []
+        files = plugin.module.input_files(plugin.options) if isinstance(plugin.module, PluginWithFiles) else []
         return [pair for path in files for pair in (files_of([path]) if path.is_dir() else [(path.name, path)])]
 
     return find

@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.labels.label_sampling import spread_choice
+from ctlev_core.plugin_contracts import MetricOfRows
 from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
@@ -65,7 +66,7 @@ def take_label_consistent(
         DataError: the metric has no score of single rows.
     """
     plugin, scorer = plugins.load_options(downstream), plugins.load_options(metric)
-    if not hasattr(scorer.module, "compute_rows"):
+    if not isinstance(scorer.module, MetricOfRows):
         raise DataError(f"keep_fraction: metric {metric.name!r} has no score of single frames to choose by")
     prediction: Any = plugin.module.predict(model.ref.path / "model", synthetic.images(np.arange(len(synthetic))))
     scores = scorer.module.compute_rows(prediction, synthetic.labels, scorer.options)

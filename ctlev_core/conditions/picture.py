@@ -19,6 +19,7 @@ from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, Labels
 
 VERSION = 1
+NEEDS = ""
 WHERE = "condition 'picture'"
 PLACEHOLDER = "{class_name}"
 

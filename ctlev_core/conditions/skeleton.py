@@ -17,6 +17,7 @@ from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, Labels
 
 VERSION = 2
+NEEDS = ""
 
 
 class Options(Frozen):

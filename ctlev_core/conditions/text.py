@@ -15,6 +15,7 @@ from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, Labels
 
 VERSION = 1
+NEEDS = ""
 PLACEHOLDER = "{class_name}"
 
 

@@ -23,6 +23,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events
 
 VERSION = 1
+HAS_SIGNATURE = True
 SUFFIXES = (".aedat", ".aedat2")
 
 SENSORS: dict[str, SensorSize] = {

@@ -17,6 +17,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 
 VERSION = 1
+HAS_SIGNATURE = True
 SUFFIXES = (".aedat4",)
 
 _MAGIC = b"#!AER-DAT4.0"

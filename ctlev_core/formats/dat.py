@@ -20,6 +20,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 
 VERSION = 1
+HAS_SIGNATURE = True
 SUFFIXES = (".dat",)
 
 TYPE_2D, TYPE_CD = 0, 12

@@ -16,6 +16,7 @@ from ctlev_core.events.decoding import prophesee
 from data_contracts.events import Events
 
 VERSION = 1
+HAS_SIGNATURE = True
 SUFFIXES = (".raw", ".evt2")
 
 

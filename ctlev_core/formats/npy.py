@@ -22,6 +22,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, check_events
 
 VERSION = 2
+HAS_SIGNATURE = True
 SUFFIXES = (".npy",)
 COLUMNS = ("x", "y", "t", "p")
 """Of an [N, 4] array."""

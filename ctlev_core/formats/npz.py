@@ -27,6 +27,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
 VERSION = 2
+HAS_SIGNATURE = True
 SUFFIXES = (".npz",)
 
 _STRUCTURED_KEYS = ("event_data", "events")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pyarrow.parquet as pq
 
 VERSION = 1
+HAS_SIGNATURE = True
 SUFFIXES = (".parquet",)
 ROW_GROUP = 1 << 18
 """Events a row group."""

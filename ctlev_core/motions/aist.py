@@ -22,6 +22,7 @@ from ctlev_core.body.motion.clip import MotionClip, check_clip
 from data_contracts.errors import DataError
 
 VERSION = 1
+HAS_SIGNATURE = True
 SUFFIXES = (".pkl",)
 
 FRAMES_PER_SECOND = 60.0

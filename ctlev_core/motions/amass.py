@@ -22,6 +22,7 @@ from ctlev_core.safe_files.numpy_files import list_npz, read_npz
 from data_contracts.errors import DataError
 
 VERSION = 1
+HAS_SIGNATURE = True
 SUFFIXES = (".npz",)
 
 RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")

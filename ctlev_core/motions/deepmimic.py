@@ -27,6 +27,7 @@ from ctlev_core.body.motion.source_skeleton import SkeletonMotion
 from data_contracts.errors import DataError
 
 VERSION = 1
+HAS_SIGNATURE = True
 SUFFIXES = (".txt", ".json")
 
 MAX_BYTES = 2**28

@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from ctlev_core import plugins
+from ctlev_core.plugin_contracts import FeatureExtractor, MetricOfSkeletons, PluginWithFiles
 from ctlev_core.plugins import PluginError
 from data_contracts.config import DatasetChoice, DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
@@ -34,7 +35,7 @@ def check_metrics(downstream: DownstreamChoice, metrics: Sequence[MetricChoice])
         PluginError: a metric needs what the model does not predict, or compares sets of frames.
         DataError: a file that a metric reads is missing.
     """
-    predicts = getattr(plugins.load_options(downstream).module, "PREDICTS", None)
+    predicts = plugins.load_options(downstream).module.PREDICTS
     for choice in metrics:
         metric = plugins.load_options(choice)
         needed = metric.module.INPUT
@@ -43,12 +44,12 @@ def check_metrics(downstream: DownstreamChoice, metrics: Sequence[MetricChoice])
                 f"metrics: expected metrics of predictions, got {choice.name!r}, which compares the features of two "
                 "sets of frames; name it under distances"
             )
-        if predicts is not None and needed not in predicts:
+        if needed not in predicts:
             raise PluginError(
                 f"metrics: {choice.name!r} expected a downstream model that predicts {needed}, got "
                 f"{downstream.name!r}, which predicts {', '.join(predicts) or 'nothing but features'}"
             )
-        if hasattr(metric.module, "input_files"):
+        if isinstance(metric.module, PluginWithFiles):
             metric.module.input_files(metric.options)
 
 
@@ -73,7 +74,7 @@ def check_labels(metrics: Sequence[MetricChoice], labels: Labels, where: str) ->
                 f"metrics: {choice.name!r} expected labels with {needed}, got {where}, which has "
                 f"{', '.join(kinds) or 'none of any kind'}"
             )
-        if hasattr(metric.module, "check_joint_set"):
+        if isinstance(metric.module, MetricOfSkeletons):
             try:
                 metric.module.check_joint_set(labels.joint_set, metric.options)
             except ValueError as error:
@@ -122,7 +123,7 @@ def check_distances(extractor: DownstreamChoice, distances: Sequence[MetricChoic
         PluginError: the extractor has no features, or a metric does not compare features.
         DataError: a file that a metric reads is missing.
     """
-    if not hasattr(plugins.load_options(extractor).module, "features"):
+    if not isinstance(plugins.load_options(extractor).module, FeatureExtractor):
         raise PluginError(f"feature_extractor: expected a model with features, got {extractor.name!r}, which has none")
     for choice in distances:
         metric = plugins.load_options(choice)
@@ -132,5 +133,5 @@ def check_distances(extractor: DownstreamChoice, distances: Sequence[MetricChoic
                 f"distances: expected metrics of features, got {choice.name!r}, which compares {needed}; "
                 "name it under metrics"
             )
-        if hasattr(metric.module, "input_files"):
+        if isinstance(metric.module, PluginWithFiles):
             metric.module.input_files(metric.options)

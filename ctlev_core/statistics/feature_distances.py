@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from ctlev_core.plugin_contracts import NamedFeatureExtractor
 from ctlev_core.plugins import Plugin
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from data_contracts.tables import Column, TableSchema
@@ -162,7 +163,7 @@ def name_distance(plugin: Plugin, folder: Path, digest: str, score: str) -> str:
         digest: of the extractor's artefact; two classifiers trained on other frames are two scores.
         score: as `compute` of the metric names it, such as `fd`.
     """
-    if hasattr(plugin.module, "name_score"):
+    if isinstance(plugin.module, NamedFeatureExtractor):
         return plugin.module.name_score(folder, score)
     return f"{score}_event_{plugin.name}_{digest[:8]}"
 

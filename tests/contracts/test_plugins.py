@@ -13,7 +13,7 @@ from ctlev_core.plugins import PluginError
 from data_contracts.config import DatasetChoice, Frozen, MetricChoice
 
 CONDITIONS_BY_NEEDS = {
-    None: plugin_contracts.Condition,
+    "": plugin_contracts.Condition,
     "intensity": plugin_contracts.ConditionOfPairs,
     "motion": plugin_contracts.ConditionOfMotions,
 }
@@ -24,10 +24,20 @@ ALL = [(kind, name) for kind in plugins.KINDS for name in plugins.names(kind)]
 def protocol_of(kind, module):
     """The contract of a kind; a condition says by `NEEDS`, a generator by its functions, which of several it keeps."""
     if kind == "conditions":
-        return CONDITIONS_BY_NEEDS[getattr(module, "NEEDS", None)]
-    if kind == "generators" and hasattr(module, "sample_events"):
-        return plugin_contracts.EventGenerator
-    return plugin_contracts.BY_KIND[kind]
+        return CONDITIONS_BY_NEEDS[module.NEEDS]
+    return next(protocol for protocol in plugin_contracts.BY_KIND[kind] if isinstance(module, protocol))
+
+
+def functions_of(protocol):
+    return [(n, f) for n, f in inspect.getmembers(protocol, inspect.isfunction) if not n.startswith("_")]
+
+
+EXTENDED = [
+    protocol
+    for protocol in vars(plugin_contracts).values()
+    if inspect.isclass(protocol) and protocol.__module__ == plugin_contracts.__name__
+    and protocol not in [kept for several in plugin_contracts.BY_KIND.values() for kept in several]
+]  # fmt: skip
 
 
 def keyword_only(function):
@@ -41,16 +51,39 @@ def test_module_keeps_its_protocol(kind, name):
     protocol = protocol_of(kind, module)
     assert isinstance(module.VERSION, int) and module.VERSION >= 1
     assert module.__doc__
+    assert isinstance(module, protocol)
     for attribute in protocol.__annotations__:
         assert hasattr(module, attribute), f"{kind}/{name} lacks {attribute}"
-    for function_name, expected in inspect.getmembers(protocol, inspect.isfunction):
-        if function_name.startswith("_"):
-            continue
+    for function_name, expected in functions_of(protocol):
         function = getattr(module, function_name)
         assert function.__doc__, f"{kind}/{name}.{function_name} has no docstring"
         wanted = list(inspect.signature(expected).parameters)[1:]
         assert list(inspect.signature(function).parameters)[: len(wanted)] == wanted, f"{kind}/{name}.{function_name}"
         assert keyword_only(function) == keyword_only(expected), f"{kind}/{name}.{function_name}"
+
+
+@pytest.mark.parametrize("protocol", EXTENDED, ids=lambda protocol: protocol.__name__)
+def test_what_only_some_plugins_can_do_is_done_as_the_protocol_says(protocol):
+    """Callers ask by `isinstance`, which looks at names alone."""
+    modules = [plugins.load(kind, name) for kind, name in ALL]
+    able = [module for module in modules if isinstance(module, protocol)]
+    assert able, "no plug-in can do this"
+    for module in able:
+        for name, expected in functions_of(protocol):
+            wanted = [(p.name, p.kind) for p in list(inspect.signature(expected).parameters.values())[1:]]
+            found = [(p.name, p.kind) for p in inspect.signature(getattr(module, name)).parameters.values()]
+            assert found[: len(wanted)] == wanted, f"{module.__name__}.{name}"
+
+
+@pytest.mark.parametrize("protocol", EXTENDED, ids=lambda protocol: protocol.__name__)
+def test_nothing_half_done(protocol):
+    """A plug-in with one function of a Protocol that adds several is asked for none of them: one is misnamed."""
+    added = {name for name in vars(protocol) if inspect.isfunction(getattr(protocol, name))} - {"__init__"}
+    added = {name for name in added if not name.startswith("_")}
+    for kind, name in ALL:
+        module = plugins.load(kind, name)
+        if set(plugin_contracts.BY_KIND[kind]) & set(protocol.__mro__) and len(added) > 1:
+            assert len([one for one in added if hasattr(module, one)]) in (0, len(added)), f"{kind}/{name}"
 
 
 @pytest.mark.parametrize("name", plugins.names("generators"))
@@ -64,7 +97,7 @@ def test_a_generator_makes_frames_or_events_and_not_both(name):
 @pytest.mark.parametrize("name", plugins.names("conditions"))
 def test_a_condition_asks_for_no_more_than_it_needs(name):
     module = plugins.load("conditions", name)
-    protocol = CONDITIONS_BY_NEEDS[getattr(module, "NEEDS", None)]
+    protocol = CONDITIONS_BY_NEEDS[module.NEEDS]
     wanted = list(inspect.signature(protocol.render).parameters)[1:]
     assert list(inspect.signature(module.render).parameters) == wanted
 
@@ -128,7 +161,8 @@ def test_a_plugin_is_looked_for_once(monkeypatch):
 def test_threads_that_load_a_plugin_at_once_get_it_whole(tmp_path, monkeypatch):
     import ctlev_core.metrics
 
-    (tmp_path / "slow_metric.py").write_text("import time\ntime.sleep(0.5)\nVERSION = 1\n")
+    text = "import time\ntime.sleep(0.5)\nINPUT, SCORES, Options, compute = 'classes', (), None, None\nVERSION = 1\n"
+    (tmp_path / "slow_metric.py").write_text(text)
     monkeypatch.setattr(ctlev_core.metrics, "__path__", [*ctlev_core.metrics.__path__, str(tmp_path)])
     with ThreadPoolExecutor(2) as threads:
         first = threads.submit(plugins.load, "metrics", "slow_metric")
@@ -137,6 +171,16 @@ def test_threads_that_load_a_plugin_at_once_get_it_whole(tmp_path, monkeypatch):
         second = threads.submit(lambda: plugins.load("metrics", "slow_metric").VERSION)
         assert second.result() == first.result().VERSION == 1
     del sys.modules["ctlev_core.metrics.slow_metric"]
+
+
+def test_what_a_plugin_lacks_is_named(tmp_path, monkeypatch):
+    import ctlev_core.metrics
+
+    (tmp_path / "half_metric.py").write_text("VERSION = 1\nINPUT = 'classes'\nSCORES = ()\nOptions = None\n")
+    monkeypatch.setattr(ctlev_core.metrics, "__path__", [*ctlev_core.metrics.__path__, str(tmp_path)])
+    with pytest.raises(PluginError, match=r"half_metric.py: expected the names of Metric in .*, lacks compute$"):
+        plugins.load("metrics", "half_metric")
+    del sys.modules["ctlev_core.metrics.half_metric"]
 
 
 def test_every_wrong_option_is_named_at_once():

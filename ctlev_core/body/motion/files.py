@@ -7,6 +7,7 @@ from types import ModuleType
 
 from ctlev_core import plugins
 from ctlev_core.body.motion.clip import MotionClip
+from ctlev_core.plugin_contracts import MotionFormatWithoutRate
 from data_contracts.errors import DataError, DetailedDataError
 
 
@@ -46,7 +47,7 @@ def read_motion(path: Path, rate_hz: float | None = None) -> MotionClip:
         raise DetailedDataError(
             f"{path}: not a motion file of a known format ({size} bytes); known formats: {known}{_objections(path)}"
         )
-    if rate_hz is not None and hasattr(module, "RATE_HZ"):
+    if rate_hz is not None and isinstance(module, MotionFormatWithoutRate):
         return module.read(path, rate_hz)
     return module.read(path)
 

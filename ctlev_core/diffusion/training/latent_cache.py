@@ -24,6 +24,7 @@ from ctlev_core.diffusion.pretrained.loading import (
 )
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
+from ctlev_core.plugin_contracts import ConditionThatTurns
 from data_contracts.arrays import ArrayWriter
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
@@ -220,10 +221,10 @@ def encode_images(base_model: PretrainedModel, images: np.ndarray, generator: to
 def turn_conditions(images: np.ndarray, turns: np.ndarray, made_by: ConditionChoice | None) -> np.ndarray:
     """Square condition images [B, S, S, 3] in `turns` [B] quarter turns against the clock.
 
-    A plug-in with a function `turn` knows what its colours mean; the others' images are pictures.
+    A `ConditionThatTurns` knows what its colours mean; the others' images are pictures.
     """
     plugin = None if made_by is None else plugins.load_options(made_by)
-    if plugin is not None and hasattr(plugin.module, "turn"):
+    if plugin is not None and isinstance(plugin.module, ConditionThatTurns):
         return plugin.module.turn(images, turns, plugin.options)
     return np.stack([np.rot90(image, turn) for image, turn in zip(images, turns, strict=True)])
 

@@ -1,13 +1,12 @@
 """Scores that do not fit the model are refused in the plan; what a body file holds is in the key."""
 
-import inspect
 from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
-from ctlev_core import plugin_contracts, plugins
+from ctlev_core import plugins
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.metrics import pve
 from ctlev_core.plugins import PluginError
@@ -57,34 +56,6 @@ def test_predictions_hold_what_a_model_says_it_predicts():
         text = (module.predict.__doc__ or "") + (getattr(module, "predict_sequences", module.predict).__doc__ or "")
         for name in module.PREDICTS:
             assert columns[name] in text, (model, name)
-
-
-CONTRACTS = {
-    "train_sequences": plugin_contracts.DownstreamOfSequences,
-    "predict_sequences": plugin_contracts.DownstreamOfSequences,
-    "predict_recordings": plugin_contracts.DownstreamOfRecordings,
-    "input_files": plugin_contracts.MetricWithFiles,
-    "check_joint_set": plugin_contracts.MetricOfSkeletons,
-    "compute_rows": plugin_contracts.MetricOfRows,
-    "prepare": plugin_contracts.PreparedMetric,
-    "compute_sums": plugin_contracts.MetricOfSums,
-}
-
-
-@pytest.mark.parametrize("kind", ["downstream", "metrics"])
-def test_what_plug_ins_have_beyond_their_kind_is_called_as_they_have_it(kind):
-    for name in plugins.names(kind):
-        module = plugins.load(kind, name)
-        assert hasattr(module, "train_sequences") == hasattr(module, "predict_sequences")
-        for function in [function for function in CONTRACTS if hasattr(module, function)]:
-            wanted = inspect.signature(getattr(CONTRACTS[function], function)).parameters.values()
-            found = inspect.signature(getattr(module, function)).parameters.values()
-            assert [(p.name, p.kind) for p in found] == [(p.name, p.kind) for p in list(wanted)[1:]], (name, function)
-
-
-def test_a_model_that_says_nothing_is_not_checked(monkeypatch):
-    monkeypatch.delattr(plugins.load("downstream", "pose2d"), "PREDICTS")
-    check_metrics(DownstreamChoice(name="pose2d"), [MetricChoice(name="pve")])
 
 
 @pytest.mark.parametrize(
