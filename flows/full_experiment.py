@@ -11,10 +11,12 @@ from functools import partial
 
 from ctlev_core import plugins
 from ctlev_core.plugin_contracts import GeneratorOfNames
+from ctlev_core.report.inputs import GeneratedFrames, Named, ReportInputs
 from ctlev_core.report.page.report_files import publish_report, read_verdict
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from data_contracts.study import Study
+from data_contracts.training_sets import SYNTHETIC
 from flows.baselines import baselines
 from flows.cli import script
 from flows.command_line import Command
@@ -53,33 +55,38 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
     # What is shown are the first set of each generator and the first of several fine-tunings.
     first = {name: sets[0] for name, sets in compared.items()}
     checkpoint, synthetic = own[0]
-    generated = [synthetic, *(frames.synthetic for frames in first.values())]
+    generated = {SYNTHETIC: synthetic} | {name: frames.synthetic for name, frames in first.items()}
+    checkpoints = {SYNTHETIC: checkpoint} | {name: made.checkpoint for name, made in first.items() if made.checkpoint}
     reference = None
     if experiment.realism_reference is not None:
         reference = ingest(dataset=experiment.realism_reference, label="realism reference")
     looks = realism(
         dataset.recordings,
         dataset.frames,
-        generated,
+        list(generated.values()),
         reference,
-        names=experiment.generator_names,
-        label=f"training frames and {', '.join(experiment.generator_names)}",
+        names=list(generated),
+        label=f"training frames and {', '.join(generated)}",
     )
-    memorised = [
-        memorisation(
-            dataset.frames,
+    shown = [
+        GeneratedFrames(
+            name,
             frames,
-            evaluation.extractor,
-            downstream=experiment.feature_extractor,
-            subject=name,
-            label=name,
+            memorisation(
+                dataset.frames,
+                frames,
+                evaluation.extractor,
+                downstream=experiment.feature_extractor,
+                subject=name,
+                label=name,
+            ),
         )
-        for name, frames in zip(experiment.generator_names, generated, strict=True)
+        for name, frames in generated.items()
     ]
-    names = None
+    nearest = None
     generator = plugins.load("generators", experiment.generator.name)
     if experiment.target is not None and isinstance(generator, GeneratorOfNames):
-        names = nearest_seen(
+        nearest = nearest_seen(
             checkpoint,
             dataset.frames,
             dataset.sample_conditions,
@@ -88,28 +95,24 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         )
     if experiment.export is not None:
         call_flow(export_streams, experiment, dataset, synthetic)
-    return report(
-        dataset.recordings,
-        dataset.frames,
-        dataset.frame_conditions,
-        dataset.sample_conditions,
-        [checkpoint, *(frames.checkpoint for frames in first.values() if frames.checkpoint)],
-        generated,
-        evaluation.scores,
-        evaluation.models,
-        looks,
-        memorised,
-        dataset.more_frames,
-        dataset.target_frames,
-        names,
+    made = ReportInputs(
         title=experiment.name,
         notice=experiment.data_notice,
-        training_sets=[str(one) for one in experiment.all_training_sets],
-        generator_names=experiment.generator_names,
-        checkpoint_names=["synthetic", *(name for name, frames in first.items() if frames.checkpoint)],
-        model_names=evaluation.model_names,
-        label=experiment.name,
+        training_sets=tuple(str(one) for one in experiment.all_training_sets),
+        recordings=dataset.recordings,
+        frames=dataset.frames,
+        frame_conditions=dataset.frame_conditions,
+        conditions=dataset.sample_conditions,
+        generated=tuple(shown),
+        checkpoints=tuple(Named(name, one) for name, one in checkpoints.items()),
+        models=tuple(Named(*pair) for pair in zip(evaluation.model_names, evaluation.models, strict=True)),
+        scores=tuple(evaluation.scores),
+        realism=looks,
+        oracle=dataset.more_frames,
+        target=dataset.target_frames,
+        nearest=nearest,
     )
+    return report(made, label=experiment.name)
 
 
 def _study(study: Study) -> ManifestRef:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -15,13 +15,10 @@ from ctlev_core.plugin_contracts import (
     DownstreamOfRecordings,
     DownstreamOfSequences,
     MetricOfRows,
-    MetricOfSums,
-    PreparedMetric,
 )
 from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
-from ctlev_core.scoring.pose import quotients
+from ctlev_core.scoring.scored_rows import score_each_row, score_rows
 from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, subject_groups
-from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, cluster_bootstrap, ratio_bootstrap
 from ctlev_core.statistics.feature_distances import (
     DISTANCE_ESTIMATES,
     DistanceEstimate,
@@ -33,7 +30,6 @@ from ctlev_core.supervised.frame_sequences import name_recordings
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
-from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest
 from data_contracts.training_sets import LabelAgreement
 from tasks.stage import Output, Stage
@@ -111,14 +107,14 @@ def score_model(
         metric = plugins.load_options(choice)
         for group, members in groups:
             try:
-                scores, low, high = _score(metric, prediction, labels.take(members), members, recordings[members])
+                scores, low, high = score_rows(metric, prediction, labels.take(members), members, recordings[members])
             except ValueError:
                 if group == "all":
                     raise
                 continue  # a class without a visible joint, for example, has no score of its own
             if group == "all" and isinstance(metric.module, MetricOfRows):
                 columns = {"sample_id": sample_ids, "recording_id": recordings}
-                sample_scores.append(pa.table(columns | _of_samples(metric, prediction, labels, scores)))
+                sample_scores.append(pa.table(columns | score_each_row(metric, prediction, labels, scores)))
             found += [
                 {
                     **same,
@@ -143,36 +139,6 @@ def _predict_of(module: Any, data: Manifest, rows: np.ndarray) -> Any:
     if isinstance(module, DownstreamOfRecordings):
         return partial(module.predict_recordings, recordings=np.array(data.column("recording_id"))[rows].tolist())
     return module.predict
-
-
-def _of_samples(
-    metric: plugins.Plugin, prediction: Mapping[str, Any], labels: Labels, scores: Mapping[str, float]
-) -> dict[str, pa.Array]:
-    """What each row adds to the one of the metric's scores that is the rows' mean, and its weight in that mean.
-
-    Joints count alike in a score, not frames: of a frame of which half is out of the picture there are fewer. Which of
-    several scores the rows belong to is seen from their mean.
-    """
-    values = metric.module.compute_rows(prediction, labels, metric.options)
-    sums = (
-        metric.module.compute_sums(prediction, labels, metric.options)
-        if isinstance(metric.module, MetricOfSums)
-        else {}
-    )
-    of = {name: np.asarray(sums[name][1] if name in sums else np.ones(len(values)), np.float64) for name in scores}
-
-    def distance(name: str) -> float:
-        scored = ~np.isnan(values) & (of[name] > 0)
-        if not scored.any():
-            return np.inf
-        return round(abs(float(np.average(values[scored], weights=of[name][scored])) - scores[name]), 9)
-
-    name = min(scores, key=distance)  # the first of those that are as near
-    return {
-        "metric": pa.array([name] * len(values), pa.string()),
-        "value": pa.array(values, pa.float64(), from_pandas=True),
-        "weight": pa.array(of[name], pa.float64()),
-    }
 
 
 def _groups(
@@ -208,35 +174,6 @@ def _others(count: int, seed: int) -> np.ndarray:
     other = np.empty(count, np.int64)
     other[order] = np.roll(order, 1)
     return other
-
-
-def _score(
-    metric: plugins.Plugin, prediction: Any, labels: Any, members: np.ndarray, recordings: np.ndarray
-) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """The scores of some rows, and the ends of their intervals."""
-
-    def pick(chosen: np.ndarray) -> dict[str, Any]:
-        return {
-            name: values if name == "classes" else np.asarray(values)[members[chosen]]
-            for name, values in prediction.items()
-        }
-
-    def compute(chosen: np.ndarray) -> dict[str, float]:
-        return metric.module.compute(pick(chosen), labels.take(chosen), metric.options)
-
-    every = np.arange(len(members))
-    few = len(set(recordings.tolist())) < MIN_RECORDINGS
-    if isinstance(metric.module, MetricOfSums):
-        sums = metric.module.compute_sums(pick(every), labels, metric.options)
-        if not all(count.any() for _, count in sums.values()):
-            raise ValueError("nothing to score in these rows")
-        scores = quotients(sums)
-        return (scores, {}, {}) if few else (scores, *ratio_bootstrap(sums, recordings))
-    # Names are compared once rather than for each of many resamplings.
-    prepared = isinstance(metric.module, PreparedMetric)
-    resampled = metric.module.prepare(pick(every), labels, metric.options) if prepared else compute
-    scores = resampled(every)
-    return (scores, {}, {}) if few else (scores, *cluster_bootstrap(resampled, recordings))
 
 
 def _refuse_overlap(data: Manifest, rows: np.ndarray, training_sets: list[Manifest], split: str) -> None:

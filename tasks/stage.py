@@ -204,7 +204,8 @@ class Stage:
         """Plan or run the stage.
 
         Args:
-            inputs: manifest references (or lists of them), in the order of the function's parameters after `out`.
+            inputs: manifest references, or lists or dataclasses of them, in the order of the function's parameters
+                after `out`.
             label: shown in the plan and in Prefect; changes nothing.
             settings: the function's keyword parameters.
         """
@@ -391,6 +392,8 @@ def _references(value: Any) -> list[ManifestRef]:
         return [value]
     if isinstance(value, list | tuple):
         return [ref for item in value for ref in _references(item)]
+    if dataclasses.is_dataclass(value):
+        return [ref for field in dataclasses.fields(value) for ref in _references(getattr(value, field.name))]
     return []
 
 
@@ -399,6 +402,9 @@ def _opened(value: Any) -> Any:
         return read_manifest(value)
     if isinstance(value, list | tuple):
         return [_opened(item) for item in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        opened = {field.name: _opened(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return dataclasses.replace(value, **opened)
     return value
 
 
@@ -417,9 +423,13 @@ def _material(value: Any) -> Any:
         return cache_material(value)
     if isinstance(value, list | tuple):
         return [_material(item) for item in value]
+    if dataclasses.is_dataclass(value):
+        return {field.name: _material(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if value is None or isinstance(value, str | int | float | bool):
         return value
-    raise DataError(f"a stage argument must be a manifest, options or a plain value, got {type(value).__name__}")
+    raise DataError(
+        f"a stage argument must be a manifest, options, a plain value or a record of these, got {type(value).__name__}"
+    )
 
 
 def _cpu_seconds() -> float:

@@ -111,6 +111,8 @@ def _inputs(arguments: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         for item in value if isinstance(value, list) else [value]:
             if isinstance(item, dict) and set(item) == {"manifest"}:
                 yield name, item["manifest"]
+            elif isinstance(item, dict):
+                yield from _inputs(item)
 
 
 def behind(records: Sequence[Record], key: str) -> list[Record]:

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
+from ctlev_core.report.inputs import GeneratedFrames, Named, ReportInputs
 from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
 from data_contracts import tables
 from data_contracts.labels import Labels
@@ -48,16 +49,23 @@ class Experiment:
         self.memorisation = [self._memorisation(name) for name in ("synthetic", "gan")]
 
     @property
-    def arguments(self) -> dict:
+    def inputs(self) -> ReportInputs[Manifest]:
         """For `tasks.report.report`."""
-        inputs = ("recordings", "frames", "frame_conditions", "conditions", "checkpoints", "generated", "scores")
-        given = {name: getattr(self, name) for name in (*inputs, "models", "realism", "memorisation", "model_names")}
-        names = ["synthetic", "gan"]
-        return given | {
-            "title": "tiny", "notice": "Data: `made up`.", "training_sets": list(TRAINING_SETS),
-            "generator_names": names,
-            "checkpoint_names": names,
-        }  # fmt: skip
+        names = ("synthetic", "gan")
+        return ReportInputs(
+            title="tiny",
+            notice="Data: `made up`.",
+            training_sets=tuple(TRAINING_SETS),
+            recordings=self.recordings,
+            frames=self.frames,
+            frame_conditions=self.frame_conditions,
+            conditions=self.conditions,
+            generated=tuple(map(GeneratedFrames, names, self.generated, self.memorisation)),
+            checkpoints=tuple(map(Named, names, self.checkpoints)),
+            models=tuple(map(Named, self.model_names, self.models)),
+            scores=tuple(self.scores),
+            realism=self.realism,
+        )
 
     def _put(self, stage: str, table: pa.Table, schema, attached=(), arrays=(), arguments=(), inputs=()) -> Manifest:
         self._count += 1

@@ -74,7 +74,7 @@ def test_experiments_in_no_group_are_shown_as_ever(tmp_path):
     experiment = Experiment(tmp_path / "other")
     folder = tmp_path / "report"
     folder.mkdir()
-    report.function(Output(folder, folder), **experiment.arguments)
+    report.function(Output(folder, folder), experiment.inputs)
     other = Manifest(ManifestRef(key="k", path=folder), None, (), ())
     groups = pooled_groups((2,))
     names = [*groups[0][1], "other0"]

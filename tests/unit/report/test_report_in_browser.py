@@ -95,7 +95,7 @@ def page(tmp_path_factory):
     experiment = Experiment(tmp_path_factory.mktemp("home"))
     folder = experiment.home / "made"
     folder.mkdir()
-    report.function(Output(folder, folder), **experiment.arguments)
+    report.function(Output(folder, folder), experiment.inputs)
     return (folder / "report.html").read_text()
 
 

@@ -53,7 +53,7 @@ def reports(tmp_path_factory):
         experiment = Experiment(tmp_path_factory.mktemp(name))
         folder = experiment.home / "report"
         folder.mkdir()
-        report.function(Output(folder, folder), **experiment.arguments)
+        report.function(Output(folder, folder), experiment.inputs)
         folders.append(folder)
     return folders
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ctlev_core import plugins
+from ctlev_core.recordings.ingestion import check_track
 from data_contracts import tables
 from data_contracts.config import ConditionChoice, DatasetChoice, EncodingChoice, Frozen, Windows
 from data_contracts.errors import DataError
@@ -15,7 +16,7 @@ from data_contracts.labels import ImageTrack, Labels, Part, Recording
 from data_contracts.manifest import read_manifest
 from tasks.condition import condition_frames
 from tasks.encode import encode
-from tasks.ingest import _check_track, ingest
+from tasks.ingest import ingest
 from tasks.realism import realism
 from tasks.store import Store
 
@@ -218,7 +219,7 @@ def test_labels_of_the_datasets_windows_are_taken_as_they_are(frames_of):
 @pytest.mark.parametrize("held", [1 << 22, 10])
 def test_a_window_that_ends_at_a_label_has_that_label(frames_of, monkeypatch, held):
     """Labels are 500 us apart: windows of 100 us that tile a recording are up to 300 us from any."""
-    monkeypatch.setattr("tasks.encode.MAX_EVENTS", held)
+    monkeypatch.setattr("ctlev_core.recordings.encoding.MAX_EVENTS", held)
     monkeypatch.setattr(encode, "version", 10**6 + held)  # not the cached artefact
     _, frames = frames_of(make_dataset(), Windows(method="duration", duration_us=100, anchor="labels"))
     assert frames.column("recording_id") == ["train/one", "test/one"], "at 0 and 1000 us there are no whole windows"
@@ -249,9 +250,9 @@ def test_recordings_larger_than_what_is_held_give_the_same_frames(frames_of, mon
     windows = Windows(method=method, num_events=7, duration_us=90, min_events=3, max_windows=9)
     _, whole = frames_of(make_dataset(), windows=windows)
     expected = [whole.array(name).copy() for name in ("histograms", "frames")], whole.table.drop_columns("joints3d_mm")
-    monkeypatch.setattr("tasks.encode.MAX_EVENTS", 10)
-    monkeypatch.setattr("tasks.encode.MAX_WINDOWS", 2)
-    monkeypatch.setattr("tasks.encode.MAX_GAP", 3)
+    monkeypatch.setattr("ctlev_core.recordings.encoding.MAX_EVENTS", 10)
+    monkeypatch.setattr("ctlev_core.recordings.encoding.MAX_WINDOWS", 2)
+    monkeypatch.setattr("ctlev_core.recordings.encoding.MAX_GAP", 3)
     monkeypatch.setattr(encode, "version", 10**6)  # not the cached artefact
     _, chunks = frames_of(make_dataset(), windows=windows)
     for name, array in zip(("histograms", "frames"), expected[0], strict=True):
@@ -309,7 +310,7 @@ def test_tracks_out_of_order_and_empty_ones_are_refused(t_us, message):
     recording = Recording("a", "someone", (Part("train"),))
     labels = Labels(("walk",) * len(t_us), np.array(t_us, np.int64))
     with pytest.raises(DataError, match=message):
-        _check_track(labels, recording, "test")
+        check_track(labels, recording, "test")
 
 
 @pytest.mark.parametrize(("count", "told"), [(65_534, False), (65_535, True), (70_000, True)])

@@ -1,5 +1,7 @@
 """The report of a tiny experiment: its page, its tables, and where its numbers come from."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -27,7 +29,7 @@ def published(experiment):
     """The folder of reports."""
     folder = experiment.home / "made"
     folder.mkdir()
-    report.function(Output(folder, folder), **experiment.arguments)
+    report.function(Output(folder, folder), experiment.inputs)
     publish_report(ManifestRef(key="k", path=folder), experiment.home, "tiny")
     return experiment.home / "reports"
 
@@ -75,14 +77,8 @@ def test_tables_hold_what_the_page_holds(published):
     assert latex.count("{table}") == 2 * latex.count(r"\toprule") and "Data: `made up`." in markdown
 
 
-def test_several_sets_of_a_generator_and_more_real_frames_are_taken(experiment, tmp_path):
-    arguments = experiment.arguments
-    arguments |= {"generated": [*experiment.generated, experiment.generated[0]], "oracle": experiment.frames}
-    arguments |= {
-        "memorisation": [*experiment.memorisation, experiment.memorisation[0]],
-        "generator_names": ["synthetic", "gan", "gan"],
-    }
-    report.function(Output(tmp_path, tmp_path), **arguments)
+def test_more_recorded_frames_are_shown(experiment, tmp_path):
+    report.function(Output(tmp_path, tmp_path), replace(experiment.inputs, oracle=experiment.frames))
     page = (tmp_path / "report.html").read_text()
     assert page.count(">GAN</span>") == 1 and "recorded, same moment" in page
     roles = [record.role for record in read_provenance(tmp_path / "provenance.json")]

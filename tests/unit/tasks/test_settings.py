@@ -182,7 +182,10 @@ def test_label_consistent_rows_are_the_best_of_each_class(monkeypatch, tmp_path)
     model = SimpleNamespace(predict=lambda folder, frames: {})
 
     def metric(score):
-        return SimpleNamespace(compute_rows=lambda *given: errors, compute=lambda *given: {score: 1.0, "mpjpe": 2.0})
+        return SimpleNamespace(
+            VERSION=1, INPUT="joints2d", SCORES=(), Options=None,
+            compute_rows=lambda *given: errors, compute=lambda *given: {score: 1.0, "mpjpe": 2.0},
+        )  # fmt: skip
 
     scores = {"mpjpe2d": "mpjpe2d_px", "pck2d": "pck2d", "pve": "pve_mm"}
     fakes = {"pose2d": model, **{name: metric(score) for name, score in scores.items()}}

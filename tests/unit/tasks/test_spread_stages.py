@@ -82,7 +82,7 @@ def test_images_that_wait_in_files_are_the_same_and_leave_nothing(alone, tmp_pat
 
     monkeypatch.setattr(encode_stage, "_put_away", watched)
     monkeypatch.setattr(encode_stage, "HELD_BYTES", 0)
-    monkeypatch.setattr(encode_stage, "MAX_WINDOWS", 2)
+    monkeypatch.setattr("ctlev_core.recordings.encoding.MAX_WINDOWS", 2)
     assert make(monkeypatch, tmp_path, "threads", 2) == alone
     assert len(put_away) == 12, "three windows of six recordings, in twos"
 

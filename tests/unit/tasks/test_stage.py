@@ -11,6 +11,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -96,6 +97,32 @@ def test_key_depends_on_options_seed_version_and_upstream():
     ref, _ = run(first, windows=Windows())
     other, _ = run(first, windows=Windows(num_events=1))
     assert key(second, ref) != key(second, other)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Artefacts in a record."""
+
+    name: str
+    sources: tuple
+
+
+@stage(version=1, schema=tables.TRAINING)
+def of_record(out, pair):
+    """Depends on what is in a record."""
+    calls.append(pair.name)
+    return curve([sum(one.column("loss")) for one in pair.sources])
+
+
+def test_records_of_artefacts_are_opened_and_enter_the_key():
+    refs = [run(first, windows=Windows(), seed=seed)[0] for seed in (1, 2)]
+    losses = [sum(read_manifest(ref).column("loss")) for ref in refs]
+    made, cached = run(of_record, Pair("both", tuple(refs)))
+    assert not cached and calls[-1] == "both" and read_manifest(made).column("loss") == losses
+    assert run(of_record, Pair("both", tuple(refs))) == (made, True)
+    assert read_run_record(made.path).upstream == {ref.key: ref.digest for ref in refs}
+    for other in (Pair("both", tuple(refs[:1])), Pair("one", tuple(refs))):
+        assert run(of_record, other)[0].key != made.key
 
 
 def test_run_settings_stay_outside_the_key():
@@ -244,7 +271,7 @@ def test_provenance_record():
 
 
 def test_stage_argument_of_unknown_kind_is_refused():
-    with pytest.raises(DataError, match="must be a manifest, options or a plain value, got set"):
+    with pytest.raises(DataError, match="must be a manifest, options, a plain value or a record of these, got set"):
         run(second, {1, 2})
 
 
