@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from prefect import Flow
 from prefect.logging import get_run_logger
@@ -28,7 +28,8 @@ from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
 from flows.command_line import check_home, load_experiment, publish_plan, use_cores
-from flows.settings import ScriptFlow, configure, flow
+from flows.preset_list import PRESETS, preset_names
+from flows.settings import ScriptFlow, configure, flow, run_named
 from flows.studies import load_study
 from tasks.chain_report import publish_chain_report
 from tasks.contact_sheet import publish_contact_sheet
@@ -50,6 +51,7 @@ def _deployable(
     *,
     default_preset: str = "pose",
     load: Callable[[str, list[str]], Any] = load_experiment,
+    presets: Path = PRESETS,
     publish: Callable[[Any, Path, str], str] | None = None,
 ) -> Flow[..., Any]:
     """A flow that does what a flow's script does, within the flow run that a worker has begun.
@@ -58,6 +60,7 @@ def _deployable(
         script_flow: a flow of one parameter, its options.
         default_preset: of the options.
         load: from a preset's name and overrides to the options.
+        presets: folder of the presets to choose from.
         publish: puts the result where a person looks for it, and says where that is.
     """
 
@@ -70,11 +73,14 @@ def _deployable(
             script_flow.fn(options)
         publish_plan(rows, f"{script_flow.name}, preset {preset}, in {folder}")
         use_cores(rows)
-        made = script_flow.fn(options)  # called as a flow it would be a second run of the same name within this one
+        with run_named(script_flow.name, getattr(options, "name", "")):
+            made = script_flow.fn(options)  # called as a flow it would be a second run of the same name within this one
         if publish is not None:
             get_run_logger().info(publish(made, folder, options.name))
         return made
 
+    # A choice of the bundled presets, or the path of another.
+    run.__annotations__["preset"] = Literal[tuple(preset_names(presets))] | str  # pyright: ignore[reportInvalidTypeForm]
     run.__name__ = script_flow.fn.__name__
     run.__doc__ = (inspect.getdoc(script_flow.fn) or "") + _ARGUMENTS
     return flow(name=script_flow.name)(run).of_prefect
@@ -95,7 +101,10 @@ evaluate = _deployable(of_evaluate.evaluate)
 compare = of_compare.compare.of_prefect
 export_events = _deployable(of_export_events.export_streams, publish=publish_events)
 speed_vs_error = _deployable(
-    of_speed_vs_error.speed_vs_error, load=of_speed_vs_error.load_speed_vs_error, publish=publish_speed_report
+    of_speed_vs_error.speed_vs_error,
+    load=of_speed_vs_error.load_speed_vs_error,
+    presets=PRESETS / "speed_vs_error",
+    publish=publish_speed_report,
 )
 realism_chain = _deployable(
     of_realism_chain.realism_chain, load=of_realism_chain.load_realism_chain, publish=publish_chain_report
@@ -104,4 +113,5 @@ pretrain = _deployable(
     of_pretrain.pretrain,
     default_preset="small",
     load=of_pretrain.load_pretraining,
+    presets=PRESETS / "pretraining",
 )

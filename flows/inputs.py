@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ctlev_core import plugins
-from ctlev_core.plugin_contracts import ConditionOfClasses, Dataset, Generator, PluginWithFiles
+from ctlev_core.plugin_contracts import ConditionOfClasses, Dataset, Generator, GeneratorFromWeights, PluginWithFiles
 from ctlev_core.plugins import PluginError
 from ctlev_core.scoring.checks import check_dataset
 from data_contracts.config import Choice, ConditionChoice, DatasetChoice
@@ -149,12 +149,13 @@ def _check_base_models(experiment: Experiment) -> None:
     used += [(baseline.generator, baseline.condition) for baseline in experiment.baselines.values()]
     for generator, condition in used:
         plugin = plugins.load_options(generator)
-        check = getattr(plugin.module, "check_fit", None)
-        base_model = getattr(plugin.options, "base_model", None)
-        # What is not there is told by the plan, and what the experiment makes itself is made to fit.
-        if check is None or (base_model is None and experiment.base_model) or (base_model and not base_model.exists()):
+        if not isinstance(plugin.module, GeneratorFromWeights):
             continue
-        check(plugin.options, image_size, condition)
+        base_model = plugin.options.base_model
+        # What is not there is told by the plan, and what the experiment makes itself is made to fit.
+        if (base_model is None and experiment.base_model) or (base_model and not base_model.exists()):
+            continue
+        plugin.module.check_fit(plugin.options, image_size, condition)
 
 
 def _conditions(experiment: Experiment) -> dict[str, tuple[ConditionChoice, DatasetChoice | None]]:

@@ -9,10 +9,12 @@ Nothing here reaches out: telemetry and update checks are off, and model hubs ar
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, ParamSpec, TypeVar
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 R = TypeVar("R")
+_run_path: ContextVar[tuple[str, ...]] = ContextVar("ctlev_run_path", default=())
 _ENVIRONMENT = {
     # Idle OpenMP threads that spin cost a busy machine most of its speed: 30 training steps of the pose network with
     # two threads took 44 s spinning and 11 s sleeping while another process had one of the two cores.
@@ -75,7 +78,32 @@ class ScriptFlow(Generic[P, R]):
 
     def __call__(self, *arguments: P.args, **settings: P.kwargs) -> R:
         """A run of the flow; what it returns or raises is that of the function."""
-        return self.of_prefect(*arguments, **settings)
+        options = [*arguments, *settings.values()]
+        with run_named(self.name, getattr(options[0], "name", "") if options else "") as name:
+            # Braces would be parameters to Prefect.
+            return self.of_prefect.with_options(flow_run_name=lambda: name)(*arguments, **settings)
+
+
+@contextlib.contextmanager
+def run_named(flow_name: str, asked: str) -> Iterator[str]:
+    """The name of a run, such as `demo / pose / synthesize`, which is that of the runs within this block before theirs.
+
+    Args:
+        flow_name: what is done.
+        asked: name of the experiment or study it is done for; empty = none.
+    """
+    above = _run_path.get()
+    if flow_name == "full-experiment":
+        # The parts of a study `demo` may be called `demo_pose`.
+        own = asked.removeprefix(f"{above[-1]}_") if above else asked
+    else:
+        own = flow_name
+    path = (*(above or ((asked,) if own != asked and asked else ())), own or flow_name)
+    token = _run_path.set(path)
+    try:
+        yield " / ".join(path)
+    finally:
+        _run_path.reset(token)
 
 
 def flow(name: str) -> Callable[[Callable[P, R]], ScriptFlow[P, R]]:

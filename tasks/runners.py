@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import importlib
 import importlib.util
 import logging
@@ -35,6 +36,14 @@ ALONE = {"CTLEV_WORKERS": "1", "CTLEV_RUNNER": "threads"}
 CONNECT_TIMEOUT_S = 60
 LOOK_UP_S = 0.5
 """A call to Ray that waits notices within so long that the cluster was closed."""
+
+
+_PASSING = {
+    errno.EAGAIN, errno.EBUSY, errno.ECONNABORTED, errno.ECONNREFUSED, errno.ECONNRESET, errno.EHOSTUNREACH,
+    errno.EINTR, errno.EIO, errno.EMFILE, errno.ENETDOWN, errno.ENETRESET, errno.ENETUNREACH,
+    errno.ENFILE, errno.ENOLCK, errno.EPIPE, errno.ESTALE, errno.ETIMEDOUT,
+}  # fmt: skip
+"""Failures of files and networks that another attempt may not meet; a full disk and a missing file stay."""
 
 
 class WorkerError(RuntimeError):
@@ -96,6 +105,15 @@ def asked_cluster(count: int) -> Runner | None:
     return cluster
 
 
+def is_passing(error: BaseException | None) -> bool:
+    """Is an error, or what it came from, one that another attempt may not meet?"""
+    while error is not None:
+        if getattr(error, "passes", False) or (isinstance(error, OSError) and error.errno in _PASSING):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def reply_to(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
     """Whether it succeeded, and what it returned or raised, with the traceback as a note."""
     try:
@@ -107,6 +125,7 @@ def reply_to(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
 def reply_with(error: Exception) -> bytes:
     """A failure as a reply; errors that cannot travel become one that says what they said."""
     error.add_note("".join(traceback.format_exception(error)))
+    error.passes = is_passing(error)  # pyright: ignore[reportAttributeAccessIssue]  # what it came from does not travel
     try:
         reply = pickle.dumps((False, error))
         pickle.loads(reply)

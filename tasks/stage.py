@@ -24,10 +24,12 @@ import importlib
 import importlib.metadata
 import inspect
 import json
+import math
 import os
 import platform
 import resource
 import shutil
+import signal
 import subprocess
 import threading
 import time
@@ -50,6 +52,7 @@ from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
+from tasks.prefect_runs import run_as_task
 from tasks.runners import asked_runner
 from tasks.store import Store
 from tasks.workers import current_workers, together
@@ -57,6 +60,8 @@ from tasks.workers import current_workers, together
 P = ParamSpec("P")
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
+TIMEOUT = "CTLEV_STAGE_TIMEOUT_S"
+"""Environment: seconds that the work of one stage may take; none = any."""
 RawFiles = Callable[[dict[str, Any]], Sequence[tuple[str, Path]]]
 """From the stage's arguments to (name, path) of the raw files it will read; the names enter the key too."""
 
@@ -223,7 +228,7 @@ class Stage:
             plan.rows.append(PlannedStage(self.name, label, key, cached, materials))
             return ManifestRef(key=key, path=store.folder(self.name, key))
         found = self.find(key, arguments) if _in_one_run.get() else None
-        return found or _run_as_task(self, label, key, arguments)
+        return found or run_as_task(self.name, label, functools.partial(self.run, key, arguments))
 
     def check(self, arguments: dict[str, Any]) -> None:
         """Raise `DataError` where the settings do not go together: where a stage is planned, and where it is run."""
@@ -286,7 +291,8 @@ class Stage:
             folder.mkdir(parents=True)
             work.mkdir(parents=True, exist_ok=True)
             opened = {name: _opened(value) for name, value in arguments.items()}
-            table = self.function(Output(folder, work), **opened)
+            with _time_limit(self.name):
+                table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
             record = {
                 "stage": self.name,
@@ -305,6 +311,39 @@ class Stage:
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
+
+
+class StageTimeoutError(RuntimeError):
+    """A stage took longer than CTLEV_STAGE_TIMEOUT_S allows."""
+
+
+@contextlib.contextmanager
+def _time_limit(name: str) -> Iterator[None]:
+    """Raise `StageTimeoutError` inside this block when its time is up; in the main thread of a process alone.
+
+    Stages of branches run in processes of their own, and those of scripts in the script's main thread.
+    """
+    asked = os.environ.get(TIMEOUT, "")
+    if not asked or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    try:
+        seconds = float(asked)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < math.inf:
+        raise DataError(f"{TIMEOUT} must be a number of seconds above 0, got {asked!r}")
+
+    def expire(number: int, frame: object) -> None:
+        raise StageTimeoutError(f"{name} took longer than {seconds:g} s ({TIMEOUT}); its checkpoints are kept")
+
+    before = signal.signal(signal.SIGALRM, expire)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def numbered(label: str, number: int) -> str:
@@ -360,21 +399,6 @@ def stage(
         readers: kinds of plug-ins that read them, found by what is in the files: one that is mended reads all anew.
     """
     return lambda function: Stage(function, version, schema, raw_files, readers)
-
-
-def _run_as_task(stage: Stage, label: str, key: str, arguments: dict[str, Any]) -> ManifestRef:
-    """Run through Prefect, so that the run, its state (Completed or Cached) and its time are recorded there."""
-    from prefect import task
-    from prefect.cache_policies import NO_CACHE
-    from prefect.states import Completed
-
-    # The store decides what is cached. Prefect's own cache would be a second, weaker opinion.
-    @task(name=stage.name, task_run_name=label, cache_policy=NO_CACHE, persist_result=False)
-    def run() -> Any:
-        ref, cached = stage.run(key, arguments)
-        return Completed(data=ref, name="Cached" if cached else "Completed", message=f"{ref.rows} rows, key {key[:12]}")
-
-    return run(return_state=True).result()
 
 
 def _run_stage(module: str, name: str, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:

@@ -117,46 +117,6 @@ def slerp(start: np.ndarray, end: np.ndarray, fraction: np.ndarray | float) -> n
     return start @ matrix_from_axis_angle(np.asarray(fraction, dtype=np.float64)[..., None] * step)
 
 
-def wrap_axis_angle(axis_angle: np.ndarray) -> np.ndarray:
-    """The shortest axis-angle vectors [..., 3] rad, of length at most pi, of the same rotations.
-
-    Vectors of length up to pi stay as they are, whole turns become 0.
-
-    Raises:
-        ValueError: the last axis is not 3.
-    """
-    vectors = _checked(axis_angle, (3,), "axis_angle")
-    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    turns = np.round(angle / (2 * np.pi))
-    return np.where(turns == 0, vectors, vectors * ((angle - 2 * np.pi * turns) / np.where(angle == 0, 1.0, angle)))
-
-
-def unwrap_axis_angle(track: np.ndarray) -> np.ndarray:
-    """The same rotations over time as vectors without jumps, as `numpy.unwrap` does for angles.
-
-    A rotation is the same after a whole turn about its axis; of all such vectors each frame gets the one nearest to the
-    vector of the frame before. Lengths may then pass pi. Near a whole turn (2 pi, 4 pi, ...) no choice is continuous
-    for every motion: what passes the identity there in another direction than along its axis still jumps. To
-    interpolate, use `slerp`.
-
-    Args:
-        track: [T, ..., 3] rad; the first frame stays as it is.
-    Raises:
-        ValueError: the last axis is not 3.
-    """
-    vectors = _checked(track, (3,), "track")
-    unwrapped = vectors.copy()
-    for frame in range(1, len(vectors)):
-        last, now = unwrapped[frame - 1], vectors[frame]
-        angle = np.linalg.norm(now, axis=-1, keepdims=True)
-        length = np.linalg.norm(last, axis=-1, keepdims=True)
-        # The identity has no axis of its own: it may take whole turns about the last one.
-        axis = np.where(angle > 0, now / np.where(angle > 0, angle, 1.0), last / np.where(length > 0, length, 1.0))
-        turns = np.round((np.sum(axis * last, axis=-1, keepdims=True) - angle) / (2 * np.pi))
-        unwrapped[frame] = np.where(turns == 0, now, axis * (angle + 2 * np.pi * turns))
-    return unwrapped
-
-
 def _refuse(wrong: np.ndarray, name: str, problem: str, values: np.ndarray) -> None:
     if np.any(wrong):
         where = tuple(int(n) for n in np.argwhere(wrong)[0])

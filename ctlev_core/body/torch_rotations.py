@@ -127,49 +127,6 @@ def matrix_from_rotation_6d(rotation_6d: torch.Tensor) -> torch.Tensor:
     return torch.stack([x, y, torch.linalg.cross(x, y, dim=-1)], -1)
 
 
-def wrap_axis_angle(axis_angle: torch.Tensor) -> torch.Tensor:
-    """The shortest axis-angle vectors [..., 3] rad, of length at most pi, of the same rotations.
-
-    Vectors of length up to pi stay as they are, whole turns become 0.
-
-    Raises:
-        ValueError: the last axis is not 3.
-    """
-    _check(axis_angle, (3,), "axis_angle")
-    length = torch.linalg.vector_norm(axis_angle.detach(), dim=-1, keepdim=True)
-    return _add_turns(axis_angle, -torch.round(length / (2 * math.pi)))
-
-
-def unwrap_axis_angle(track: torch.Tensor) -> torch.Tensor:
-    """The same rotations over time as vectors without jumps; see the function of the same name in `rotations`.
-
-    Args:
-        track: [T, ..., 3] rad; the first frame stays as it is.
-    Raises:
-        ValueError: the last axis is not 3.
-    """
-    _check(track, (3,), "track")
-    frames = list(track[:1])
-    for now in track[1:]:
-        last = frames[-1].detach()
-        length = torch.linalg.vector_norm(now.detach(), dim=-1, keepdim=True)
-        # The identity has no axis of its own: it may take whole turns about the last one.
-        axis = _unit(now.detach(), last).nan_to_num()
-        turns = torch.round(((axis * last).sum(-1, keepdim=True) - length) / (2 * math.pi))
-        has_axis = length > 0
-        about_last = now + 2 * math.pi * torch.where(has_axis, 0.0, turns) * axis
-        frames.append(torch.where(has_axis, _add_turns(now, torch.where(has_axis, turns, 0.0)), about_last))
-    return torch.stack(frames) if frames else track
-
-
-def _add_turns(vectors: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """Vectors longer by whole turns; those without turns are the same to the last bit, and have a gradient at 0."""
-    whole = turns != 0
-    safe = torch.where(whole, vectors, 1.0)
-    length = torch.linalg.vector_norm(safe, dim=-1, keepdim=True)
-    return torch.where(whole, safe * ((length + 2 * math.pi * turns) / length), vectors)
-
-
 def slerp(start: torch.Tensor, end: torch.Tensor, fraction: torch.Tensor | float) -> torch.Tensor:
     """Point on the shortest path from `start` to `end` on SO(3), at constant angular speed.
 

@@ -1,7 +1,7 @@
 """Body motion of others, without events: the clips of a motion data set as labels before a virtual camera.
 
 A still camera of each recording looks at where the body goes, and labels come in its frame (x right, y down, z
-forward), which is the only frame that `Labels` knows; `clip_of_labels` is the way back.
+forward), which is the only frame that `Labels` knows.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from ctlev_core.body.motion.clip import (
 from ctlev_core.events.windows import spread
 from ctlev_core.geometry.camera import orbit_rotation
 from data_contracts.config import Frozen
-from data_contracts.errors import DataError
 from data_contracts.labels import Labels, check_labels
 
 CAMERA_STREAM = 20
@@ -109,33 +108,6 @@ def _still_translation(way: np.ndarray, distance_m: float) -> np.ndarray:
     needed = 2 * FOCAL_PER_SIDE * (off_axis + BODY_REACH_M) - (way[:, 2] - low[2])
     needed = np.where(off_axis > MAX_OFF_AXIS_M, needed, 0.0).max()
     return np.array([-centre[0], -centre[1], max(distance_m, needed) - low[2]])
-
-
-def clip_of_labels(labels: Labels, where: str) -> MotionClip:
-    """The SMPL track of one recording of any dataset as a motion, to be resampled, shown from elsewhere or shown again.
-
-    Labels are in the camera frame. The clip's world is the camera turned by half a turn about x, so that a body that
-    stands upright in the picture stands upright: x to the right of the picture, y up, z towards the camera. Which way
-    gravity points is not known; of a camera that looks down, the world is inclined by as much.
-
-    Args:
-        labels: T moments of one person, times rising.
-        where: names them in messages.
-    Raises:
-        DataError: there are no SMPL parameters or no moments, times do not rise, or the shape changes on the way.
-    """
-    if labels.smpl_pose is None or labels.smpl_betas is None or labels.smpl_transl is None:
-        raise DataError(f"{where}: expected SMPL parameters, got {', '.join(labels.arrays) or 'class names alone'}")
-    if len(labels) == 0:
-        raise DataError(f"{where}: expected the motion of one body, got no moments")
-    betas = labels.smpl_betas.astype(np.float64)
-    other = np.flatnonzero((betas != betas[0]).any(axis=1))
-    if len(other):
-        raise DataError(f"{where}: expected one body, got another shape at moment {int(other[0])}")
-    caption = labels.class_names[0] if len(set(labels.class_names)) == 1 else ""
-    pose, transl = labels.smpl_pose.astype(np.float64), labels.smpl_transl.astype(np.float64)
-    in_camera = check_clip(MotionClip(pose, betas[0], transl, labels.t_us / 1e6, caption), where)
-    return move_world(in_camera, np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 
 
 def _camera_rotation(recording_id: str, options: PoseSourceOptions) -> np.ndarray:

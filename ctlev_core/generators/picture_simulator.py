@@ -233,11 +233,6 @@ def fill(options: SampleOptions) -> SampleOptions:
     return options.model_copy(update=missing)
 
 
-def frame_times_us(options: SampleOptions) -> np.ndarray:
-    """[T] int64, when the sensor is shown a frame: whenever the picture has moved by `max_displacement_px`."""
-    return _frames(options.path_us, options.path_px, options.max_displacement_px)[0]
-
-
 def _record(image: np.ndarray, row: int, sensor_size: SensorSize, options: SampleOptions, seed: int) -> Events:
     """The events of one picture."""
     from ctlev_core.render.panned_picture import pan

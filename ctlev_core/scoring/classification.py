@@ -103,12 +103,6 @@ def read_guesses(predicted: Mapping[str, Any], target: Labels) -> Guesses:
     return Guesses(np.array(list(columns)), truth, guess.astype(np.int64), confidence)
 
 
-def confusion_matrix(guesses: Guesses) -> np.ndarray:
-    """Counts [K, K] int64 of true class (row) and predicted class (column), in the order of `guesses.classes`."""
-    count = len(guesses.classes)
-    return np.bincount(guesses.truth * count + guesses.guess, minlength=count * count).reshape(count, count)
-
-
 def class_scores(truth: np.ndarray, guess: np.ndarray, num_classes: int) -> ClassScores:
     """Scores of each class, from class numbers [N] below `num_classes`."""
     hits, true, guessed = (

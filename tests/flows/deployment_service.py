@@ -20,10 +20,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
 from flow_scripts import REPOSITORY
 
 from ctlev_core.processes import die_with_parent
 
+DEPLOYMENTS = {
+    (flow := item["entrypoint"].rpartition(".")[2].replace("_", "-")): f"{flow}/{item['name']}"
+    for item in yaml.safe_load((REPOSITORY / "prefect.yaml").read_text())["deployments"]
+}
+"""`FLOW/DEPLOYMENT` by the flow's name."""
 PREFECT = [str(Path(sys.executable).with_name("prefect"))]
 ENDED = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
 PASSWORD = "ctlev:a password of the tests"
@@ -94,7 +100,7 @@ class Service:
         """Ask for a run as a user does; its id."""
         parameters = smoke_parameters(home, overrides)
         asked = [part for name, value in parameters.items() for part in ("-p", f"{name}={json.dumps(value)}")]
-        finished = self.prefect("deployment", "run", f"{deployment}/default", *asked)
+        finished = self.prefect("deployment", "run", DEPLOYMENTS[deployment], *asked)
         assert finished.returncode == 0, finished.stderr + finished.stdout
         return re.findall(r"UUID: ([0-9a-f-]{36})", finished.stdout)[0]
 
@@ -119,11 +125,14 @@ class Service:
         """The end of what the server or the workers said."""
         return (self.home / f"{name}.log").read_text()[-4000:]
 
+    def artifacts(self, run: str) -> dict[str, dict[str, Any]]:
+        """What a run shows, by key."""
+        found = self.api("artifacts/filter", {"artifacts": {"flow_run_id": {"any_": [run]}}, "limit": 200})
+        return {artifact["key"]: artifact for artifact in found}
+
     def plan(self, run: str) -> list[dict[str, str]]:
         """What a run said it would do."""
-        asked = {"artifacts": {"flow_run_id": {"any_": [run]}, "key": {"any_": ["plan"]}}}
-        (plan,) = self.api("artifacts/filter", asked)
-        return json.loads(plan["data"])
+        return json.loads(self.artifacts(run)["plan"]["data"])
 
 
 def smoke_parameters(home: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def script(name: str, *arguments: str, home: Path, own_server: bool = False, **p
     command = [sys.executable, str(REPOSITORY / "flows" / f"{name}.py"), "--home", str(home), *arguments]
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PREFECT_")}
     if not own_server:
-        environment |= shared_server()
+        environment |= {**shared_server(), "CTLEV_SHOW_STAGES": "0"}
     return subprocess.Popen(
         command, cwd=home, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen
     )
@@ -84,7 +84,7 @@ def run_script_here(name: str, *arguments: str, home: Path) -> Finished:
     For what is the same however a script is run: what its stages make of data and options.
     """
     with pytest.MonkeyPatch.context() as patch, in_one_run():
-        patch.setattr("tasks.stage._run_as_task", lambda stage, label, key, arguments: stage.run(key, arguments)[0])
+        patch.setattr("tasks.stage.run_as_task", lambda name, label, work: work()[0])
         return _here(name, arguments, home, connected=contextlib.nullcontext, with_plan=lambda flow, *_: flow.fn)
 
 

@@ -1,17 +1,20 @@
 """The deployments of prefect.yaml, served as docs/operations.md says: a server, a pool and a worker on loopback."""
 
 import datetime
+import http.server
 import inspect
 import itertools
 import json
+import queue
 import re
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 import yaml
-from deployment_service import ENDED, TIMEOUT_S, serving, smoke_parameters
+from deployment_service import DEPLOYMENTS, ENDED, TIMEOUT_S, serving, smoke_parameters
 from flow_scripts import REPOSITORY, digests
 
 from data_contracts.published import published_folder, read_latest, read_versions
@@ -62,13 +65,17 @@ def service(tmp_path_factory):
 
 @pytest.mark.slow
 def test_deployments_say_what_they_take_and_regenerate_never_overlaps(service):
-    found = {name: service.api(f"deployments/name/{name}/default") for name in SCRIPTS}
+    found = {name: service.api(f"deployments/name/{DEPLOYMENTS[name]}") for name in SCRIPTS}
     for name, deployment in found.items():
         parameters = deployment["parameter_openapi_schema"]["properties"]
-        expected = {"preset": "string", "overrides": "array", "home": None}
+        expected = {"preset": None, "overrides": "array", "home": None}
         if name == "compare":
             expected = {"run_a": "string", "run_b": "string", "home": None}
         assert {name: value.get("type") for name, value in parameters.items()} == expected
+        if name != "compare":
+            bundled, other = parameters["preset"]["anyOf"]
+            assert parameters["preset"]["default"] in bundled["enum"] and other == {"type": "string"}
+            assert DEPLOYMENTS[name] == f"{name}/{parameters['preset']['default']}"
         assert all(value["description"] for value in parameters.values())
         assert deployment["enforce_parameter_schema"] and deployment["work_pool_name"] == "ctlev"
         assert bool(deployment["schedules"]) == (name == "regenerate")
@@ -98,13 +105,17 @@ def test_a_deployed_run_makes_what_the_script_makes_and_shows_its_plan(service, 
     assert made == digests(tmp_path / "script", stages) and {name.partition("/")[0] for name in made} == set(stages)
     assert (tmp_path / "deployed" / "reports" / "smoke_conditions.html").is_file()
     assert not (service.home / "artefacts").exists()
-    (plan,) = service.api("artifacts/filter", {"artifacts": {"flow_run_id": {"any_": [run]}}})
-    assert {row["plan"] for row in json.loads(plan["data"])} == {"to run"}
+    assert {row["plan"] for row in service.plan(run)} == {"to run"}
+    shown = service.artifacts(run)
+    pictures = [key for key, artifact in shown.items() if "data:image/png;base64," in str(artifact["data"])]
+    assert any(key.startswith("encode") for key in pictures), sorted(shown)
+    logs = [log["message"] for log in service.api("logs/filter", {"logs": {"flow_run_id": {"any_": [run]}}})]
+    assert any(re.search(r"^encode.*: \d+ rows in [\d.]+ s, key ", message) for message in logs), logs
 
 
 @pytest.mark.slow
 def test_wrong_types_are_refused_before_anything_runs(service):
-    finished = service.prefect("deployment", "run", "prepare-dataset/default", "-p", "overrides=5")
+    finished = service.prefect("deployment", "run", DEPLOYMENTS["prepare-dataset"], "-p", "overrides=5")
     assert finished.returncode != 0
     assert "overrides" in finished.stdout + finished.stderr
 
@@ -157,6 +168,38 @@ def test_a_run_that_would_overlap_is_cancelled_and_says_why(service, tmp_path):
     assert service.state(first, until=ENDED)["type"] == "CANCELLED"
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_version_that_fails_a_gate_calls_the_webhook_of_the_docs(service, tmp_path):
+    heard: queue.Queue[str] = queue.Queue()
+
+    class Listener(http.server.BaseHTTPRequestHandler):
+        def do_POST(self):
+            heard.put(self.rfile.read(int(self.headers["Content-Length"])).decode())
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *told):
+            pass
+
+    page = (REPOSITORY / "docs" / "operations.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?Automation.*?)```", page, re.DOTALL)
+    with http.server.HTTPServer(("127.0.0.1", 0), Listener) as listener:
+        threading.Thread(target=listener.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{listener.server_address[1]}/gate"
+        assert "http://127.0.0.1:9000/gate" in code
+        made = subprocess.run(
+            [sys.executable, "-c", code.replace("http://127.0.0.1:9000/gate", url)],
+            env=service.environment, capture_output=True, text=True, timeout=TIMEOUT_S,
+        )  # fmt: skip
+        assert made.returncode == 0, made.stderr
+        run = service.start_run("regenerate", tmp_path, *QUICK, "gates.max_distance_ratio=0.001")
+        assert service.state(run, until=ENDED)["name"] == "Rejected"
+        told = heard.get(timeout=120)
+        listener.shutdown()
+    assert service.api(f"flow_runs/{run}")["name"] in told and "max_distance_ratio" in told
+
+
 QUICK = (
     "num_synthetic=3", "baselines={}", "oracle=null", "generator.options.num_steps=2",
     "sampling.num_inference_steps=2", "downstream.options.num_steps=2", "feature_extractor.options.num_steps=2",
@@ -201,7 +244,7 @@ def ended(service, runs):
 
 @pytest.mark.slow
 def test_a_schedule_becomes_a_run(service, tmp_path):
-    deployment = service.api("deployments/name/prepare-dataset/default")["id"]
+    deployment = service.api(f"deployments/name/{DEPLOYMENTS['prepare-dataset']}")["id"]
     (made,) = schedule_once(service, deployment, tmp_path, after_s=86_400)
     run = service.api(f"flow_runs/{made}")
     assert run["state"]["type"] == "SCHEDULED" and run["parameters"]["home"] == str(tmp_path)
@@ -212,7 +255,7 @@ def test_a_schedule_becomes_a_run(service, tmp_path):
 @pytest.mark.timeout(2400)
 def test_scheduled_regenerations_do_not_overlap_and_a_killed_one_is_gone_on_with(service, tmp_path):
     """Two schedules fire at the same moment, a third later; the worker of a fourth run is killed while it samples."""
-    deployment = service.api("deployments/name/regenerate/default")["id"]
+    deployment = service.api(f"deployments/name/{DEPLOYMENTS['regenerate']}")["id"]
     folder = published_folder(tmp_path, "smoke")
     runs = ended(service, schedule_once(service, deployment, tmp_path, times=2))
     ran = [run for run in runs if run["state"]["type"] == "COMPLETED"]

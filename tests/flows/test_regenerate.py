@@ -37,7 +37,7 @@ UNKEEPABLE = "gates.max_distance_ratio=1.0e-6"
 
 def make_next(patch: pytest.MonkeyPatch, home: Path, *overrides: str) -> Any:
     """Make the next version under a home, as the flow does; stages run here rather than as tasks of Prefect."""
-    patch.setattr("tasks.stage._run_as_task", lambda stage, label, key, arguments: stage.run(key, arguments)[0])
+    patch.setattr("tasks.stage.run_as_task", lambda name, label, work: work()[0])
     patch.setenv("CTLEV_HOME", str(home))
     from flows import regenerate  # here, because flows take the home from the environment
 

@@ -14,13 +14,13 @@ COMPUTES = {"finetune", "sample", "train_downstream", "score_model", "score_dist
 def test_every_stage_with_a_network_uses_the_gpu(tmp_path, monkeypatch):
     used = {}
 
-    def run(stage, label, key, arguments):
+    def run(name, label, work):
         before = gpu.num_operations
-        ref, _ = stage.run(key, arguments)
-        used[stage.name] = used.get(stage.name, 0) + gpu.num_operations - before
+        ref, _ = work()
+        used[name] = used.get(name, 0) + gpu.num_operations - before
         return ref
 
-    monkeypatch.setattr("tasks.stage._run_as_task", run)
+    monkeypatch.setattr("tasks.stage.run_as_task", run)
     monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
     from flows import full_experiment  # here, because flows take the home from the environment
     from flows.studies import load_study

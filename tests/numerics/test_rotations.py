@@ -104,67 +104,10 @@ def test_degenerate_6d_is_named(numbers, message):
         rotations.matrix_from_rotation_6d(np.array([good, numbers], dtype=np.float64))
 
 
-@settings(deadline=None, max_examples=150)
-@given(directions, st.one_of(st.floats(0, 60), st.sampled_from([np.pi, 2 * np.pi, 3 * np.pi, 4 * np.pi, 50.0])))
-def test_wrapped_vectors_are_the_same_rotation_and_short(direction, angle):
-    vector = angle * np.array(direction) / np.linalg.norm(direction)
-    wrapped = rotations.wrap_axis_angle(vector)
-    assert np.linalg.norm(wrapped) <= np.pi * (1 + 1e-14)
-    if np.linalg.norm(vector) < np.pi:
-        np.testing.assert_array_equal(wrapped, vector)
-    # 60 rad are known to 7e-15.
-    np.testing.assert_allclose(
-        rotations.matrix_from_axis_angle(wrapped), rotations.matrix_from_axis_angle(vector), atol=3e-14
-    )
-
-
-def test_whole_turns_wrap_to_nothing():
-    np.testing.assert_array_equal(rotations.wrap_axis_angle(np.array([[0, 2 * np.pi, 0], [0, 0, 0]])), np.zeros((2, 3)))
-
-
-def test_a_long_spin_unwraps_to_a_straight_line():
-    axis, angle = np.array([0.6, 0.0, -0.8]), np.linspace(-15.0, 15.0, 400)
-    track = np.stack([angle[:, None] * axis, np.zeros((400, 3))], axis=1)
-    wrapped = rotations.wrap_axis_angle(track)
-    assert np.abs(np.diff(wrapped, axis=0)).max() > 2.5
-    unwrapped = rotations.unwrap_axis_angle(wrapped)
-    # The first frame stays: the line begins there instead of at -15.
-    np.testing.assert_allclose(unwrapped - unwrapped[0], track - track[0], atol=1e-13)
-
-
-@settings(deadline=None, max_examples=60)
-@given(st.integers(0, 2**32 - 1))
-def test_unwrapped_tracks_are_the_same_rotations_without_jumps(seed):
-    rng = np.random.default_rng(seed)
-    # Between half a turn and one and a half, off the whole turns where no choice is continuous.
-    axis = rng.normal(size=3)
-    axis = axis / np.linalg.norm(axis) + 0.1 * np.cumsum(rng.normal(size=(200, 3)) * 0.05, axis=0)
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    track = (np.pi + 2.2 * np.sin(np.linspace(0, 9, 200)))[:, None] * axis
-    wrapped = rotations.wrap_axis_angle(track)
-    assert np.linalg.norm(np.diff(wrapped, axis=0), axis=1).max() > 2.5
-    unwrapped = rotations.unwrap_axis_angle(wrapped)
-    np.testing.assert_allclose(
-        rotations.matrix_from_axis_angle(unwrapped), rotations.matrix_from_axis_angle(track), atol=1e-13
-    )
-    # The track itself, or the same seen from the opposite axis: its steps are no longer than twice as long.
-    steps = np.linalg.norm(np.diff(track, axis=0), axis=1).max()
-    assert np.linalg.norm(np.diff(unwrapped, axis=0), axis=1).max() < 2 * steps
-
-
-def test_the_identity_after_a_whole_turn_keeps_the_turn():
-    track = np.array([[0, 6.0, 0], [0, 0, 0], [0, 0.5, 0]])
-    expected = [[0, 6.0, 0], [0, 2 * np.pi, 0], [0, 2 * np.pi + 0.5, 0]]
-    np.testing.assert_allclose(rotations.unwrap_axis_angle(track), expected, atol=1e-14)
-
-
-def test_empty_batches_and_one_frame():
+def test_empty_batches():
     assert rotations.matrix_from_axis_angle(np.zeros((0, 3))).shape == (0, 3, 3)
     assert rotations.axis_angle_from_matrix(np.zeros((0, 3, 3))).shape == (0, 3)
     assert rotations.matrix_from_rotation_6d(np.zeros((0, 6))).shape == (0, 3, 3)
-    assert rotations.wrap_axis_angle(np.zeros((0, 24, 3))).shape == (0, 24, 3)
-    assert rotations.unwrap_axis_angle(np.zeros((0, 24, 3))).shape == (0, 24, 3)
-    np.testing.assert_array_equal(rotations.unwrap_axis_angle(np.full((1, 3), 9.0)), np.full((1, 3), 9.0))
 
 
 def test_numbers_that_are_not_finite_are_named():

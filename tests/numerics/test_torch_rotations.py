@@ -4,7 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -194,44 +194,7 @@ def test_slerp_agrees_with_numpy_and_has_gradients():
     assert torch.isfinite(gradient).all()
 
 
-@settings(deadline=None, max_examples=100)
-@given(unit_axes, st.one_of(st.floats(0, 60), st.sampled_from([*NEAR_PI, *LARGE])))
-@example((0.8019453943966162, 0.37892701770705783, 0.37892701770705783), 3 * PI)
-def test_wrapping_agrees_with_numpy_and_has_gradients(axis, angle):
-    vector = torch.tensor(angle * np.array(axis) / np.linalg.norm(axis), dtype=torch.float64, requires_grad=True)
-    wrapped = rotations.wrap_axis_angle(vector)
-    expected = numpy_rotations.wrap_axis_angle(vector.detach().numpy())
-    if abs(np.linalg.norm(expected) - PI) < 1e-13:  # half a turn either way is the same: the last bit of a norm decides
-        expected = np.sign(expected @ wrapped.detach().numpy()) * expected
-    np.testing.assert_allclose(wrapped.detach(), expected, atol=2e-14)
-    # It stays the same rotation, so that whatever follows has the same gradient.
-    weights = torch.arange(9, dtype=torch.float64).view(3, 3)
-    gradients = [
-        torch.autograd.grad((rotations.matrix_from_axis_angle(v) * weights).sum(), vector)[0] for v in (vector, wrapped)
-    ]
-    if np.linalg.norm(wrapped.detach()) > 1e-6:  # where a whole turn becomes 0 the axis, and its gradient, is lost
-        np.testing.assert_allclose(gradients[1], gradients[0], atol=1e-8)
-    assert torch.isfinite(gradients[1]).all()
-
-
-def test_unwrapping_agrees_with_numpy_and_has_gradients():
-    rng = np.random.default_rng(0)
-    steps = 0.3 * rng.normal(size=(100, 24, 3))
-    track = numpy_rotations.wrap_axis_angle(np.cumsum(steps, axis=0))
-    track[50, :4] = 0.0
-    tensor = torch.from_numpy(track).requires_grad_()
-    unwrapped = rotations.unwrap_axis_angle(tensor)
-    expected = numpy_rotations.unwrap_axis_angle(track)
-    assert np.abs(np.diff(track, axis=0)).max() > 3 and np.linalg.norm(expected, axis=-1).max() > 3.5
-    np.testing.assert_allclose(unwrapped.detach(), expected, atol=1e-13)
-    (gradient,) = torch.autograd.grad(unwrapped.sum(), tensor)
-    assert torch.isfinite(gradient).all()
-    still = rotations.unwrap_axis_angle(torch.zeros(3, 2, 3, dtype=torch.float64))
-    np.testing.assert_array_equal(still, np.zeros((3, 2, 3)))
-
-
 def test_empty_batches_and_wrong_shapes():
-    assert rotations.unwrap_axis_angle(torch.zeros(0, 24, 3)).shape == (0, 24, 3)
     assert rotations.matrix_from_axis_angle(torch.zeros(0, 24, 3)).shape == (0, 24, 3, 3)
     assert rotations.axis_angle_from_matrix(torch.zeros(0, 3, 3)).shape == (0, 3)
     assert rotations.matrix_from_rotation_6d(torch.zeros(0, 6)).shape == (0, 3, 3)

@@ -12,7 +12,6 @@ from ctlev_core.generators.picture_simulator import (
     UNCALIBRATED,
     SampleOptions,
     calibrate,
-    frame_times_us,
     sample_events,
 )
 from ctlev_core.render.panned_picture import pan
@@ -105,13 +104,6 @@ def test_the_measured_sign_is_that_of_the_trailing_edge():
     (events,) = record(conditions_of(image), **options)
     inside = (events.y >= 8) & (events.y < 26)
     assert events.x[inside & (events.p == 1)].mean() < events.x[inside & (events.p == 0)].mean() - 3
-
-
-def test_frames_are_dense_where_the_picture_moves():
-    options = SampleOptions(path_us=(0, 100_000, 200_000), path_px=((0, 0), (0, 0), (6, 8)), max_displacement_px=0.5)
-    times = frame_times_us(options)
-    assert times[0] == 0 and times[-1] == 200_000 and (np.diff(times) > 0).all()
-    assert np.count_nonzero(times <= 100_000) <= 12 and np.count_nonzero(times > 100_000) >= 20
 
 
 @pytest.mark.parametrize("blur_px", [0.0, 0.5])

@@ -17,14 +17,11 @@ from ctlev_core.body.rotations import matrix_from_axis_angle
 from ctlev_core.dataset_files.pose_sources import (
     PoseSourceOptions,
     choose_times,
-    clip_of_labels,
     labels_before_camera,
 )
 from ctlev_core.geometry.camera import Camera, is_inside, project
 from ctlev_core.geometry.joint_sets import SMPL_JOINTS
 from ctlev_core.labels.body_views import with_joints
-from data_contracts.errors import DataError
-from data_contracts.labels import Labels
 
 FRONT = {"yaw_range_deg": (0.0, 0.0), "pitch_range_deg": (0.0, 0.0), "rate_hz": None}
 
@@ -155,42 +152,6 @@ def test_moments_between_frames_lie_on_the_shortest_way(rate_hz, camera):
         got = Rotation.from_rotvec(labels.smpl_pose[:, columns].astype(float))
         # float32 labels, times in whole microseconds: a joint turns by up to pi a frame, 190 rad a second.
         assert (got * expected.inv()).magnitude().max() < 3e-4
-
-
-def round_trip_options(**options) -> PoseSourceOptions:
-    return asked(None, **options)
-
-
-def test_labels_are_a_motion_again():
-    """Seen by a level camera, the world of `clip_of_labels` is the first one turned about the vertical and shifted."""
-    whole = replace(clip(7), caption="jump")
-    labels = labels_before_camera(whole, "jump", "a", round_trip_options())
-    again = clip_of_labels(labels, "a")
-    assert again.caption == "jump"
-    np.testing.assert_allclose(again.time_s, whole.time_s, atol=1e-6)
-    np.testing.assert_allclose(again.betas, whole.betas, atol=1e-6)
-    difference = again.transl - whole.transl
-    np.testing.assert_allclose(difference, np.tile(difference[0], (7, 1)), atol=1e-5)
-    for joint in range(24):
-        columns = slice(3 * joint, 3 * joint + 3)
-        turned = Rotation.from_rotvec(again.pose[:, columns]) * Rotation.from_rotvec(whole.pose[:, columns]).inv()
-        assert turned.magnitude().max() < 1e-5
-    seen_again = labels_before_camera(again, "jump", "a", round_trip_options())
-    np.testing.assert_allclose(seen_again.smpl_transl, labels.smpl_transl, atol=1e-5)
-
-
-def test_labels_that_are_no_motion():
-    labels = labels_before_camera(clip(4), "", "a", round_trip_options())
-    with pytest.raises(DataError, match="walk: expected SMPL parameters, got class names alone"):
-        clip_of_labels(Labels(("a",), np.zeros(1, np.int64)), "walk")
-    with pytest.raises(DataError, match="walk: expected the motion of one body, got no moments"):
-        clip_of_labels(labels.take([]), "walk")
-    with pytest.raises(DataError, match="walk: times must rise, frame 2 follows"):
-        clip_of_labels(labels.take([0, 1, 1]), "walk")
-    assert labels.smpl_betas is not None
-    labels.smpl_betas[2, 0] += 1
-    with pytest.raises(DataError, match="walk: expected one body, got another shape at moment 2"):
-        clip_of_labels(labels, "walk")
 
 
 def test_ranges_must_rise():

@@ -156,11 +156,11 @@ DAMAGE = {
 def test_in_one_run_only_what_is_gone_since_the_plan_is_a_task(monkeypatch, damage):
     tasks = []
 
-    def run_as_task(a_stage, label, key, arguments):
+    def run_as_task(name, label, work):
         tasks.append(label)
-        return a_stage.run(key, arguments)[0]
+        return work()[0]
 
-    monkeypatch.setattr("tasks.stage._run_as_task", run_as_task)
+    monkeypatch.setattr("tasks.stage.run_as_task", run_as_task)
     source = first(windows=Windows(), label="data")
     made = second(source)
     assert tasks == ["first: data", "second"]

@@ -280,7 +280,7 @@ def test_who_need_not_wait_long_says_nothing(home, capsys):
 
 def test_in_one_run_a_passing_error_is_not_taken_for_a_missing_artefact(monkeypatch):
     run(first, windows=Windows())
-    monkeypatch.setattr("tasks.stage._run_as_task", lambda *_: pytest.fail("made anew"))
+    monkeypatch.setattr("tasks.stage.run_as_task", lambda *_: pytest.fail("made anew"))
 
     def fail(*_, **__):
         raise OSError(errno.EMFILE, "Too many open files")
