@@ -1,11 +1,13 @@
-"""A plug-in is a module: one file in its folder, found by its name. There is no registry.
+"""A plug-in is a module: one file in its folder, or a module that an installed package offers, found by its name.
 
-What a module must have is said by the Protocols of `ctlev_core.plugin_contracts`.
+What a module must have is said by the Protocols of `ctlev_core.plugin_contracts`. Packages offer theirs by entry points
+of the groups `ctlev.datasets`, `ctlev.formats` and so on.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import importlib.util
 import pkgutil
 import re
@@ -54,7 +56,32 @@ def names(kind: str) -> list[str]:
     if kind not in KINDS:
         raise PluginError(f"unknown plug-in kind {kind!r}; known kinds: {', '.join(KINDS)}")
     package = importlib.import_module(f"ctlev_core.{kind}")
-    return sorted(module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_"))
+    bundled = {module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_")}
+    if both := sorted(bundled & set(installed(kind))):
+        raise PluginError(f"{kind}/{both[0]}: offered by {installed(kind)[both[0]]}, and bundled; one must be renamed")
+    return sorted(bundled | set(installed(kind)))
+
+
+@cache
+def installed(kind: str) -> dict[str, str]:
+    """Module of each plug-in of a kind that installed packages offer, by name.
+
+    Raises:
+        PluginError: a name that none can have, or two packages offer one of the same name.
+    """
+    found: dict[str, str] = {}
+    for entry in importlib.metadata.entry_points(group=f"ctlev.{kind}"):
+        if not entry.name.isidentifier() or entry.name.startswith("_") or entry.attr:
+            raise PluginError(
+                f"{kind}: entry point {entry.name} = {entry.value!r}: expected NAME = MODULE, the name an identifier"
+            )
+        if found.setdefault(entry.name, entry.module) != entry.module:
+            raise PluginError(f"{kind}/{entry.name}: offered by {found[entry.name]} and by {entry.module}")
+    return found
+
+
+def _module_of(kind: str, name: str) -> str:
+    return installed(kind).get(name, f"ctlev_core.{kind}.{name}") if kind in KINDS else ""
 
 
 @cache
@@ -66,7 +93,7 @@ def versions(kind: str) -> dict[str, int]:
     """
     found = {}
     for name in names(kind):
-        spec = importlib.util.find_spec(f"ctlev_core.{kind}.{name}")
+        spec = importlib.util.find_spec(_module_of(kind, name))
         text = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
         match = re.search(r"^VERSION = (\d+)", text, re.MULTILINE)
         if match is None:
@@ -97,12 +124,12 @@ def recognise(formats: Mapping[str, ModuleType], path: Path) -> ModuleType | Non
 
 
 def load(kind: str, name: str) -> ModuleType:
-    """Import the module `ctlev_core.<kind>.<name>`.
+    """Import the module of a plug-in: `ctlev_core.<kind>.<name>`, or that of an installed package.
 
     Raises:
         PluginError: there is no such plug-in, then the message lists the known ones; or it lacks what its kind has.
     """
-    path = f"ctlev_core.{kind}.{name}"
+    path = _module_of(kind, name)
     # One that was loaded before is not looked at once more, which plans would do a thousand times.
     if not (kind in KINDS and name.isidentifier() and not name.startswith("_") and path in sys.modules):
         known = names(kind)

@@ -183,6 +183,53 @@ def test_what_a_plugin_lacks_is_named(tmp_path, monkeypatch):
     del sys.modules["ctlev_core.metrics.half_metric"]
 
 
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Write the entry points of an installed package that has a metric `always_one`."""
+    (tmp_path / "my_package").mkdir()
+    (tmp_path / "my_package" / "__init__.py").write_text("")
+    (tmp_path / "my_package" / "one.py").write_text(
+        "from data_contracts.config import Frozen\nVERSION = 7\nINPUT = 'classes'\nSCORES = ()\n"
+        "class Options(Frozen):\n    pass\ndef compute(predicted, target, options):\n    return {'one': 1.0}\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def offer(text):
+        (tmp_path / "my_package-1.0.dist-info").mkdir(exist_ok=True)
+        (tmp_path / "my_package-1.0.dist-info" / "METADATA").write_text("Name: my-package\nVersion: 1.0\n")
+        (tmp_path / "my_package-1.0.dist-info" / "entry_points.txt").write_text(f"[ctlev.metrics]\n{text}\n")
+        forget()
+
+    def forget():
+        for function in (plugins.installed, plugins.versions):
+            function.cache_clear()
+
+    yield offer
+    monkeypatch.undo()
+    forget()
+
+
+def test_installed_packages_offer_plugins(package):
+    package("always_one = my_package.one")
+    assert "always_one" in plugins.names("metrics") and plugins.versions("metrics")["always_one"] == 7
+    plugin = plugins.load_options(MetricChoice(name="always_one"))
+    assert plugin.module.compute(None, None, plugin.options) == {"one": 1.0} and plugin.version == 7
+
+
+@pytest.mark.parametrize(
+    ("offered", "message"),
+    [
+        ("frechet = my_package.one", "metrics/frechet: offered by my_package.one, and bundled; one must be renamed"),
+        ("always_one = my_package.one:compute", r"expected NAME = MODULE, the name an identifier"),
+        ("always-one = my_package.one", r"entry point always-one = 'my_package.one': expected NAME = MODULE"),
+    ],
+)
+def test_entry_points_that_name_no_plugin_are_refused(package, offered, message):
+    package(offered)
+    with pytest.raises(PluginError, match=message):
+        plugins.names("metrics")
+
+
 def test_every_wrong_option_is_named_at_once():
     choice = DatasetChoice(name="folder", options={"root": ".", "test_fraction": 2, "colour": 1})
     with pytest.raises(PluginError) as error:
