@@ -2,7 +2,7 @@
 
 FOLDER/README.md                             what it is and how to read it
 FOLDER/labels.parquet                        one row an image (`IMAGES`); label columns that no row has are left out
-FOLDER/metadata.parquet                      the same table, under the name that `imagefolder` of `datasets` looks for
+FOLDER/metadata.parquet                      the same for `imagefolder` of `datasets`; `label` is the class's number
 FOLDER/provenance.json                       the record of every stage behind it (ctlev_core.provenance.records)
 FOLDER/images/000/synthetic_000000.png       RGB, 8 bit; 1,000 rows a sub-folder
 FOLDER/conditions/000/synthetic_000000.png   the condition image, for generators that are asked by one
@@ -89,7 +89,9 @@ def file_names(kind: str, sample_ids: Sequence[str], rows: Sequence[int], suffix
 
 
 def write_image_table(folder: Path, table: pa.Table) -> None:
-    """Check and write `labels.parquet`, and the same again as `metadata.parquet`; columns that hold nothing stay out.
+    """Check and write `labels.parquet`, and as `metadata.parquet` the same with class numbers (`ClassLabel`).
+
+    Columns that hold nothing stay out.
 
     Args:
         folder: holds the files that the table names.
@@ -101,8 +103,24 @@ def write_image_table(folder: Path, table: pa.Table) -> None:
     empty = [name for name in _OPTIONAL if is_empty(table[name])]
     table = table.drop_columns(empty)
     schema = table.schema.with_metadata({_SCHEMA_KEY: json.dumps({"name": IMAGES.name, "version": IMAGES.version})})
-    for name in (LABELS_FILE, METADATA_FILE):
-        pq.write_table(table.cast(schema), folder / name, compression="zstd")
+    table = table.cast(schema)
+    pq.write_table(table, folder / LABELS_FILE, compression="zstd")
+    pq.write_table(_with_class_numbers(table), folder / METADATA_FILE, compression="zstd")
+
+
+def _with_class_numbers(table: pa.Table) -> pa.Table:
+    """The table with a column `label` that `datasets` reads as a `ClassLabel`, where there are classes.
+
+    Source: `datasets.Features` in the metadata of a Parquet schema.
+    """
+    names = sorted(set(table["class_name"].to_pylist()) - {""})
+    if not names or is_empty(table["class_name"]):
+        return table
+    numbers = {name: number for number, name in enumerate(names)} | {"": -1}  # -1: no class, as `datasets` has it
+    told = {"info": {"features": {"label": {"names": names, "_type": "ClassLabel"}}}}
+    column = pa.array([numbers[name] for name in table["class_name"].to_pylist()], pa.int64())
+    metadata = {**(table.schema.metadata or {}), b"huggingface": json.dumps(told).encode()}
+    return table.append_column("label", column).replace_schema_metadata(metadata)
 
 
 def read_image_table(folder: Path) -> pa.Table:

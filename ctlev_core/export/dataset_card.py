@@ -47,6 +47,34 @@ class Card:
 
 def render_card(card: Card) -> str:
     """The text, in Markdown."""
+    return _front_matter(card) + _text(card)
+
+
+def _front_matter(card: Card) -> str:
+    """What the pages of a hub sort data sets by."""
+    from huggingface_hub import DatasetCardData
+
+    tasks = ["keypoint-detection"] if card.table["joint_set"][0].as_py() else ["image-classification"]
+    data = DatasetCardData(
+        pretty_name=card.name,
+        license="other",
+        task_categories=tasks,
+        size_categories=_size(card.table.num_rows),
+        tags=["event-camera", "synthetic", "ctlev"],
+    )
+    return f"---\n{data.to_yaml()}\n---\n\n"
+
+
+def _size(num_rows: int) -> str:
+    """The hub's names of sizes."""
+    sizes = ("1K", "10K", "100K", "1M", "10M", "100M")
+    for number, size in enumerate(sizes):
+        if num_rows < 1_000 * 10**number:
+            return f"{sizes[number - 1]}<n<{size}" if number else f"n<{size}"
+    return "n>100M"
+
+
+def _text(card: Card) -> str:
     parts = [_head(card), _files(card), _reading(card), _labels(card), _columns(card), _origin(card)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -67,7 +95,7 @@ def _head(card: Card) -> str:
 
 def _files(card: Card) -> str:
     names = {
-        "labels.parquet": "one row an image: its file, its label, how it was made; `metadata.parquet` is the same",
+        "labels.parquet": "one row an image: file, label, how it was made; `metadata.parquet`: the same for `datasets`",
         "images/": "PNG, RGB, 8 bit, 1,000 a sub-folder. " + _encoding(card.records),
     }
     if _has(card.table, "condition_file_name"):
@@ -111,7 +139,7 @@ image = cv2.imread(labels["file_name"][0])  # [H, W, 3] uint8, blue first
 _DATASETS = """\
 from datasets import load_dataset
 
-rows = load_dataset("imagefolder", data_dir=".", split="train")
+rows = load_dataset("imagefolder", data_dir=".", split="train")  # the class by name, and as a ClassLabel, `label`
 table = load_dataset("parquet", data_files="labels.parquet", split="train")  # names of files in the place of images
 """
 _TORCH = """\

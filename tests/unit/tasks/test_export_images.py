@@ -11,6 +11,7 @@ import numpy as np
 import pandas
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from generated_frames import REJECTED_ROW, make_generated, make_streams, publish
 
 from ctlev_core.export.event_dataset import EventDataset
@@ -49,7 +50,21 @@ def test_pandas_and_opencv_read_every_image_with_its_label(tmp_path):
     assert set(labels["frames_digest"]) == {made.synthetic.digest}
     assert not {"joints3d_mm", "intrinsics_px", "events_file"} & set(labels.columns), "no row has such"
     assert [record.role for record in read_provenance(folder / "provenance.json")] == ["synthetic", "conditions"]
-    assert (folder / "metadata.parquet").read_bytes() == (folder / "labels.parquet").read_bytes()
+    metadata, table = (pq.read_table(folder / f"{name}.parquet") for name in ("metadata", "labels"))
+    assert repr(metadata.drop_columns("label").to_pylist()) == repr(table.to_pylist())  # NaN is unequal to itself
+    told = json.loads(metadata.schema.metadata[b"huggingface"])["info"]["features"]["label"]
+    assert told == {"names": sorted(set(made.labels.class_names)), "_type": "ClassLabel"}
+    assert [told["names"][number] for number in metadata["label"].to_pylist()] == table["class_name"].to_pylist()
+
+
+def test_datasets_reads_images_and_classes(tmp_path):
+    datasets = pytest.importorskip("datasets")
+    made = make_generated(tmp_path / "home")
+    folder = export(made, tmp_path / "mine")
+    rows = datasets.load_dataset("imagefolder", data_dir=str(folder), split="train", cache_dir=str(tmp_path / "cache"))
+    assert rows.features["label"].names == sorted(set(made.labels.class_names))
+    assert [rows.features["label"].int2str(row["label"]) for row in rows] == rows["class_name"]
+    np.testing.assert_array_equal(np.asarray(rows[0]["image"]), made.frames[0])
 
 
 def test_a_text_route_has_classes_alone(tmp_path):
@@ -64,6 +79,8 @@ def test_a_text_route_has_classes_alone(tmp_path):
 def test_the_description_says_what_it_is_and_its_code_runs(tmp_path, monkeypatch):
     folder = export(make_generated(tmp_path / "home"), tmp_path / "mine")
     text = (folder / "README.md").read_text()
+    head = yaml.safe_load(text.split("---\n")[1])
+    assert head["task_categories"] == ["keypoint-detection"] and head["size_categories"] == "n<1K"
     for expected in ("6 synthetic event images", "> Data: a test.", "20 x 14 px", " 1 more image", "0 head, 1 right_"):
         assert expected in text
     for name in pq.read_schema(folder / "labels.parquet").names:
