@@ -73,6 +73,12 @@ Home = Annotated[
     typer.Option("--home", help="folder of all state (default: CTLEV_HOME, else .ctlev)", show_default=False),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", help="show Prefect's log")]
+Track = Annotated[
+    str,
+    typer.Option(
+        "--track", metavar="TRACKER", help="tell tensorboard, mlflow or wandb of the result", show_default=False
+    ),
+]
 Run = Annotated[
     str,
     typer.Argument(help="name, key or path of a report", autocompletion=_complete_report, show_default=False),
@@ -140,6 +146,7 @@ def run(
     overrides: Overrides = None,
     dry_run: DryRun = False,
     home: Home = None,
+    track: Track = "",
     verbose: Verbose = False,
 ) -> None:
     """Run a whole experiment or study, recordings in, a scored report out; by default the preset `demo`.
@@ -153,6 +160,7 @@ def run(
         overrides=overrides,
         dry_run=dry_run,
         home=home,
+        track=track,
         verbose=verbose,
     )
 

@@ -181,12 +181,14 @@ class Asked:
         overrides: options to change, each as `key=value`.
         dry_run: print the plan and run nothing.
         costs: the plan has the time, memory and disk of each stage.
+        track: experiment tracker that is told of the finished report; empty = none.
     """
 
     preset: str
     overrides: list[str]
     dry_run: bool = False
     costs: bool = False
+    track: str = ""
 
 
 def run_command(command: Command, asked: Asked) -> int:
@@ -204,6 +206,10 @@ def run_command(command: Command, asked: Asked) -> int:
         check_home(home)
         if not asked.dry_run:
             local_server.start(home)  # first of all, so that what comes now overlaps with its start-up
+        if asked.track:
+            from flows.tracking import check_tracker, track  # here, because few runs are tracked
+
+            check_tracker(asked.track)
         options = command.load(asked.preset, asked.overrides)
         with planning() as rows:
             flow.fn(options)
@@ -216,6 +222,8 @@ def run_command(command: Command, asked: Asked) -> int:
         with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
             result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
         described = command.describe(result, options)
+        if asked.track:
+            described += "\n" + track(asked.track, result.path, options, home)
     except (DataError, PluginError, TrainingError, ValidationError, OSError, local_server.ServerLostError) as error:
         if isinstance(error, InputsMissing) and asked.dry_run:
             print_costs(error.asked)
