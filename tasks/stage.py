@@ -52,6 +52,7 @@ from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.tables import TableSchema
+from tasks.gpus import gpu_need, gpus_held
 from tasks.prefect_runs import run_as_task
 from tasks.runners import asked_runner
 from tasks.store import Store
@@ -291,7 +292,7 @@ class Stage:
             folder.mkdir(parents=True)
             work.mkdir(parents=True, exist_ok=True)
             opened = {name: _opened(value) for name, value in arguments.items()}
-            with _time_limit(self.name):
+            with gpus_held(gpu_need(arguments), self.name), _time_limit(self.name):
                 table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
             record = {
