@@ -68,8 +68,11 @@ class DatasetWithChunks(Dataset, Protocol):
 class DatasetWithWindows(Dataset, Protocol):
     """A dataset whose authors cut recordings into windows in a way of their own."""
 
-    def read_windows(self, recording: Recording, options: Any) -> np.ndarray:
-        """Index ranges [W, 2] int64 into the events of `read_events`, in order; used by the window method `dataset`."""
+    def read_windows(self, recording: Recording, options: Any) -> np.ndarray | None:
+        """Index ranges [W, 2] int64 into the events of `read_events`, in order; used by the window method `dataset`.
+
+        None: of this recording there are none.
+        """
         ...
 
 
@@ -77,8 +80,8 @@ class DatasetWithWindows(Dataset, Protocol):
 class DatasetWithWindowLabels(DatasetWithWindows, Protocol):
     """A dataset whose authors also have a rule of their own for the label of a window."""
 
-    def read_window_labels(self, recording: Recording, options: Any) -> Labels:
-        """One row for each range of `read_windows`."""
+    def read_window_labels(self, recording: Recording, options: Any) -> Labels | None:
+        """One row for each range of `read_windows`; None: the track's labels hold."""
         ...
 
 

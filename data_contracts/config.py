@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
@@ -18,8 +19,13 @@ RUN_SETTING: dict[str, Any] = {"run_setting": True}
 change any result and therefore stays outside the cache key."""
 
 
-def cache_material(options: BaseModel) -> dict[str, Any]:
-    """The options as JSON-ready values, without the run settings: what the cache key is made of."""
+def cache_material(options: BaseModel, of_choice: Callable[[Choice], Any] | None = None) -> dict[str, Any]:
+    """The options as JSON-ready values, without the run settings: what the cache key is made of.
+
+    Args:
+        options: of a plug-in, or of what a stage does.
+        of_choice: what stands for a plug-in that is chosen among them; None = its name and options as they are.
+    """
     excluded = {
         name
         for name, info in type(options).model_fields.items()
@@ -27,10 +33,19 @@ def cache_material(options: BaseModel) -> dict[str, Any]:
     }
     material = options.model_dump(mode="json", exclude=excluded)
     for name in material:
-        value = getattr(options, name)
-        if isinstance(value, BaseModel):
-            material[name] = cache_material(value)
+        material[name] = _material_of(getattr(options, name), material[name], of_choice)
     return material
+
+
+def _material_of(value: Any, dumped: Any, of_choice: Callable[[Choice], Any] | None) -> Any:
+    """What stands for one option, which is `dumped` in JSON."""
+    if isinstance(value, Choice) and of_choice is not None:
+        return of_choice(value)
+    if isinstance(value, BaseModel):
+        return cache_material(value, of_choice)
+    if isinstance(value, dict) and any(isinstance(item, BaseModel) for item in value.values()):
+        return {name: _material_of(item, dumped[str(name)], of_choice) for name, item in value.items()}
+    return dumped
 
 
 class Choice(Frozen):

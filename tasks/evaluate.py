@@ -18,7 +18,7 @@ from ctlev_core.plugin_contracts import (
 )
 from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
 from ctlev_core.scoring.scored_rows import score_each_row, score_rows
-from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, subject_groups
+from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, part_groups, subject_groups
 from ctlev_core.statistics.feature_distances import (
     DISTANCE_ESTIMATES,
     DistanceEstimate,
@@ -145,7 +145,8 @@ def _groups(
     class_names: Sequence[str], data: Manifest, rows: np.ndarray, poses: list[Manifest], split: str
 ) -> list[Group]:
     """All groups of the given rows; of frames that are not held out, none by subject."""
-    groups = class_groups(class_names) + _groups_by_origin(class_names, data, poses)
+    recordings = np.array(data.column("recording_id"))[rows].tolist()
+    groups = class_groups(class_names) + part_groups(recordings) + _groups_by_origin(class_names, data, poses)
     return groups if split == "train" else groups + _groups_by_subject(data, rows, poses)
 
 

@@ -442,10 +442,10 @@ def _material(value: Any) -> Any:
         return {
             "plugin": f"{plugin.kind}/{plugin.name}",
             "version": plugin.version,
-            "options": cache_material(plugin.options),
+            "options": cache_material(plugin.options, _material),
         }
     if isinstance(value, BaseModel):
-        return cache_material(value)
+        return cache_material(value, _material)
     if isinstance(value, list | tuple):
         return [_material(item) for item in value]
     if dataclasses.is_dataclass(value):

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from data_contracts.parts import PREFIX, part_of
+
 
 def surrounded(recordings: Sequence[str], t_us: np.ndarray, half_us: int) -> np.ndarray:
     """Which moments [N] bool lie `half_us` or more from both ends of their recording; all of one where none does.
@@ -28,8 +30,18 @@ def surrounded(recordings: Sequence[str], t_us: np.ndarray, half_us: int) -> np.
 def balanced_choice(class_names: Sequence[str], recordings: Sequence[str], count: int, seed: int) -> np.ndarray:
     """`count` row indices in which the classes take turns, and within a class its recordings.
 
-    Every class has a random order of its own, every row comes before any comes twice.
+    Every class has a random order of its own, every row comes before any comes twice. The datasets of a union take
+    turns before that, so that each has an equal share.
     """
+    parts = _rows_of_parts(recordings)
+    if len(parts) > 1:
+        shares = [count // len(parts) + (number < count % len(parts)) for number in range(len(parts))]
+        chosen = [
+            rows[balanced_choice([class_names[row] for row in rows], _without_part(recordings, rows), n, seed)]
+            for rows, n in zip(parts, shares, strict=True)
+        ]
+        turns = np.concatenate([np.arange(len(rows)) for rows in chosen])
+        return np.concatenate(chosen)[np.argsort(turns, kind="stable")]
     classes = sorted(set(class_names))
     names, groups = np.array(class_names), np.array(recordings)
     queues: list[np.ndarray] = []
@@ -44,12 +56,22 @@ def balanced_choice(class_names: Sequence[str], recordings: Sequence[str], count
 def spread_choice(groups: Sequence[str], recordings: Sequence[str], count: int, seed: int) -> np.ndarray:
     """`count` different row indices, ascending: groups take turns until they are used up, and in them recordings.
 
+    The datasets of a union have equal shares, as far as each has so many rows.
+
     Args:
         groups: [N] of each row.
         recordings: [N] of each row.
         count: at most N.
         seed: of the order in each group, and of groups in the last turn.
     """
+    parts = _rows_of_parts(recordings)
+    if len(parts) > 1:
+        shares = _equal_shares([len(rows) for rows in parts], count)
+        chosen = [
+            rows[spread_choice([groups[row] for row in rows], _without_part(recordings, rows), n, seed)]
+            for rows, n in zip(parts, shares, strict=True)
+        ]
+        return np.sort(np.concatenate(chosen))
     names, of_recording = np.array(groups), np.array(recordings)
     known = sorted(set(groups))
     order = np.random.default_rng([seed, len(known)]).permutation(len(known))
@@ -59,6 +81,26 @@ def spread_choice(groups: Sequence[str], recordings: Sequence[str], count: int, 
         rows = _in_turns(random.permutation(np.flatnonzero(names == name)), of_recording)
         turn[rows], place[rows] = np.arange(len(rows)), order[number]
     return np.sort(np.lexsort((place, turn))[:count])
+
+
+def _rows_of_parts(recordings: Sequence[str]) -> list[np.ndarray]:
+    """The rows of each dataset of a union, in the order of names; all rows where there is one dataset."""
+    names = np.array([part_of(recording) for recording in recordings])
+    return [np.flatnonzero(names == name) for name in np.unique(names)]
+
+
+def _without_part(recordings: Sequence[str], rows: np.ndarray) -> list[str]:
+    return [recordings[row].removeprefix(f"{PREFIX}{part_of(recordings[row])}/") for row in rows]
+
+
+def _equal_shares(sizes: Sequence[int], count: int) -> list[int]:
+    """How many to take of each of several sets, as equal as their sizes allow, `count` in all."""
+    shares, left = [0] * len(sizes), count
+    order = sorted(range(len(sizes)), key=lambda number: sizes[number])
+    for place, number in enumerate(order):
+        shares[number] = min(sizes[number], left // (len(sizes) - place))
+        left -= shares[number]
+    return shares
 
 
 def _in_turns(rows: np.ndarray, groups: np.ndarray) -> np.ndarray:

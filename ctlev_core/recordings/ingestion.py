@@ -160,7 +160,10 @@ def _dataset_windows(
     """Ranges [W, 2] and, where the authors have a rule for them too, their W labels."""
     if not recording.has_events or not isinstance(plugin.module, DatasetWithWindows):
         return None, None
-    ranges = np.asarray(plugin.module.read_windows(recording, plugin.options))
+    found = plugin.module.read_windows(recording, plugin.options)
+    if found is None:
+        return None, None
+    ranges = np.asarray(found)
     if ranges.ndim != 2 or ranges.shape[1] != 2 or ranges.dtype != np.int64:
         raise DataError(f"{where}: windows must be [W, 2] int64, got {ranges.shape} {ranges.dtype}")
     flat = ranges.reshape(-1)
@@ -170,7 +173,10 @@ def _dataset_windows(
         )
     if not isinstance(plugin.module, DatasetWithWindowLabels):
         return ranges, None
-    labels = check_labels(plugin.module.read_window_labels(recording, plugin.options), f"{where}, windows")
+    labels = plugin.module.read_window_labels(recording, plugin.options)
+    if labels is None:
+        return ranges, None
+    check_labels(labels, f"{where}, windows")
     if len(labels) != len(ranges):
         raise DataError(f"{where}: {len(ranges)} windows but {len(labels)} window labels")
     return ranges, labels

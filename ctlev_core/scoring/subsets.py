@@ -11,7 +11,11 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from data_contracts.parts import part_of
+
 Group = tuple[str, np.ndarray]
+DATASET = "dataset "
+"""Groups that begin so are the rows of one dataset of a union."""
 MAX_SINGLE_SUBJECTS = 10
 """Up to so many subjects each have scores of their own."""
 
@@ -61,6 +65,12 @@ def subject_groups(subjects: Sequence[str], recordings: Sequence[str], learnt: C
     if 2 <= len(present) <= MAX_SINGLE_SUBJECTS and len(present) < len(set(recordings)):
         groups += _divide({f"subject {name}": {name} for name in present}, subjects)
     return groups
+
+
+def part_groups(recordings: Sequence[str]) -> list[Group]:
+    """Rows of each dataset of a union, by the names [N] of their recordings; none where there is one dataset."""
+    names = [part_of(recording) for recording in recordings]
+    return _divide({f"{DATASET}{name}": {name} for name in dict.fromkeys(names)}, names)
 
 
 def _divide(parts: dict[str, set[str]], names: Sequence[str]) -> list[Group]:

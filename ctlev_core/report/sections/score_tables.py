@@ -17,6 +17,7 @@ from ctlev_core.report.page.display_names import metric_heading, metric_name, se
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.verdict import made_better
 from ctlev_core.scoring.score_info import find_score, lower_is_better
+from ctlev_core.scoring.subsets import DATASET
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference, Trainings, paired_difference, read_trainings
 from data_contracts.training_sets import (
@@ -134,11 +135,13 @@ def group_tables(rows: list[Row], training_sets: Sequence[str]) -> tuple[list[Ta
     names = list(dict.fromkeys([*training_sets, *(row["subject"] for row in groups)]))
     by_origin = [row for row in groups if row["group"].startswith(ORIGINS)]
     by_subject = [row for row in groups if row["group"].startswith(SUBJECTS)]
-    by_class = [row for row in groups if not row["group"].startswith((ORIGINS, *SUBJECTS))]
+    by_dataset = [row for row in groups if row["group"].startswith(DATASET)]
+    by_class = [row for row in groups if not row["group"].startswith((ORIGINS, DATASET, *SUBJECTS))]
     caption = (
         "Held-out recorded frames by class. What synthetic frames add is seen in those that no training frame shows."
     )
-    origins = _by_group(f"{metric}: where does it help?", by_origin, names, caption)
+    origins = _by_group(f"{metric}: on each dataset", by_dataset, names, first="test frames of")
+    origins += _by_group(f"{metric}: where does it help?", by_origin, names, caption)
     origins += _by_group(f"{metric}: by subject", by_subject, names, first="subjects")
     classes = _by_group(f"{metric}: class by class", by_class, names)
     return origins, classes

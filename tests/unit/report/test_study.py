@@ -391,8 +391,8 @@ def test_the_papers_study_says_everything_that_is_missing_at_once():
     values = yaml.safe_load((PRESETS / "paper.yaml").read_text())
     for name in values["paths"]:
         assert f"paths.{name}" in message
-    assert message.count("paths.inception") == 1  # all five need it
-    assert "  - recognition, zero_shot, pose_dhp19, pose_cdehp, body: torchscript" in message
+    assert message.count("paths.inception") == 1  # all six need it
+    assert "  - recognition, zero_shot, pose_dhp19, pose_both, pose_cdehp, body: torchscript" in message
     assert "extracted_train/" in message  # the expected tree
     assert list(raised.value.asked.experiments) == list(values["experiments"])
 
