@@ -11,8 +11,8 @@ from packaging.requirements import Requirement
 
 PAGE = Path(__file__).parents[2] / "docs" / "licences.md"
 ALLOWED = re.compile(
-    r"MIT(?:-0|-CMU| License)?|(?:0|3-Clause )?BSD(?:-\d-Clause| License)?|Apache(?:-2\.0| 2\.0 License| Software License)"
-    r"|PSF-2\.0|ISC(?: License \(ISCL)?|CC0-1\.0|Zlib|BSL-1\.0|MPL-2\.0|Mozilla Public License 2\.0 \(MPL 2\.0"
+    r"MIT(?:-0|-CMU| License)?|(?:0|3-Clause )?BSD(?:-\d-Clause| License)?|PSF-2\.0"
+    r"|Apache(?:-2\.0| 2\.0 License| Software License)|ISC(?: License \(ISCL)?|CC0-1\.0|Zlib|BSL-1\.0|MPL-2\.0|Mozilla Public License 2\.0 \(MPL 2\.0"
     r"|CNRI-Python|Artistic License|LLVM-exception"
 )
 TOLD_ELSEWHERE = {"aedat": "MIT", "pyglet": "BSD License"}
