@@ -139,7 +139,7 @@ def _tensorboard(runs: list[TrackedRun], name: str, home: Path) -> str:
 
 def _mlflow(runs: list[TrackedRun], name: str, home: Path) -> str:
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    import mlflow
+    import mlflow  # pyright: ignore[reportMissingImports]
 
     place = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home / 'mlflow.db'}"
     mlflow.set_tracking_uri(place)
@@ -159,7 +159,7 @@ def _mlflow(runs: list[TrackedRun], name: str, home: Path) -> str:
 
 
 def _wandb(runs: list[TrackedRun], name: str, home: Path) -> str:
-    import wandb
+    import wandb  # pyright: ignore[reportMissingImports]
 
     known = any(os.environ.get(variable) for variable in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_BASE_URL"))
     for run in runs:

@@ -154,14 +154,14 @@ def _drawn_as(made: ReportInputs[Manifest]) -> tuple[str, Colours]:
 
 def _results(
     rows: list[Row], training_sets: Sequence[str], names: list[str], paired: PairedScores
-) -> tuple[list[Section], list[Section]]:
+) -> tuple[Sequence[Section], Sequence[Section]]:
     """Tables of all classes, and of each."""
     results = score_tables(rows, training_sets, paired)
     origins, by_class = group_tables(rows, training_sets)
     return [*results, *origins, *baseline_tables(names, _first_metric(rows), paired)], by_class
 
 
-def _recorded_frames(made: ReportInputs[Manifest]) -> list[Section]:
+def _recorded_frames(made: ReportInputs[Manifest]) -> list[Section | Folded]:
     return [
         pictures.real_grid(made.frames, made.target),
         *([] if made.nearest is None else nearest_sections(made.nearest)),
@@ -175,11 +175,11 @@ def _recorded_frames(made: ReportInputs[Manifest]) -> list[Section]:
 class _Quality(NamedTuple):
     """Tables on generated frames themselves."""
 
-    about_frames: list[Section]
-    floors: list[Section]
-    realism: list[Section]
-    memorisation: list[Section]
-    rejections: list[Section]
+    about_frames: Sequence[Section]
+    floors: Sequence[Section]
+    realism: Sequence[Section]
+    memorisation: Sequence[Section]
+    rejections: Sequence[Section]
 
     @classmethod
     def of(cls, made: ReportInputs[Manifest], rows: list[Row]) -> _Quality:
@@ -199,7 +199,7 @@ class _Quality(NamedTuple):
     def others(self) -> list[Section]:
         return [*self.floors, *self.memorisation, *self.rejections]
 
-    def sections(self) -> list[Section]:
+    def sections(self) -> list[Section | Folded]:
         return [
             *self.about_frames,
             *_folded("How to read the distances", self.floors),
@@ -211,7 +211,7 @@ class _Quality(NamedTuple):
         ]
 
 
-def _origins(made: ReportInputs[Manifest], records: Sequence[Record]) -> list[Section]:
+def _origins(made: ReportInputs[Manifest], records: Sequence[Record]) -> list[Section | Folded]:
     models, names = [one.manifest for one in made.models], [one.name for one in made.models]
     return [
         lineage_diagram(records),
