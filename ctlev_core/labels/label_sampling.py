@@ -37,7 +37,7 @@ def balanced_choice(class_names: Sequence[str], recordings: Sequence[str], count
     if len(parts) > 1:
         shares = [count // len(parts) + (number < count % len(parts)) for number in range(len(parts))]
         chosen = [
-            rows[balanced_choice([class_names[row] for row in rows.tolist()], _without_part(recordings, rows), n, seed)]
+            rows[balanced_choice([class_names[row] for row in map(int, rows)], _without_part(recordings, rows), n, seed)]
             for rows, n in zip(parts, shares, strict=True)
         ]
         turns = np.concatenate([np.arange(len(rows)) for rows in chosen])
@@ -68,7 +68,7 @@ def spread_choice(groups: Sequence[str], recordings: Sequence[str], count: int, 
     if len(parts) > 1:
         shares = _equal_shares([len(rows) for rows in parts], count)
         chosen = [
-            rows[spread_choice([groups[row] for row in rows.tolist()], _without_part(recordings, rows), n, seed)]
+            rows[spread_choice([groups[row] for row in map(int, rows)], _without_part(recordings, rows), n, seed)]
             for rows, n in zip(parts, shares, strict=True)
         ]
         return np.sort(np.concatenate(chosen))
@@ -90,7 +90,7 @@ def _rows_of_parts(recordings: Sequence[str]) -> list[np.ndarray]:
 
 
 def _without_part(recordings: Sequence[str], rows: np.ndarray) -> list[str]:
-    return [recordings[row].removeprefix(f"{PREFIX}{part_of(recordings[row])}/") for row in rows.tolist()]
+    return [recordings[row].removeprefix(f"{PREFIX}{part_of(recordings[row])}/") for row in map(int, rows)]
 
 
 def _equal_shares(sizes: Sequence[int], count: int) -> list[int]:
