@@ -37,7 +37,9 @@ def balanced_choice(class_names: Sequence[str], recordings: Sequence[str], count
     if len(parts) > 1:
         shares = [count // len(parts) + (number < count % len(parts)) for number in range(len(parts))]
         chosen = [
-            rows[balanced_choice([class_names[row] for row in map(int, rows)], _without_part(recordings, rows), n, seed)]
+            rows[
+                balanced_choice([class_names[row] for row in map(int, rows)], _without_part(recordings, rows), n, seed)
+            ]
             for rows, n in zip(parts, shares, strict=True)
         ]
         turns = np.concatenate([np.arange(len(rows)) for rows in chosen])
