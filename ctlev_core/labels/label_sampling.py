@@ -70,7 +70,7 @@ def spread_choice(groups: Sequence[str], recordings: Sequence[str], count: int, 
     if len(parts) > 1:
         shares = _equal_shares([len(rows) for rows in parts], count)
         chosen = [
-            rows[spread_choice([groups[row] for row in map(int, rows)], _without_part(recordings, rows), n, seed)]
+            rows[spread_choice(_of_rows(groups, rows), _without_part(recordings, rows), n, seed)]
             for rows, n in zip(parts, shares, strict=True)
         ]
         return np.sort(np.concatenate(chosen))
@@ -92,7 +92,11 @@ def _rows_of_parts(recordings: Sequence[str]) -> list[np.ndarray]:
 
 
 def _without_part(recordings: Sequence[str], rows: np.ndarray) -> list[str]:
-    return [recordings[row].removeprefix(f"{PREFIX}{part_of(recordings[row])}/") for row in map(int, rows)]
+    return [name.removeprefix(f"{PREFIX}{part_of(name)}/") for name in _of_rows(recordings, rows)]
+
+
+def _of_rows(names: Sequence[str], rows: np.ndarray) -> list[str]:
+    return [names[row] for row in map(int, rows)]
 
 
 def _equal_shares(sizes: Sequence[int], count: int) -> list[int]:
