@@ -16,6 +16,7 @@ from data_contracts.labels import Conditions
 # So many test recordings that intervals, and with them a recommendation, can be given; nothing that is not measured.
 SETTINGS = ("experiment.dataset.options.num_test_recordings=6", "experiment.oracle=null")
 OPTIONS = ["--preset", "smoke", *(word for setting in SETTINGS for word in ("--set", setting))]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
