@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ctlev_core import plugins
+from ctlev_core.events.image_grid import ImageFit
 from ctlev_core.plugin_contracts import ConditionOfClasses, Dataset, Generator, GeneratorFromWeights, PluginWithFiles
 from ctlev_core.plugins import PluginError
 from ctlev_core.scoring.checks import check_dataset
@@ -105,9 +106,9 @@ def check_whole_counts(experiment: Experiment, what: str) -> None:
     finished = [one.recording_id for one in recordings if one.has_event_images and not one.has_events]
     if finished:
         raise PluginError(f"{what} needs events, and {finished[0]} comes as finished event images")
-    image_size = getattr(encoding, "image_size", None)
-    if image_size is None or getattr(encoding, "resampling", "") != "area":
+    if not isinstance(encoding, ImageFit) or encoding.image_size is None or encoding.resampling != "area":
         return
+    image_size = encoding.image_size
     # A sensor whose size only its files tell may have that of the image; with `events` it comes to the same.
     other = [one for one in recordings if one.has_events and one.sensor_size != image_size]
     if other:
@@ -144,7 +145,8 @@ def _check_classes(experiment: Experiment) -> None:
 
 def _check_base_models(experiment: Experiment) -> None:
     """Raise `DataError` where event images or conditions do not fit the weights a generator starts from."""
-    image_size = getattr(plugins.load_options(experiment.encoding).options, "image_size", None)
+    encoding = plugins.load_options(experiment.encoding).options
+    image_size = encoding.image_size if isinstance(encoding, ImageFit) else None
     used = [(experiment.generator, experiment.condition)]
     used += [(baseline.generator, baseline.condition) for baseline in experiment.baselines.values()]
     for generator, condition in used:

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.events.image_grid import ImageFit
 from ctlev_core.progress import ProgressBar
 from ctlev_core.recordings.encoding import EncodedWindows, RecordingPart, RecordingSource, encode_recording
 from data_contracts import tables
@@ -85,7 +86,8 @@ def _rows(source: RecordingSource, cut: EncodedWindows) -> list[dict[str, Any]]:
 
 def _canvas(sources: list[RecordingSource], encoding: EncodingChoice) -> tuple[int, int] | None:
     """(height, width) px that the counts of every sensor fit into; None where counts have the size of the image."""
-    if getattr(plugins.load_options(encoding).options, "resampling", "") != "area":
+    options = plugins.load_options(encoding).options
+    if not isinstance(options, ImageFit) or options.resampling != "area":
         return None
     sizes = [source.sensor_size for source in sources]
     return (max(height for _, height in sizes), max(width for width, _ in sizes)) if sizes else None
