@@ -19,11 +19,14 @@ TOLD_ELSEWHERE = {"aedat": "MIT", "pyglet": "BSD License"}
 """By the project's own file, where the package's metadata say nothing."""
 CHOSEN = {"text-unidecode": "Artistic License"}
 """Of several licences of which one may be chosen."""
+OF_GPUS = ("nvidia-", "cuda-", "triton")
+"""What torch brings where there is a GPU; the page says so."""
 HEAD = """# Licences
 
 ctlev has the MIT licence. `pip install ctlev` brings these packages along, each under its own licence; on other systems
-a few more or fewer. Extras bring others. The weights in the repository are ours, under the same licence
-([weights](weights.md)); datasets and Stable Diffusion are not part of it.
+a few more or fewer. Extras bring others, and torch for GPUs brings NVIDIA's libraries, under NVIDIA's licence. The
+weights in the repository are ours, under the same licence as the code ([weights](weights.md)); datasets and Stable
+Diffusion are not part of it.
 
 | package | licence |
 |---|---|
@@ -35,7 +38,7 @@ def required():
     found, waiting = {}, [("ctlev", frozenset())]
     for name, extras in waiting:
         key = re.sub(r"[-_.]+", "-", name).lower()
-        if key in found:
+        if key in found or key.startswith(OF_GPUS):
             continue
         try:
             found[key] = importlib.metadata.distribution(name)
