@@ -13,7 +13,9 @@ kernels, float16 where this CPU has none, compiling and several GPUs are not sim
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -154,6 +156,10 @@ def simulated_gpu() -> Iterator[SimulatedGpu]:
         "torch.load": load_to,
         "torch.cuda.is_available": lambda: True,
         "torch.cuda.device_count": lambda: 1,
+        "torch.cuda.init": lambda: None,
+        "torch.cuda.current_device": lambda: 0,
+        "torch.cuda.set_device": lambda _: None,
+        "torch.cuda.get_device_properties": lambda _: SimpleNamespace(uuid=f"simulated-{os.getpid()}"),
         "torch.cuda.synchronize": lambda *_: None,
         "torch.cuda.empty_cache": lambda: None,
         "torch.cuda.is_bf16_supported": lambda *_: True,
