@@ -150,8 +150,9 @@ def _watch(server: subprocess.Popen[bytes], ended: threading.Event) -> None:
     while not ended.wait(LOOK_EVERY_S):
         if server.poll() is None:
             continue
+        # To the main thread by name: one sent to the process may go to a thread that leaves the main one asleep.
         with contextlib.suppress(OSError):
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
         told = ended.wait(END_TIMEOUT_S / 2)
         # Also where the run has ended: threads of Prefect's that a script waits for go on asking.
         time.sleep(END_TIMEOUT_S / 2)

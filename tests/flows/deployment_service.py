@@ -130,6 +130,18 @@ class Service:
         found = self.api("artifacts/filter", {"artifacts": {"flow_run_id": {"any_": [run]}}, "limit": 200})
         return {artifact["key"]: artifact for artifact in found}
 
+    def logged(self, run: str, pattern: str) -> str:
+        """The first message of a run's log that begins so. Prefect sends logs in the background, after the state."""
+        deadline = time.monotonic() + 120
+        while True:
+            found = self.api("logs/filter", {"logs": {"flow_run_id": {"any_": [run]}}, "limit": 200})
+            messages = [log["message"] for log in found]
+            for message in messages:
+                if re.match(pattern, message):
+                    return message
+            assert time.monotonic() < deadline, messages
+            time.sleep(0.5)
+
     def plan(self, run: str) -> list[dict[str, str]]:
         """What a run said it would do."""
         return json.loads(self.artifacts(run)["plan"]["data"])

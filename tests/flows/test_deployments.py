@@ -109,8 +109,7 @@ def test_a_deployed_run_makes_what_the_script_makes_and_shows_its_plan(service, 
     shown = service.artifacts(run)
     pictures = [key for key, artifact in shown.items() if "data:image/png;base64," in str(artifact["data"])]
     assert any(key.startswith("encode") for key in pictures), sorted(shown)
-    logs = [log["message"] for log in service.api("logs/filter", {"logs": {"flow_run_id": {"any_": [run]}}})]
-    assert any(re.search(r"^encode.*: \d+ rows in [\d.]+ s, key ", message) for message in logs), logs
+    service.logged(run, r"^encode.*: \d+ rows in [\d.]+ s, key ")
 
 
 @pytest.mark.slow
