@@ -38,7 +38,9 @@ NAME_PATTERN = r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$"
 class Baseline(Frozen):
     """Another generator to compare with, from the same frames and the same labels to sample from.
 
-    What is left out is the experiment's own: with `poses` alone it is the same generator, asked for other poses.
+    What is left out is the experiment's own: with `poses` alone it is the same generator, asked for other poses. A
+    `condition` or `generator` without a `name` is the experiment's own with the options that are given changed, and its
+    `sampling` too: `{generator: {options: {random_init: true}}}` is the same fine-tuning from random weights.
     """
 
     condition: ConditionChoice
@@ -52,6 +54,33 @@ class Baseline(Frozen):
     def sampling_choice(self) -> SamplingChoice:
         """The generator's sampling options as a plug-in choice."""
         return SamplingChoice(name=self.generator.name, options=self.sampling)
+
+
+def _completed(baseline: Any, own: dict[str, Any]) -> Any:
+    """A baseline as a preset has it, with what it leaves out.
+
+    Args:
+        baseline: its options; anything else is left to validation.
+        own: condition, generator and sampling of the experiment.
+    """
+    if not isinstance(baseline, dict):
+        return baseline
+    generator = baseline.get("generator", {})
+    same_generator = isinstance(generator, dict) and "name" not in generator
+    made = dict(baseline)
+    for key, theirs in own.items():
+        given = baseline.get(key, {})
+        is_own = same_generator if key == "sampling" else isinstance(given, dict) and "name" not in given
+        if is_own:
+            made[key] = _merged(theirs, given)
+    return made
+
+
+def _merged(values: Any, changes: Any) -> Any:
+    """Nested mappings with single values changed; neither argument is."""
+    if not isinstance(values, dict) or not isinstance(changes, dict):
+        return changes
+    return values | {key: _merged(values.get(key), value) for key, value in changes.items()}
 
 
 class Oracle(Frozen):
@@ -169,13 +198,9 @@ class Experiment(Frozen):
         """What a baseline leaves out is the experiment's own; sampling options only where the generator is."""
         if not isinstance(values, dict) or not isinstance(values.get("baselines"), dict):
             return values
-        filled = {}
-        for name, baseline in values["baselines"].items():
-            if isinstance(baseline, dict):
-                left_out = ("condition",) if "generator" in baseline else ("condition", "generator", "sampling")
-                baseline = {key: values[key] for key in left_out if key in values} | baseline
-            filled[name] = baseline
-        return {**values, "baselines": filled}
+        own = {key: values[key] for key in ("condition", "generator", "sampling") if key in values}
+        baselines = {name: _completed(baseline, own) for name, baseline in values["baselines"].items()}
+        return {**values, "baselines": baselines}
 
     @field_validator("baselines")
     @classmethod

@@ -62,6 +62,35 @@ def test_what_a_baseline_leaves_out_is_the_experiments_own():
     assert (gan.condition, gan.generator.name, gan.sampling, gan.poses) == (made.condition, "event_gan", {}, None)
 
 
+def test_a_baseline_without_a_name_changes_single_options_of_the_experiments_own():
+    made = smoke(
+        "generator.options.num_steps=7",
+        "generator.options.moves.shift=0.1",
+        "baselines={random: {generator: {options: {random_init: true, moves: {turn_deg: 5}}}}}",
+        "baselines.random.sampling={batch_size: 3}",
+        "baselines.random.generator.options.num_steps=9",
+    )
+    random = made.baselines["random"]
+    assert random.generator.name == made.generator.name and random.condition == made.condition
+    changed = {"random_init": True, "num_steps": 9, "moves": {"shift": 0.1, "turn_deg": 5}}
+    assert random.generator.options == made.generator.options | changed
+    assert random.sampling == made.sampling | {"batch_size": 3}
+    # The experiment's own stay as they were.
+    assert made.generator.options["num_steps"] == 7 and "turn_deg" not in made.generator.options["moves"]
+    condition = smoke("baselines={other: {condition: {options: {drawing: openpose}}}}").baselines["other"].condition
+    assert condition.name == made.condition.name and condition.options == made.condition.options | {
+        "drawing": "openpose"
+    }
+
+
+@pytest.mark.parametrize(
+    "baseline", ["{generator: {optoins: {num_steps: 3}}}", "{generator: 3}", "{generator: {options: 3}}", "3"]
+)
+def test_a_baseline_that_says_something_else_is_refused(baseline):
+    with pytest.raises((DataError, ValueError), match=r"baselines.*other"):
+        smoke(f"baselines={{other: {baseline}}}")
+
+
 def test_frames_of_several_generators_are_learnt_from_together():
     names = list(map(str, smoke(FOREIGN, "mixtures=[recorded+synthetic+foreign, synthetic+foreign]").all_training_sets))
     assert names[-2:] == ["recorded+synthetic+foreign", "synthetic+foreign"]
