@@ -39,6 +39,8 @@ _QUIET = {
     "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
     "PREFECT_CLI_PROMPT": "false",
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
+    # A server on SQLite answers 503 after a minute of waiting for its turn to write; the default is five further tries.
+    "PREFECT_CLIENT_MAX_RETRIES": "20",
 }
 _SERVER = {
     "PREFECT_UI_ENABLED": "0",
@@ -46,6 +48,10 @@ _SERVER = {
     # One at a time, as Prefect does it, few task runs of a quick flow are recorded before the server ends with it.
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_BATCH_SIZE": "50",
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_FLUSH_INTERVAL": "1",
+    # Nobody reads events of a server that ends with its script, and SQLite has one writer at a time: where thousands of
+    # stages are cached, storing each event with its resources kept requests waiting until they were given up.
+    "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "false",
+    "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
 }
 _server: subprocess.Popen[bytes] | None = None
 _url = ""

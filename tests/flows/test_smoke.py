@@ -72,6 +72,8 @@ def test_prefect_has_recorded_every_stage_that_was_computed(smoke_home):
     messages = ask_prefect(smoke_home, "SELECT message FROM task_run_state WHERE name = 'Completed'")
     recorded = {message.rpartition(" ")[2] for (message,) in messages if ", key " in (message or "")}
     assert recorded >= {name.partition("/")[2][:12] for name in digests(smoke_home)}
+    # Each further row is a write that requests wait for; see flows/local_server.py.
+    assert ask_prefect(smoke_home, "SELECT COUNT(*) FROM events") == [(0,)]
 
 
 GENERATORS = {
