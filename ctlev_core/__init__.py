@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ctlev_core.api import pck as pck
     from ctlev_core.api import read_events as read_events
     from ctlev_core.api import simulate as simulate
+    from ctlev_core.api import simulate_video as simulate_video
     from ctlev_core.api import skeleton_map as skeleton_map
     from ctlev_core.export.event_dataset import EventDataset as EventDataset
     from ctlev_core.trained_generator import TrainedGenerator as TrainedGenerator
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "EventDataset", "TrainedGenerator", "frechet", "histogram", "load_generator", "mpjpe", "normal_map", "pck",
-    "read_events", "simulate", "skeleton_map",
+    "read_events", "simulate", "simulate_video", "skeleton_map",
 ]  # fmt: skip
 
 _ELSEWHERE = {

@@ -99,6 +99,47 @@ def simulate(
     return simulate_events(intensity, np.asarray(times).astype(np.int64), options, sensor_seed=seed, seed=seed)
 
 
+def simulate_video(
+    path: str | os.PathLike[str],
+    *,
+    size: tuple[int, int] | None = None,
+    sensor: str = "noisy",
+    noise: float = 1.0,
+    fps: float | None = None,
+    slow_motion: float = 1.0,
+    seed: int = 0,
+) -> Events:
+    """The events of a simulated event camera that watches a video file, a folder of pictures or one picture.
+
+    What lies between two frames is drawn by optical flow (`ctlev_core.video.interpolation`); a picture is moved in
+    saccades. `ctlev simulate` has more options and writes files.
+
+    Args:
+        path: the file or folder.
+        size: (width, height) px of the camera; None = of the pictures.
+        sensor: as `simulate`.
+        noise: as `simulate`.
+        fps: frames a second, in the place of the file's times.
+        slow_motion: so many times slower than life the video plays.
+        seed: as `simulate`.
+    Returns:
+        Times in us from the first frame on.
+    Raises:
+        DataError: nothing there, nothing that can be read, no times, or a video that ends too early.
+        ValueError: an unknown sensor, or a number that cannot be.
+    """
+    from ctlev_core.sensor.choice import read_sensor
+    from ctlev_core.sensor.dvs_pixel import join
+    from ctlev_core.video.frames import FrameOptions, open_frames
+    from ctlev_core.video.simulation import VideoSimulation
+
+    frames = open_frames(Path(path), FrameOptions(size=size, fps=fps, slow_motion=slow_motion))
+    simulation = VideoSimulation(frames, read_sensor(str(sensor), noise), seed=seed)
+    chunks = list(simulation)
+    assert simulation.size is not None
+    return join(chunks, simulation.size)
+
+
 def normal_map(
     body: BodyModel | str | os.PathLike[str] | None = None,
     *,

@@ -214,6 +214,61 @@ _part(
 )
 
 
+@app.command(rich_help_panel=PARTS)
+def simulate(
+    source: Annotated[
+        Path, typer.Argument(help="a video, a folder of pictures, or a picture, moved in saccades", show_default=False)
+    ],
+    output: Annotated[
+        Path, typer.Argument(help="event file; its suffix is its format, .parquet the smallest", show_default=False)
+    ],
+    sensor: Annotated[
+        str, typer.Option(help="kind of camera: ideal, clean, noisy, dvs346, dvxplorer, or a calibration file")
+    ] = "noisy",
+    noise: Annotated[float, typer.Option(min=0, help="factor on the camera's noise; 0 = none")] = 1.0,
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="pixels of the camera, such as 346x260; default: the pictures' own")
+    ] = "",
+    fps: Annotated[
+        float | None, typer.Option(help="frames a second, in the place of the file's times", show_default=False)
+    ] = None,
+    slow_motion: Annotated[float, typer.Option(help="so many times slower than life the video plays")] = 1.0,
+    start: Annotated[float, typer.Option(help="first second of the video that is read")] = 0.0,
+    stop: Annotated[float | None, typer.Option(help="last second that is read", show_default=False)] = None,
+    interpolation: Annotated[str, typer.Option(help="what lies between two frames: flow, or fade")] = "flow",
+    max_displacement_px: Annotated[
+        float, typer.Option(help="farthest movement between two drawn frames; smaller is slower and more exact")
+    ] = 1.0,
+    gamma: Annotated[float, typer.Option(help="light is a stored value to this power")] = 2.2,
+    seed: Annotated[int, typer.Option(min=0, help="of the camera's pixels and noise")] = 0,
+    format_name: Annotated[
+        str, typer.Option("--format", help="format, where the suffix does not tell: evt2, evt3, ...")
+    ] = "",
+    preview: Annotated[
+        Path | None, typer.Option(help="a picture of some frames and their events", show_default=False)
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace what is there")] = False,
+) -> None:
+    """Turn a video, or pictures, into the events of a simulated camera."""
+    from ctlev_core.events.decoding.event_tables import parse_sensor_size
+    from ctlev_core.video.frames import FrameOptions
+    from flows.simulate import SimulateOptions, simulate_file
+
+    pixels = parse_sensor_size(size) if size else None
+    if size and pixels is None:
+        raise typer.BadParameter(f"must be WIDTHxHEIGHT in px, such as 346x260, got {size!r}", param_hint="--size")
+    if interpolation not in ("flow", "fade"):
+        raise typer.BadParameter(f"must be flow or fade, got {interpolation!r}", param_hint="--interpolation")
+    try:
+        frames = FrameOptions(pixels, fps, slow_motion, start, stop, gamma)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+    options = SimulateOptions(
+        sensor, noise, interpolation, max_displacement_px, seed, format_name, preview, overwrite=overwrite
+    )
+    raise typer.Exit(simulate_file(source, output, frames, options))
+
+
 @app.command(rich_help_panel=STORE)
 def compare(run_a: Run, run_b: Run, home: Home = None) -> None:
     """Say what differs between two finished experiments: options, data, code and scores."""

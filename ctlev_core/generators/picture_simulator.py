@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field, model_validator
 
+from ctlev_core.render.saccades import NMNIST_PATH_PX, NMNIST_PATH_US, path_frames
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
@@ -39,55 +40,8 @@ if TYPE_CHECKING:
 VERSION = 1
 WHERE = "generator 'picture_simulator'"
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-MAX_INTERVAL_US = 10_000
-PATH_STEP_US = 250
 BLOCK_VALUES = 1 << 22
 """Pixels of the frames that are held at a time."""
-PATH_MS_PX = (
-    (0, 0.00, 0.00),
-    (7.5, 0.00, 0.05),
-    (15, 0.00, 0.23),
-    (22.5, 0.00, 0.62),
-    (30, 0.00, 1.15),
-    (37.5, 0.00, 1.90),
-    (45, 0.02, 2.81),
-    (52.5, 0.29, 3.66),
-    (60, 0.74, 4.35),
-    (67.5, 1.21, 4.81),
-    (75, 1.60, 5.13),
-    (82.5, 1.70, 5.17),
-    (90, 1.76, 5.17),
-    (97.5, 1.82, 5.17),
-    (105, 1.92, 5.15),
-    (112.5, 2.07, 5.06),
-    (120, 2.27, 4.94),
-    (127.5, 2.59, 4.67),
-    (135, 3.03, 4.19),
-    (142.5, 3.46, 3.43),
-    (150, 3.79, 2.55),
-    (157.5, 4.04, 1.67),
-    (165, 4.38, 0.84),
-    (172.5, 4.73, 0.20),
-    (180, 5.06, -0.07),
-    (187.5, 5.29, -0.13),
-    (195, 5.39, -0.13),
-    (202.5, 5.56, -0.13),
-    (210, 5.72, -0.15),
-    (217.5, 5.80, -0.18),
-    (225, 5.73, -0.18),
-    (232.5, 5.27, -0.18),
-    (240, 4.70, -0.18),
-    (247.5, 4.01, -0.20),
-    (255, 3.30, -0.22),
-    (262.5, 2.53, -0.26),
-    (270, 1.83, -0.35),
-    (277.5, 1.32, -0.43),
-    (285, 0.93, -0.47),
-    (292.5, 0.62, -0.47),
-    (300, 0.52, -0.47),
-    (307.5, 0.50, -0.47),
-)
-"""Of N-MNIST: ms, and px to the right and down."""
 
 
 class Options(Frozen):
@@ -98,11 +52,11 @@ class SampleOptions(Frozen):
     """Options of the simulation. What is null is calibrated; without recordings it is as in `UNCALIBRATED`."""
 
     path_us: tuple[int, ...] = Field(
-        default=tuple(round(1000 * row[0]) for row in PATH_MS_PX),
+        default=NMNIST_PATH_US,
         description="times of the path's points, from 0 to the end of a recording",
     )
     path_px: tuple[tuple[float, float], ...] = Field(
-        default=tuple(row[1:] for row in PATH_MS_PX),
+        default=NMNIST_PATH_PX,
         description="where the picture is then against its start, (x right, y down), smooth in between",
     )
     centre_px: tuple[float, float] | None = Field(
@@ -238,7 +192,7 @@ def _record(image: np.ndarray, row: int, sensor_size: SensorSize, options: Sampl
     from ctlev_core.render.panned_picture import pan
     from ctlev_core.sensor.dvs_pixel import Sensor, join
 
-    times_us, moved_px = _frames(options.path_us, options.path_px, options.max_displacement_px)
+    times_us, moved_px = path_frames(options.path_us, options.path_px, options.max_displacement_px)
     rng = np.random.default_rng(seed)
     assert options.centre_px is not None and options.picture_share is not None
     start_px = np.array(options.centre_px) + np.array(sensor_size) / 2 + rng.normal(0, options.centre_jitter_px, 2)
@@ -300,22 +254,3 @@ def _sensor(sensor_size: SensorSize, options: SampleOptions) -> tuple[SensorOpti
         if 0 <= x < sensor_size[0] and 0 <= y < sensor_size[1]:
             maps.hot_rate_hz[y, x] = rate_hz
     return kind, maps
-
-
-@functools.lru_cache(maxsize=4)
-def _frames(
-    path_us: tuple[int, ...], path_px: tuple[tuple[float, float], ...], max_displacement_px: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Times [T] int64 us of the frames, and where [T, 2] px the picture is then against its start."""
-    from scipy.interpolate import PchipInterpolator
-
-    path = PchipInterpolator(np.array(path_us, float), np.array(path_px) - np.array(path_px[0]))
-    fine_us = np.unique(np.append(np.arange(0, path_us[-1], PATH_STEP_US), path_us[-1]))
-    steps = np.linalg.norm(np.diff(path(fine_us), axis=0), axis=1)
-    # Each fine step is a share of a frame: by how far it moves, and by how long it lasts.
-    shares = np.maximum(steps / max_displacement_px, np.diff(fine_us) / MAX_INTERVAL_US)
-    progress = np.concatenate([[0.0], np.cumsum(shares)])
-    count = int(np.ceil(progress[-1])) + 1
-    times_us = np.interp(np.linspace(0, progress[-1], count), progress, fine_us)
-    times_us = np.unique(np.rint(times_us).astype(np.int64))
-    return times_us, path(times_us)

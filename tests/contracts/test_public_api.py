@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -60,7 +61,12 @@ def test_each_line_of_the_quick_start_runs(tmp_path, monkeypatch, random_events)
         "features": random.normal(size=(20, 4)),
         "other_features": random.normal(size=(20, 4)),
     }
+    writer = cv2.VideoWriter("video.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (64, 48))
+    for number in range(3):
+        writer.write(np.roll(random.integers(0, 255, (48, 64, 3), np.uint8), number, axis=1))
+    writer.release()
     exec(block, given)
+    assert given["filmed"].sensor_size == (346, 260) and len(given["filmed"]) > 0
     assert len(given["events"]) == len(random_events) and opened == ["mine"]
     assert given["counts"].shape == (4, 2, 24, 32) and given["counts"].sum() == 2000
     assert given["error"] == 5.0 and 0 <= given["share"] <= 1

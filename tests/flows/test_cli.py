@@ -23,7 +23,7 @@ from flows.preset_list import preset_names
 
 COMMANDS = (
     "run", "plan", "prepare", "train", "synthesize", "evaluate", "baselines", "export-events", "speed-vs-error",
-    "realism-chain", "pretrain", "regenerate", "compare", "verify", "prune", "show", "presets", "options",
+    "realism-chain", "pretrain", "simulate", "regenerate", "compare", "verify", "prune", "show", "presets", "options",
 )  # fmt: skip
 
 

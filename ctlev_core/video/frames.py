@@ -1,0 +1,304 @@
+"""Frames of a video, of a folder of pictures, or of one still picture, as a camera would see them: linear light.
+
+    a video file          anything that OpenCV reads; its own times, so that frame rates may vary
+    a folder of pictures  in the order of their names; `timestamps.txt` (seconds, a line each) in it or beside it, or a
+                          rate
+    a picture             moved before the camera as N-MNIST's pictures were (`ctlev_core.render.saccades`)
+
+Stored pixels of 8 and 16 bits are light to the power of 1 / gamma; floating-point ones (.hdr, .tiff) are light.
+Pictures are scaled to cover the sensor and cut to its shape about their middle. Colours become luminance (ITU-R
+BT.709).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ctlev_core.render.saccades import NMNIST_PATH_PX, NMNIST_PATH_US, path_frames
+from data_contracts.errors import DataError, shortened
+from data_contracts.events import SensorSize, check_sensor_size
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".hdr")
+TIMES_FILE = "timestamps.txt"
+GAMMA = 2.2
+NMNIST_SIDE_PX = 34
+"""Side of the sensor on which the path of N-MNIST was measured."""
+_LUMINANCE_BGR = np.array([[0.0722, 0.7152, 0.2126]], np.float32)
+_NOT_SHOWN = 0.01
+"""A container may count so many frames more than it has; with fewer, the file was cut."""
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """How frames are read.
+
+    Attributes:
+        size: (width, height) px of the sensor; None = of the pictures.
+        fps: frames a second, in the place of the file's times; needed for a folder without times.
+        slow_motion: so many times slower than life the video plays.
+        start_s, stop_s: the stretch of the video that is read, s of its own time; None = to its end.
+        gamma: light is a stored value to this power; 1 = values are light.
+    """
+
+    size: SensorSize | None = None
+    fps: float | None = None
+    slow_motion: float = 1.0
+    start_s: float = 0.0
+    stop_s: float | None = None
+    gamma: float = GAMMA
+
+    def __post_init__(self) -> None:
+        for name in ("fps", "slow_motion", "gamma"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be a number above 0, got {value}")
+        if not self.start_s >= 0 or (self.stop_s is not None and not self.stop_s > self.start_s):
+            raise ValueError(f"start and stop must be ascending seconds from 0, got {self.start_s} and {self.stop_s}")
+        if self.size is not None:
+            try:
+                check_sensor_size(self.size, "size")
+            except DataError as error:
+                raise ValueError(str(error)) from None
+
+
+class Frames:
+    """Frames one after the other, in memory of one; iterating again reads them again.
+
+    Attributes:
+        path: where from.
+        size: (width, height) px; known once the first frame was read.
+        expected: number of frames as the file says; 0 = it does not.
+        is_dense: so close together that nothing need be drawn between two.
+        num_skipped: frames whose time is not after that of the frame before; counted while iterating.
+    """
+
+    is_dense = False
+
+    def __init__(self, path: Path, options: FrameOptions, expected: int) -> None:
+        self.path, self.options, self.expected = path, options, expected
+        self.size: SensorSize | None = options.size
+        self.num_skipped = 0
+        self._light = (np.arange(256) / 255).astype(np.float32) ** np.float32(options.gamma)
+        self._stored: tuple[int, int] | None = None
+
+    def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Times in us of life from the first frame on, and linear light [H, W] float32, white = 1.
+
+        Raises:
+            DataError: a frame that cannot be read, frames of different sizes, or fewer than two of them.
+        """
+        options, first_s, last_us, count = self.options, None, -1, 0
+        self.num_skipped, self._stored = 0, None
+        for time_s, stored in self._read():
+            if time_s < options.start_s:
+                continue
+            if options.stop_s is not None and time_s > options.stop_s:
+                break
+            first_s = time_s if first_s is None else first_s
+            t_us = round((time_s - first_s) / options.slow_motion * 1e6)
+            if t_us <= last_us:
+                self.num_skipped += 1
+                continue
+            last_us, count = t_us, count + 1
+            yield t_us, self._to_light(stored, count - 1)
+        if count < 2:
+            stretch = "" if options.stop_s is None and not options.start_s else " in this stretch"
+            raise DataError(f"{self.path}: expected two frames or more at different times{stretch}, got {count}")
+
+    def _read(self) -> Iterator[tuple[float, np.ndarray]]:
+        """Times in s, and frames as they are stored."""
+        raise NotImplementedError
+
+    def _to_light(self, stored: np.ndarray, number: int) -> np.ndarray:
+        import cv2
+
+        shape = stored.shape[:2]
+        if self._stored is not None and shape != self._stored:
+            raise DataError(
+                f"{self.path}: frames must have one size, got {shape[1]} x {shape[0]} px at frame {number} after "
+                f"{self._stored[1]} x {self._stored[0]}"
+            )
+        self._stored = shape
+        if self.size is None:
+            self.size = check_sensor_size((shape[1], shape[0]), str(self.path))
+        stored = _cover(stored, self.size)
+        if stored.ndim == 3 and stored.shape[2] == 4:
+            stored = stored[..., :3]
+        if stored.dtype == np.uint8:
+            light = cv2.LUT(np.ascontiguousarray(stored), self._light)
+        elif stored.dtype == np.uint16:
+            light = (stored.astype(np.float32) / 65535) ** np.float32(self.options.gamma)
+        else:
+            light = stored.astype(np.float32)
+            if not np.isfinite(light).all() or light.min() < 0:
+                raise DataError(f"{self.path}: light must be finite and not negative, it is not in frame {number}")
+        if light.ndim == 3:
+            light = cv2.transform(light, _LUMINANCE_BGR) if light.shape[2] == 3 else light[..., 0]
+        return np.ascontiguousarray(light.reshape(self.size[1], self.size[0]))
+
+
+class _VideoFile(Frames):
+    def _read(self) -> Iterator[tuple[float, np.ndarray]]:
+        import cv2
+
+        capture = _open(self.path)
+        try:
+            fps = self.options.fps or 0.0
+            stated_fps = capture.get(cv2.CAP_PROP_FPS)
+            count, before_s, has_times = 0, -1.0, True
+            while True:
+                is_there, frame = capture.read()
+                if not is_there:
+                    break
+                time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                if count == 1 and time_s <= before_s:
+                    has_times = False  # the container knows nothing but a rate
+                if not has_times and not fps:
+                    fps = stated_fps if math.isfinite(stated_fps) and stated_fps > 0 else 0.0
+                    if not fps:
+                        raise DataError(f"{self.path}: the file says nothing of the times of its frames; give fps")
+                before_s = time_s
+                yield (count / fps if fps else time_s), frame
+                count += 1
+        finally:
+            capture.release()
+        if count < self.expected - max(2, _NOT_SHOWN * self.expected):
+            raise DataError(
+                f"{self.path}: ends after frame {count} of {self.expected}; the file is cut or damaged. What is before "
+                f"can be read with an earlier stop"
+            )
+
+
+class _PictureFolder(Frames):
+    def __init__(self, path: Path, options: FrameOptions) -> None:
+        self._paths, self._times_s = _list_folder(path, options.fps)
+        super().__init__(path, options, len(self._paths))
+
+    def _read(self) -> Iterator[tuple[float, np.ndarray]]:
+        for path, time_s in zip(self._paths, self._times_s, strict=True):
+            yield time_s, _read_picture(path)
+
+
+class _StillPicture(Frames):
+    """One picture that the camera looks at in saccades."""
+
+    is_dense = True
+
+    def __init__(self, path: Path, options: FrameOptions, max_displacement_px: float) -> None:
+        self._picture = _read_picture(path)
+        self.size = options.size or (self._picture.shape[1], self._picture.shape[0])
+        scale = min(self.size) / NMNIST_SIDE_PX
+        path_px = tuple((scale * x, scale * y) for x, y in NMNIST_PATH_PX)
+        self._times_us, self._moved_px = path_frames(NMNIST_PATH_US, path_px, max_displacement_px)
+        super().__init__(path, options, len(self._times_us))
+
+    def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
+        import cv2
+
+        light = self._to_light(self._picture, 0)
+        assert self.size is not None
+        for t_us, (right, down) in zip(self._times_us.tolist(), self._moved_px.tolist(), strict=True):
+            moved = np.array([[1, 0, right], [0, 1, down]], np.float64)
+            yield (
+                t_us,
+                cv2.warpAffine(light, moved, self.size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+            )
+
+
+def open_frames(path: Path, options: FrameOptions, max_displacement_px: float = 1.0) -> Frames:
+    """The frames of a video file, of a folder of pictures, or of one picture.
+
+    Args:
+        path: the file or folder.
+        options: see `FrameOptions`.
+        max_displacement_px: movement of a still picture between two frames.
+    Raises:
+        DataError: nothing there, nothing that can be read, or no times.
+    """
+    if path.is_dir():
+        return _PictureFolder(path, options)
+    if not path.is_file():
+        raise DataError(f"{path}: expected a video, a folder of pictures or a picture, got nothing there")
+    if path.suffix.lower() in PICTURE_SUFFIXES:
+        return _StillPicture(path, options, max_displacement_px)
+    import cv2
+
+    capture = _open(path)
+    expected = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    capture.release()
+    is_whole = options.stop_s is None and math.isfinite(expected) and expected > 0
+    return _VideoFile(path, options, int(expected) if is_whole else 0)
+
+
+def _open(path: Path):
+    import cv2
+
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise DataError(f"{path}: not a video that OpenCV can read ({path.stat().st_size} bytes)")
+    return capture
+
+
+def _list_folder(path: Path, fps: float | None) -> tuple[list[Path], list[float]]:
+    """Pictures of a folder, or of its folder `imgs`, in the order of their names, and their times in s."""
+    found = _pictures_of(path) or _pictures_of(path / "imgs")
+    if not found:
+        raise DataError(f"{path}: holds no pictures ({', '.join(PICTURE_SUFFIXES)})")
+    if fps:
+        return found, [number / fps for number in range(len(found))]
+    times = next((one for one in (path / TIMES_FILE, path.parent / TIMES_FILE) if one.is_file()), None)
+    if times is None:
+        raise DataError(f"{path}: has no {TIMES_FILE} (seconds, a line for each picture); give fps")
+    lines = [line.split()[-1] for line in times.read_text("utf-8", errors="replace").splitlines() if line.split()]
+    try:
+        seconds = [float(line) for line in lines]
+    except ValueError as error:
+        raise DataError(f"{times}: expected seconds, {shortened(str(error), 100)}") from None
+    if len(seconds) != len(found):
+        raise DataError(f"{times}: expected a time for each of {len(found)} pictures, got {len(seconds)}")
+    if not all(math.isfinite(one) and one >= 0 for one in seconds):
+        raise DataError(f"{times}: expected finite seconds from 0 on")
+    return found, seconds
+
+
+def _pictures_of(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    found = [one for one in folder.iterdir() if one.suffix.lower() in PICTURE_SUFFIXES and one.is_file()]
+    # Numbers count as such: frame 10 comes after frame 9.
+    return sorted(found, key=lambda one: [(int(part) if part.isdigit() else 0, part) for part in _parts(one.name)])
+
+
+def _parts(name: str) -> list[str]:
+    return re.split(r"([0-9]+)", name)
+
+
+def _read_picture(path: Path) -> np.ndarray:
+    import cv2
+
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
+    stored = cv2.imdecode(np.fromfile(path, np.uint8), flags) if path.stat().st_size else None
+    if stored is None:
+        raise DataError(f"{path}: not a picture that OpenCV can read ({path.stat().st_size} bytes)")
+    return stored
+
+
+def _cover(stored: np.ndarray, size: SensorSize) -> np.ndarray:
+    """The picture scaled so that it covers a size, and cut to it about its middle."""
+    import cv2
+
+    height, width = stored.shape[:2]
+    if (width, height) == size:
+        return stored
+    scale = max(size[0] / width, size[1] / height)
+    # What will be cut is not scaled first: of a wide video that is a third.
+    keep = min(width, math.ceil(size[0] / scale)), min(height, math.ceil(size[1] / scale))
+    left, top = (width - keep[0]) // 2, (height - keep[1]) // 2
+    part = stored[top : top + keep[1], left : left + keep[0]]
+    return cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)

@@ -1,0 +1,59 @@
+"""A picture of a simulated recording: some frames of the video, and below each the events until the next frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ctlev_core.video.simulation import VideoSimulation
+from data_contracts.events import Events
+
+COLUMNS = 6
+FULL_SCALE = 3
+"""Events of a pixel that are drawn as bright as it gets."""
+
+
+class Preview:
+    """Gathers what it shows while the events go by.
+
+    Args:
+        simulation: what sends them.
+        num_frames: of the video; with 0 the first frames are shown.
+    """
+
+    def __init__(self, simulation: VideoSimulation, num_frames: int) -> None:
+        self._simulation = simulation
+        last = max(num_frames - 2, COLUMNS - 1)
+        self._shown = set(np.linspace(0, last, COLUMNS).astype(int).tolist())
+        self._columns: list[tuple[np.ndarray, np.ndarray]] = []
+        self._interval = -1
+
+    def watch(self, chunks: Iterator[Events]) -> Iterator[Events]:
+        """Hand the events on."""
+        for events in chunks:
+            # Events that come while n frames are finished lie between frame n - 1 and frame n.
+            interval = self._simulation.num_frames - 1
+            if interval in self._shown and self._simulation.last_light is not None:
+                if interval != self._interval:
+                    light = self._simulation.last_light
+                    grey = np.rint(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+                    self._columns.append((grey, np.zeros((2, *light.shape), np.int64)))
+                    self._interval = interval
+                np.add.at(self._columns[-1][1], (events.p, events.y, events.x), 1)
+            yield events
+
+    def write(self, path: Path) -> None:
+        """Write the picture, PNG or what the suffix says: brighter is red, darker blue."""
+        import cv2
+
+        columns = []
+        for grey, counts in self._columns:
+            level = np.rint(255 * np.minimum(counts / FULL_SCALE, 1)).astype(np.uint8)
+            # Blue, green, red: the order of OpenCV. A light ground, so that single events are seen.
+            events = 255 - np.stack([level[1], np.maximum(level[0], level[1]), level[0]], axis=-1)
+            columns.append(np.vstack([np.repeat(grey[..., None], 3, axis=2), events]))
+        is_written, encoded = cv2.imencode(path.suffix or ".png", np.hstack(columns))
+        assert is_written
+        path.write_bytes(encoded.tobytes())

@@ -1,0 +1,95 @@
+"""A video before a simulated event camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ctlev_core.progress import ProgressBar
+from ctlev_core.sensor.dvs_pixel import Sensor
+from ctlev_core.sensor.options import SensorOptions
+from ctlev_core.video.frames import Frames
+from ctlev_core.video.interpolation import Fading, Flow, Interpolator, num_steps
+from data_contracts.events import Events, SensorSize
+
+Interpolation = Literal["flow", "fade"]
+MAX_STEPS = 200
+"""Between two frames; so many are enough for 100 px."""
+STEPS_AT_ONCE = 16
+"""Frames between that are held at a time."""
+
+
+@dataclass
+class VideoSimulation:
+    """A simulated event camera that watches a video; iterate over it for the events, in chunks of a frame's time.
+
+    Attributes:
+        frames: the video.
+        sensor: kind of camera.
+        seed: of the pixels' mismatch and of noise.
+        interpolator: what lies between two frames.
+        max_displacement_px: the farthest that anything moves between two drawn frames.
+            last_light: [H, W] the frame that the latest events follow.
+        size, num_frames, num_drawn, num_events, duration_us: what has been seen, known while iterating.
+    """
+
+    frames: Frames
+    sensor: SensorOptions
+    seed: int = 0
+    interpolator: Interpolator = field(default_factory=Flow)
+    max_displacement_px: float = 1.0
+    size: SensorSize | None = field(default=None, init=False)
+    num_frames: int = field(default=0, init=False)
+    num_drawn: int = field(default=0, init=False)
+    num_events: int = field(default=0, init=False)
+    duration_us: int = field(default=0, init=False)
+    last_light: np.ndarray | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        if not self.max_displacement_px > 0:
+            raise ValueError(f"max_displacement_px must be above 0, got {self.max_displacement_px}")
+
+    def __iter__(self) -> Iterator[Events]:
+        """The events of each interval between two frames, times in us from the first frame on.
+
+        Raises:
+            DataError: see `ctlev_core.video.frames.open_frames`.
+        """
+        camera: Sensor | None = None
+        last: tuple[int, np.ndarray] | None = None
+        with ProgressBar(desc="simulate", total=self.frames.expected or None, unit="frame") as bar:
+            for t_us, light in self.frames:
+                if camera is None:
+                    self.size = light.shape[1], light.shape[0]
+                    camera = Sensor(self.size, self.sensor, sensor_seed=self.seed, seed=[self.seed, 1])
+                    self.num_frames = self.num_drawn = self.num_events = 0
+                for times, drawn in self._drawn(last, t_us, light):
+                    events = camera.push(drawn, times)
+                    self.num_drawn += len(drawn)
+                    self.num_events += len(events)
+                    yield events
+                last, self.last_light, self.duration_us = (t_us, light), light, t_us
+                self.num_frames += 1
+                bar.update()
+
+    def _drawn(
+        self, last: tuple[int, np.ndarray] | None, t_us: int, light: np.ndarray
+    ) -> Iterable[tuple[np.ndarray, np.ndarray]]:
+        """Times and frames from after the last frame to this one, a few at a time."""
+        if last is None or self.frames.is_dense:
+            yield np.array([t_us], np.int64), light[None]
+            return
+        between = self.interpolator.between(last[1], light)
+        steps = num_steps(between.displacement_px, self.max_displacement_px, min(MAX_STEPS, t_us - last[0]))
+        for first in range(1, steps + 1, STEPS_AT_ONCE):
+            shares = np.arange(first, min(first + STEPS_AT_ONCE, steps + 1)) / steps
+            times = last[0] + np.rint(shares * (t_us - last[0])).astype(np.int64)
+            yield times, np.stack([light if share == 1 else between.at(float(share)) for share in shares])
+
+
+def interpolator_of(name: Interpolation) -> Interpolator:
+    """The interpolator of a name."""
+    return Flow() if name == "flow" else Fading()

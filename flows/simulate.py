@@ -1,0 +1,128 @@
+"""A video, a folder of pictures or a still picture becomes events of a simulated camera: `ctlev simulate`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ctlev_core import plugins
+from ctlev_core.duration_text import duration_text
+from ctlev_core.plugin_contracts import FormatWithWriter
+from ctlev_core.plugins import PluginError
+from data_contracts.errors import DataError
+from data_contracts.events import Events
+
+if TYPE_CHECKING:
+    from ctlev_core.video.frames import FrameOptions
+    from ctlev_core.video.simulation import Interpolation
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    """What a person asked of `ctlev simulate`; see its help."""
+
+    sensor: str = "noisy"
+    noise: float = 1.0
+    interpolation: Interpolation = "flow"
+    max_displacement_px: float = 1.0
+    seed: int = 0
+    format: str = ""
+    preview: Path | None = None
+    overwrite: bool = False
+
+
+def simulate_file(source: Path, output: Path, frames: FrameOptions, options: SimulateOptions) -> int:
+    """Write the events that a simulated camera sends while it watches a video, and say how many.
+
+    Returns:
+        Exit status: 0 written, 2 wrong input; then nothing is left at `output`.
+    """
+    started = time.perf_counter()
+    partial = output.with_name(f".partial-{output.name}")
+    try:
+        name, writer = find_writer(output, options.format)
+        for path in filter(None, (output, options.preview)):
+            _check_free(path, overwrite=options.overwrite)
+        from ctlev_core.sensor.choice import read_sensor
+        from ctlev_core.video.frames import open_frames
+        from ctlev_core.video.preview import Preview
+        from ctlev_core.video.simulation import VideoSimulation, interpolator_of
+
+        simulation = VideoSimulation(
+            open_frames(source, frames, options.max_displacement_px),
+            read_sensor(options.sensor, options.noise),
+            seed=options.seed,
+            interpolator=interpolator_of(options.interpolation),
+            max_displacement_px=options.max_displacement_px,
+        )
+        preview = Preview(simulation, simulation.frames.expected)
+        try:
+            _write(partial, preview.watch(iter(simulation)), name, writer)
+            partial.replace(output)
+        finally:
+            partial.unlink(missing_ok=True)
+        if options.preview is not None:
+            preview.write(options.preview)
+    except (DataError, PluginError, ValueError, OSError) as error:
+        print(f"error: {str(error).replace(str(partial), str(output))}", file=sys.stderr)
+        return 2
+    assert simulation.size is not None
+    width, height = simulation.size
+    rate = simulation.num_events / max(simulation.duration_us, 1)
+    skipped = simulation.frames.num_skipped
+    print(
+        f"{simulation.num_events} events of {width} x {height} px in {simulation.duration_us / 1e6:.3f} s "
+        f"({rate:.3g} million a second), from {simulation.num_frames} frames, {simulation.num_drawn} drawn"
+        + (f"; {skipped} frames not after the one before were left out" if skipped else "")
+    )
+    print(f"events: {output}" + (f"\npreview: {options.preview}" if options.preview else ""))
+    print(f"in {duration_text(time.perf_counter() - started)}")
+    return 0
+
+
+def find_writer(output: Path, name: str = "") -> tuple[str, FormatWithWriter]:
+    """The format to write, by its name or by the suffix of the file.
+
+    Raises:
+        PluginError: no such format, or none with that suffix.
+    """
+    writers = {}
+    for one in [name] if name else plugins.names("formats"):
+        module = plugins.load("formats", one)
+        if isinstance(module, FormatWithWriter):
+            writers[one] = module
+    if name:
+        if not writers:
+            raise PluginError(f"format {name!r} is read only")
+        return name, writers[name]
+    suffix = output.suffix.lower()
+    found = [one for one, module in writers.items() if suffix in module.SUFFIXES]
+    if not found:
+        known = ", ".join(f"{one} ({', '.join(module.SUFFIXES)})" for one, module in writers.items())
+        raise PluginError(f"{output}: no format is written with the suffix {suffix!r}; known: {known}")
+    # Formats that share a suffix: the newest of them, which comes last by name (.raw is EVT3).
+    return found[-1], writers[found[-1]]
+
+
+def _check_free(path: Path, *, overwrite: bool) -> None:
+    if not path.absolute().parent.is_dir():
+        raise DataError(f"{path}: there is no folder {path.absolute().parent}")
+    if path.exists() and not overwrite:
+        raise DataError(f"{path}: is there already; --overwrite replaces it")
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder")
+
+
+def _write(path: Path, chunks: Iterable[Events], name: str, writer: FormatWithWriter) -> None:
+    """Parquet chunk by chunk; other formats write a recording as a whole, which must fit into memory."""
+    from ctlev_core.events.decoding import event_chunks
+    from ctlev_core.formats import parquet
+
+    if name == "parquet":
+        parquet.write_chunks(path, chunks)
+        return
+    writer.write(path, event_chunks.concatenate(chunks))

@@ -1,0 +1,127 @@
+"""`ctlev simulate`: every format, a preview, and refusals that leave nothing behind."""
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ctlev_core import read_events, simulate_video
+from ctlev_core.plugin_contracts import FormatWithWriter
+from ctlev_core.plugins import load, names
+from flows.cli import app
+from flows.simulate import find_writer
+
+WRITTEN = [name for name in names("formats") if isinstance(load("formats", name), FormatWithWriter)]
+
+
+def invoke(*arguments):
+    result = CliRunner().invoke(app, ["simulate", *map(str, arguments)])
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """A bright square that moves over a dark ground, 12 frames at 30 a second."""
+    path = tmp_path_factory.mktemp("video") / "square.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 48))
+    for number in range(12):
+        frame = np.full((48, 64, 3), 30, np.uint8)
+        frame[14:34, 4 + 3 * number : 24 + 3 * number] = 220
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+def test_a_video_becomes_events_and_a_preview(video, tmp_path):
+    status, output, errors = invoke(video, tmp_path / "a.parquet", "--sensor", "ideal", "--preview", tmp_path / "a.png")
+    assert status == 0, errors
+    events = read_events(tmp_path / "a.parquet")
+    assert events.sensor_size == (64, 48) and f"{len(events)} events of 64 x 48 px in 0.367 s" in output
+    # The front edge brightens, the rear one darkens; both move to the right, row for row of the square.
+    assert set(np.unique(events.y[events.p == 1]).tolist()) >= set(range(16, 32))
+    for polarity, start in ((1, 24), (0, 4)):
+        x, t = events.x[events.p == polarity], events.t[events.p == polarity]
+        assert np.median(x[t < 60_000]) == pytest.approx(start + 3, abs=4)
+        assert np.median(x[t > 300_000]) == pytest.approx(start + 30, abs=4)
+    picture = cv2.imread(str(tmp_path / "a.png"))
+    assert picture.shape == (96, 6 * 64, 3)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.parquet", "a.png"]
+
+
+def test_python_gives_the_same_events(video, tmp_path):
+    assert invoke(video, tmp_path / "a.parquet", "--seed", 3, "--size", "32x24", "--slow-motion", 2)[0] == 0
+    written = read_events(tmp_path / "a.parquet")
+    made = simulate_video(video, size=(32, 24), seed=3, slow_motion=2)
+    assert len(made) > 0 and made.sensor_size == (32, 24)
+    for name in "txyp":
+        np.testing.assert_array_equal(getattr(made, name), getattr(written, name))
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_every_format_that_is_written_holds_the_same_events(video, tmp_path, name):
+    output, size = tmp_path / f"a{load('formats', name).SUFFIXES[0]}", (240, 180) if name == "atis" else (346, 260)
+    asked = ("--format", name, "--sensor", "clean", "--size", f"{size[0]}x{size[1]}")
+    status, _, errors = invoke(video, output, *asked)
+    assert status == 0, errors
+    made, written = simulate_video(video, sensor="clean", size=size), read_events(output)
+    assert len(written) == len(made)
+    np.testing.assert_array_equal(written.t, made.t)
+
+
+def test_a_format_that_cannot_hold_the_events_says_so_of_the_file_asked_for(video, tmp_path):
+    status, _, errors = invoke(video, tmp_path / "a.bin")
+    assert status == 2 and f"{tmp_path}/a.bin: the format states no sensor size" in errors
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_suffix_says_the_format(tmp_path):
+    for suffix, name in ((".parquet", "parquet"), (".raw", "evt3"), (".npz", "npz"), (".csv", "csv"), (".dat", "dat")):
+        assert find_writer(tmp_path / f"a{suffix}")[0] == name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{missing}", "{out}.parquet"], "got nothing there"),
+        (["{video}", "{out}.mp3"], r"no format is written with the suffix '.mp3'; known: "),
+        (["{video}", "{out}.parquet", "--format", "aedat4"], "format 'aedat4' is read only"),
+        (["{video}", "{out}.parquet", "--format", "evt9"], "unknown plug-in 'evt9'"),
+        (["{video}", "{out}.parquet", "--sensor", "dvs364"], "expected one of ideal"),
+        (["{video}", "{out}/in/a.parquet"], "there is no folder"),
+        (["{video}", "{out}.parquet", "--size", "346"], "must be WIDTHxHEIGHT"),
+        (["{video}", "{out}.parquet", "--interpolation", "magic"], "must be flow or fade"),
+        (["{video}", "{out}.parquet", "--fps", "-3"], "fps must be a number above 0"),
+        (["{video}", "{out}.parquet", "--max-displacement-px", "0"], "max_displacement_px must be above 0"),
+        (["{video}", "{out}.parquet", "--start", "50"], "two frames or more"),
+    ],
+)
+def test_what_cannot_be_done_is_said_and_leaves_nothing(video, tmp_path, arguments, message):
+    given = {"video": video, "missing": tmp_path / "no.mp4", "out": tmp_path / "a"}
+    status, _, errors = invoke(*(argument.format(**given) for argument in arguments))
+    assert status == 2 and message in " ".join(errors.replace("│", " ").split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_there_stays_unless_it_may_be_replaced(video, tmp_path):
+    output = tmp_path / "a.parquet"
+    output.write_text("mine")
+    status, _, errors = invoke(video, output)
+    assert status == 2 and "is there already; --overwrite replaces it" in errors and output.read_text() == "mine"
+    assert invoke(video, output, "--overwrite")[0] == 0 and len(read_events(output)) > 0
+
+
+def test_a_still_picture_and_a_folder(tmp_path):
+    rng = np.random.default_rng(0)
+    picture = cv2.resize(rng.integers(0, 255, (9, 9, 3), np.uint8), (68, 68), interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(tmp_path / "a.png"), picture)
+    status, _, errors = invoke(tmp_path / "a.png", tmp_path / "still.npz")
+    assert status == 0, errors
+    events = read_events(tmp_path / "still.npz")
+    assert events.sensor_size == (68, 68) and events.t[-1] <= 307_500 and len(events) > 1000
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for number in range(4):
+        cv2.imwrite(str(folder / f"{number}.png"), np.roll(picture, 2 * number, axis=1))
+    assert invoke(folder, tmp_path / "folder.npz")[0] == 2
+    assert invoke(folder, tmp_path / "folder.npz", "--fps", 100)[0] == 0
+    assert read_events(tmp_path / "folder.npz").t[-1] <= 30_000

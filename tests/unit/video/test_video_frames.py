@@ -1,0 +1,159 @@
+"""Reading videos, folders and pictures: times, sizes, light, and what is wrong with them."""
+
+import cv2
+import numpy as np
+import pytest
+
+from ctlev_core.video.frames import FrameOptions, open_frames
+from data_contracts.errors import DataError
+
+
+def picture(level, size=(32, 24)):
+    return np.full((size[1], size[0], 3), level, np.uint8)
+
+
+def write_video(path, levels, fps=50.0, size=(32, 24)):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), fps, size)
+    for level in levels:
+        writer.write(picture(level, size))
+    writer.release()
+    return path
+
+
+def write_folder(path, levels, times=None, suffix=".png"):
+    path.mkdir()
+    for number, level in enumerate(levels):
+        cv2.imwrite(str(path / f"frame_{number + 8}{suffix}"), picture(level))
+    if times is not None:
+        (path / "timestamps.txt").write_text("\n".join(map(str, times)) + "\n")
+    return path
+
+
+def test_a_video_has_the_times_of_its_container_and_linear_light(tmp_path):
+    levels = [0, 60, 120, 180, 240]
+    frames = open_frames(write_video(tmp_path / "a.avi", levels), FrameOptions())
+    times, light = zip(*frames, strict=True)
+    assert frames.expected == 5 and frames.size == (32, 24) and list(times) == [0, 20_000, 40_000, 60_000, 80_000]
+    for level, one in zip(levels, light, strict=True):
+        assert one.dtype == np.float32 and one.shape == (24, 32)
+        np.testing.assert_allclose(one, (level / 255) ** 2.2, atol=0.02)  # the codec rounds
+    assert [t for t, _ in frames] == list(times)  # again from the start
+
+
+def test_options_change_times(tmp_path):
+    path = write_video(tmp_path / "a.avi", range(0, 200, 10))
+    assert [t for t, _ in open_frames(path, FrameOptions(fps=100))][:3] == [0, 10_000, 20_000]
+    assert [t for t, _ in open_frames(path, FrameOptions(slow_motion=4))][:3] == [0, 5_000, 10_000]
+    assert len(list(open_frames(path, FrameOptions(start_s=0.1, stop_s=0.2)))) == 6
+    with pytest.raises(DataError, match="two frames or more at different times in this stretch, got 0"):
+        list(open_frames(path, FrameOptions(start_s=7)))
+
+
+def test_a_folder_is_read_in_the_order_of_its_numbers_with_its_times(tmp_path):
+    folder = write_folder(tmp_path / "imgs", [10, 20, 30, 40], times=[0, 0.1, 0.15, 0.4])
+    frames = list(open_frames(folder, FrameOptions(gamma=1.0)))
+    assert [t for t, _ in frames] == [0, 100_000, 150_000, 400_000]  # frame_8, 9, 10, 11
+    np.testing.assert_allclose([light.mean() for _, light in frames], np.array([10, 20, 30, 40]) / 255, atol=1e-6)
+    # vid2e writes the times beside the folder of pictures.
+    (folder / "timestamps.txt").rename(tmp_path / "timestamps.txt")
+    assert len(list(open_frames(tmp_path, FrameOptions()))) == 4
+
+
+def test_frames_at_one_time_are_left_out_and_counted(tmp_path):
+    folder = write_folder(tmp_path / "f", [10, 20, 30, 40], times=[0, 0.1, 0.1, 0.05])
+    frames = open_frames(folder, FrameOptions())
+    assert [t for t, _ in frames] == [0, 100_000] and frames.num_skipped == 2
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([0, 0.1], r"expected a time for each of 3 pictures, got 2"),
+        ([0, "soon", 1], r"expected seconds"),
+        ([0, "nan", 1], r"expected finite seconds"),
+        (None, r"has no timestamps\.txt .*give fps"),
+    ],
+)
+def test_wrong_times_are_named(tmp_path, times, message):
+    folder = write_folder(tmp_path / "f", [10, 20, 30], times=times)
+    with pytest.raises(DataError, match=message):
+        open_frames(folder, FrameOptions())
+
+
+def test_what_is_no_video_is_refused(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"nothing of a video" * 50)
+    (tmp_path / "a.png").write_bytes(b"nothing of a picture")
+    (tmp_path / "empty").mkdir()
+    for name, message in (
+        ("a.mp4", "not a video that OpenCV can read"),
+        ("a.png", "not a picture that OpenCV can read"),
+        ("empty", "holds no pictures"),
+        ("b.mp4", "nothing there"),
+    ):
+        with pytest.raises(DataError, match=message):
+            open_frames(tmp_path / name, FrameOptions())
+
+
+def test_a_video_that_was_cut_is_refused_and_can_be_read_up_to_there(tmp_path):
+    whole = write_video(tmp_path / "a.avi", [0, 200] * 60)
+    content = whole.read_bytes()
+    (tmp_path / "cut.avi").write_bytes(content[: len(content) // 2])
+    frames = open_frames(tmp_path / "cut.avi", FrameOptions())
+    with pytest.raises(DataError, match=r"cut\.avi: ends after frame \d+ of 120"):
+        list(frames)
+    assert len(list(open_frames(tmp_path / "cut.avi", FrameOptions(stop_s=0.5)))) == 26
+
+
+def test_frames_of_several_sizes_are_refused(tmp_path):
+    folder = write_folder(tmp_path / "f", [10, 20])
+    cv2.imwrite(str(folder / "frame_99.png"), picture(5, (40, 24)))
+    with pytest.raises(DataError, match=r"one size, got 40 x 24 px at frame 2 after 32 x 24"):
+        list(open_frames(folder, FrameOptions(fps=30)))
+
+
+def test_pictures_cover_the_sensor_and_are_cut_about_their_middle(tmp_path):
+    wide = np.zeros((20, 60, 3), np.uint8)
+    wide[:, 20:40] = 255
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for name in ("1", "2"):
+        cv2.imwrite(str(folder / f"{name}.png"), wide)
+    for size in ((10, 10), (40, 40)):
+        _, light = next(iter(open_frames(folder, FrameOptions(size=size, fps=1))))
+        assert light.shape == size[::-1]
+        np.testing.assert_allclose(light, 1, atol=1e-6)
+
+
+def test_sixteen_bits_and_floats(tmp_path):
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for name in ("1", "2"):
+        cv2.imwrite(str(folder / f"{name}.png"), np.full((20, 20), 32768, np.uint16))
+    _, light = next(iter(open_frames(folder, FrameOptions(fps=1))))
+    np.testing.assert_allclose(light, (32768 / 65535) ** 2.2, rtol=1e-4)
+    floats = tmp_path / "g"
+    floats.mkdir()
+    for name in ("1", "2"):
+        cv2.imwrite(str(floats / f"{name}.hdr"), np.full((20, 20, 3), 3.5, np.float32))
+    _, light = next(iter(open_frames(floats, FrameOptions(fps=1))))
+    np.testing.assert_allclose(light, 3.5, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"fps": 0}, {"fps": float("nan")}, {"slow_motion": -1}, {"start_s": -1}, {"start_s": 2, "stop_s": 1}]
+)
+def test_options_that_cannot_be_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"must be"):
+        FrameOptions(**wrong)
+
+
+def test_a_still_picture_makes_a_closed_path_of_saccades(tmp_path):
+    level = np.linspace(20, 230, 68 * 68).reshape(68, 68).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), level)
+    frames = open_frames(tmp_path / "a.png", FrameOptions(gamma=1.0), max_displacement_px=0.5)
+    times, light = zip(*frames, strict=True)
+    assert frames.is_dense and times[0] == 0 and times[-1] == 307_500 and len(times) == frames.expected > 60
+    np.testing.assert_allclose(light[0], level / 255, atol=1e-6)
+    # Columns differ by 1 / 255 px, rows by 68 times as much: a path of twice N-MNIST's is seen in the mean.
+    assert np.abs(light[30] - light[0]).max() > 0.02
+    np.testing.assert_allclose(light[-1][10:-10, 10:-10], light[0][10:-10, 10:-10], atol=0.02)
