@@ -22,7 +22,7 @@ import numpy as np
 from ctlev_core.events.decoding.event_tables import parse_sensor_size
 from ctlev_core.sensor.dvs_pixel import PRESETS, join, simulate_events
 from ctlev_core.video.frames import FrameOptions, Frames, open_frames
-from ctlev_core.video.interpolation import Fading, Flow
+from ctlev_core.video.interpolation import Between, Fading, Flow
 from ctlev_core.video.simulation import VideoSimulation
 from data_contracts.events import Events
 
@@ -98,7 +98,11 @@ def of_a_video(path: Path, options: FrameOptions) -> None:
     flow = Flow()
     for first, truth, second in triples:
         changed = np.abs(grey(second) - grey(first)) > CHANGED
-        drawn = {"flow": flow.between(first, second).at(0.5), "fade": (first + second) / 2, "frame before": first}
+        drawn = {
+            "flow": drawn_frame(flow.between(first, second), first, second),
+            "fade": (first + second) / 2,
+            "frame before": first,
+        }
         pixels += int(changed.sum())
         for name, one in drawn.items():
             squares[name] += float(((grey(one) - grey(truth))[changed] ** 2).sum())
@@ -130,6 +134,13 @@ def of_a_video(path: Path, options: FrameOptions) -> None:
     for one in found:
         one.at(0.5)
     print(f"a frame between {1e3 * (time.perf_counter() - started) / len(found):.1f}")
+
+
+def drawn_frame(between: Between, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The whole frame in the middle."""
+    frame = (first + second) / 2
+    frame.reshape(-1)[between.moving] = between.at(0.5)
+    return frame
 
 
 def grey(light: np.ndarray) -> np.ndarray:

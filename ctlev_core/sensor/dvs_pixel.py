@@ -141,6 +141,60 @@ class Sensor:
                 )
         return self._join(found)
 
+    def push_between(
+        self, moving: np.ndarray, drawn: np.ndarray, drawn_us: np.ndarray, intensity: np.ndarray, time_us: int
+    ) -> Events:
+        """The events from the last frame pushed before to one more, of which some pixels are known in between too.
+
+        The same as `push` of all frames in between, if in those every other pixel changes linearly; but it costs no
+        time for them. Events of one microsecond are in any order, always the same.
+
+        Args:
+            moving: [K] int64 pixels, row by row of the frame, ascending.
+            drawn: [S, K] intensity of those pixels at the times in between.
+            drawn_us: [S] int64, increasing, after the last frame and before `time_us`.
+            intensity: [H, W] the frame.
+            time_us: its time.
+        Raises:
+            DataError: as `push`.
+            ValueError: this is the first frame, or there is a budget of events.
+        """
+        if self.num_frames == 0 or self.max_events is not None:
+            raise ValueError("sensor: push_between needs a frame before, and no max_events")
+        times = np.append(drawn_us, np.int64(time_us))
+        values = _check_frames(
+            np.append(drawn.reshape(len(drawn_us), len(moving)), intensity.reshape(1, -1)[:, moving], axis=0)[:, None],
+            times, (len(moving), 1), self._last_t_us,
+        )[:, 0] if len(moving) else np.empty((len(times), 0), np.float64)  # fmt: skip
+        frame = _check_frames(intensity[None], times[-1:], self.sensor_size, self._last_t_us).reshape(-1)
+        if frame.dtype != self._frame.dtype:
+            frame, self._frame = frame.astype(np.float64), self._frame.astype(np.float64)
+        values = values.astype(frame.dtype, copy=False)
+        before, begin_us, count = self._frame[moving], float(self._last_t_us - self._first_t_us), 0
+        for one, end_us in zip(values, (times - self._first_t_us).astype(np.float64).tolist(), strict=True):
+            count = self._advance_chosen(before, one, moving, begin_us, end_us, count)
+            before, begin_us = one, end_us
+        others = np.ones(len(frame), bool)
+        others[moving] = False
+        (still,) = np.nonzero(others)
+        begin_us, end_us = (float(time - self._first_t_us) for time in (self._last_t_us, time_us))
+        count = self._advance_chosen(self._frame[still], frame[still], still, begin_us, end_us, count)
+        return self._join([self._sorted(frame, time_us, count)])[0]
+
+    def _advance_chosen(
+        self, before: np.ndarray, after: np.ndarray, chosen: np.ndarray, begin_us: float, end_us: float, count: int
+    ) -> int:
+        """Rows filled once those pixels have gone on."""
+        number = 0
+        while True:
+            number, count, needed = kernels.advance_chosen(
+                before, after, chosen, begin_us, end_us, self._traits, self._physics, self._state, number,
+                self._rows[0], self._rows[1], self._rows[2], count,
+            )  # fmt: skip
+            if number == len(chosen):
+                return count
+            self._rows = tuple(_enlarged(column, needed) for column in self._rows)
+
     def _start(self, frame: np.ndarray, time_us: int) -> None:
         settled = self.options.starts_settled
         kernels.start(frame, self._traits, self._physics, settled, self._seed, self._state)
@@ -163,6 +217,13 @@ class Sensor:
             if self.max_events is not None and self.num_events + needed > self.max_events:
                 break  # `push_exact` puts everything back
             self._rows = tuple(_enlarged(column, needed) for column in self._rows)
+        columns = self._sorted(frame, time_us, count)
+        self.num_events += needed - count
+        return columns
+
+    def _sorted(self, frame: np.ndarray, time_us: int, count: int) -> list[np.ndarray]:
+        """Columns of the rows that are filled, in the order of time; the frame is the last one from here on."""
+        begin_us = float(self._last_t_us - self._first_t_us)
         exact_us, pixels, polarity = (column[:count] for column in self._rows)
         span_us = time_us - self._last_t_us
         if span_us <= 4 * count + 4096:
@@ -176,7 +237,7 @@ class Sensor:
         )
         self._frame, self._last_t_us = frame.copy(), time_us
         self.num_frames += 1
-        self.num_events += needed
+        self.num_events += count
         return columns
 
     def _join(self, found: list[list[np.ndarray]]) -> tuple[Events, np.ndarray]:

@@ -141,6 +141,36 @@ def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exac
     return len(after), count, count
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def advance_chosen(
+    before, after, chosen, begin_us, end_us, traits, physics, state, number, exact_us, pixels, polarity, count
+):
+    """As `advance`, of the pixels `chosen` [K] alone.
+
+    `before` and `after` [K] are their intensities, and `number` is which of them to begin with. Returns as `advance`;
+    the first is K when all is done.
+    """
+    for k in range(number, len(chosen)):
+        i = chosen[k]
+        light_before, light = np.float64(before[k]), np.float64(after[k])
+        if light_before == light and end_us < state.due_us[i]:
+            continue
+        (knot_us, signal, lag, difference, allowance, sent_us, random, due), end = _advance_pixel(
+            light_before, light, _log_response(light, physics.log_floor), begin_us, end_us,
+            traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_noise_rate[i],
+            traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i],
+            state.allowance[i], state.sent_us[i], state.random[i], exact_us, polarity, count,
+        )  # fmt: skip
+        if end > len(exact_us):
+            return k, count, end
+        state.knot_us[i], state.signal[i], state.lag[i], state.difference[i] = knot_us, signal, lag, difference
+        state.allowance[i], state.sent_us[i], state.random[i], state.due_us[i] = allowance, sent_us, random, due
+        for row in range(count, end):
+            pixels[row] = i
+        count = end
+    return len(chosen), count, count
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _advance_pixel(
     light_before, light, response, begin_us, end_us, on, off, leak, shot, hot, physics, knot_us, signal, lag,

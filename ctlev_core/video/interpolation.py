@@ -22,6 +22,9 @@ VISIBLE = 2.0
 DISAGREEMENT = 12.0
 """Grey levels of 255 by which two moved frames may differ until half of a pixel fades."""
 GAMMA = 2.2
+STILL_PX = 0.25
+"""A pixel that moves less, and looks the same in both frames, is still."""
+ROW = 1024
 
 
 class Between(Protocol):
@@ -29,9 +32,11 @@ class Between(Protocol):
 
     displacement_px: float
     """The farthest that anything visible moves."""
+    moving: np.ndarray
+    """[K] int64 pixels, row by row, that do more between than change evenly from one frame to the other."""
 
     def at(self, share: float) -> np.ndarray:
-        """The frame [H, W] float32 at a share of the time between, 0 to 1."""
+        """[K] float32 light of the moving pixels at a share of the time between, 0 to 1."""
         ...
 
 
@@ -48,17 +53,15 @@ class Fading:
 
     def between(self, first: np.ndarray, second: np.ndarray) -> Between:
         """See `Interpolator`."""
-        return _Faded(first, second)
+        return _Faded()
 
 
 class _Faded:
     displacement_px = 0.0
-
-    def __init__(self, first: np.ndarray, second: np.ndarray) -> None:
-        self._first, self._second = first, second
+    moving = np.empty(0, np.int64)
 
     def at(self, share: float) -> np.ndarray:
-        return self._first + np.float32(share) * (self._second - self._first)
+        return np.empty(0, np.float32)
 
 
 class Flow:
@@ -71,7 +74,6 @@ class Flow:
         # variational refinement 14.7 in 18, coarser (`FAST`) 18.1 in 5; fading 20.8.
         self._search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._search.setVariationalRefinementIterations(0)
-        self._grid: tuple[np.ndarray, np.ndarray] | None = None
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     def between(self, first: np.ndarray, second: np.ndarray) -> Between:
@@ -82,15 +84,15 @@ class Flow:
         changed = np.abs(after.astype(np.int16) - before) > VISIBLE
         height, width = first.shape
         if not changed.any() or min(height, width) < 16:  # smaller ones have no pyramid
-            return _Faded(first, second)
-        if self._grid is None or self._grid[0].shape != first.shape:
-            x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-            self._grid = x, y
+            return _Faded()
         forward = self._search.calc(before, after, None)
         backward = self._search.calc(after, before, None)
         lengths = np.linalg.norm(forward, axis=2)[changed]
         moved = float(np.quantile(lengths, 0.99)) if len(lengths) else 0.0
-        return _Moved(first, second, forward, backward, moved, self._grid)
+        # An edge may pass a pixel that looks the same before and after: flow says so.
+        moves = np.maximum(np.linalg.norm(forward, axis=2), np.linalg.norm(backward, axis=2)) > STILL_PX
+        (moving,) = np.nonzero((changed | moves).reshape(-1))
+        return _Moved(first, second, forward, backward, moved, moving)
 
 
 class _Moved:
@@ -101,13 +103,17 @@ class _Moved:
         forward: np.ndarray,
         backward: np.ndarray,
         displacement_px: float,
-        grid: tuple[np.ndarray, np.ndarray],
+        moving: np.ndarray,
     ) -> None:
-        self._frames, self._flows, self._grid = (first, second), (forward, backward), grid
-        self.displacement_px = displacement_px
+        self.displacement_px, self.moving = displacement_px, moving
+        self._frames = first, second
+        self._flows = forward.reshape(-1, 2)[moving], backward.reshape(-1, 2)[moving]
+        self._ends = first.reshape(-1)[moving], second.reshape(-1)[moving]
+        width = first.shape[1]
+        self._places = np.stack([moving % width, moving // width], axis=-1).astype(np.float32)
 
     def at(self, share: float) -> np.ndarray:
-        first, second = self._frames
+        first, second = self._ends
         if share <= 0:
             return first
         if share >= 1:
@@ -115,20 +121,23 @@ class _Moved:
         forward, backward = self._flows
         rest = 1.0 - share
         # From the frame between to the first and to the second: Super SloMo, equation 4.
-        moved_first = self._move(first, -rest * share * forward + share * share * backward)
-        moved_second = self._move(second, rest * rest * forward - share * rest * backward)
+        moved_first = self._take(self._frames[0], -rest * share * forward + share * share * backward)
+        moved_second = self._take(self._frames[1], rest * rest * forward - share * rest * backward)
         moved = rest * moved_first + share * moved_second
         faded = rest * first + share * second
         differ = 255 * (_stored(moved_first) - _stored(moved_second)) / DISAGREEMENT
         trust = 1 / (1 + differ * differ)
         return (faded + trust * (moved - faded)).astype(np.float32)
 
-    def _move(self, frame: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    def _take(self, frame: np.ndarray, flow: np.ndarray) -> np.ndarray:
+        """[K] values of the frame where each pixel comes from."""
         import cv2
 
-        x, y = self._grid
-        flow = flow.astype(np.float32, copy=False)
-        return cv2.remap(frame, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        # A picture of any shape will do; OpenCV takes none of more than 32,767 columns.
+        places = np.zeros((-(-len(flow) // ROW), ROW, 2), np.float32)
+        places.reshape(-1, 2)[: len(flow)] = self._places + flow
+        taken = cv2.remap(frame, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        return taken.reshape(-1)[: len(flow)]
 
 
 def num_steps(displacement_px: float, max_displacement_px: float, max_steps: int) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -18,8 +18,6 @@ from data_contracts.events import Events, SensorSize
 Interpolation = Literal["flow", "fade"]
 MAX_STEPS = 200
 """Between two frames; so many are enough for 100 px."""
-STEPS_AT_ONCE = 16
-"""Frames between that are held at a time."""
 
 
 @dataclass
@@ -66,28 +64,27 @@ class VideoSimulation:
                     self.size = light.shape[1], light.shape[0]
                     camera = Sensor(self.size, self.sensor, sensor_seed=self.seed, seed=[self.seed, 1])
                     self.num_frames = self.num_drawn = self.num_events = 0
-                for times, drawn in self._drawn(last, t_us, light):
-                    events = camera.push(drawn, times)
-                    self.num_drawn += len(drawn)
-                    self.num_events += len(events)
-                    yield events
+                events = self._seen(camera, last, t_us, light)
+                self.num_events += len(events)
+                yield events
                 last, self.last_light, self.duration_us = (t_us, light), light, t_us
                 self.num_frames += 1
                 bar.update()
 
-    def _drawn(
-        self, last: tuple[int, np.ndarray] | None, t_us: int, light: np.ndarray
-    ) -> Iterable[tuple[np.ndarray, np.ndarray]]:
-        """Times and frames from after the last frame to this one, a few at a time."""
+    def _seen(self, camera: Sensor, last: tuple[int, np.ndarray] | None, t_us: int, light: np.ndarray) -> Events:
+        """The events from the last frame to this one."""
         if last is None or self.frames.is_dense:
-            yield np.array([t_us], np.int64), light[None]
-            return
+            self.num_drawn += 1
+            return camera.push(light[None], np.array([t_us], np.int64))
         between = self.interpolator.between(last[1], light)
         steps = num_steps(between.displacement_px, self.max_displacement_px, min(MAX_STEPS, t_us - last[0]))
-        for first in range(1, steps + 1, STEPS_AT_ONCE):
-            shares = np.arange(first, min(first + STEPS_AT_ONCE, steps + 1)) / steps
-            times = last[0] + np.rint(shares * (t_us - last[0])).astype(np.int64)
-            yield times, np.stack([light if share == 1 else between.at(float(share)) for share in shares])
+        shares = np.arange(1, steps) / steps
+        times = last[0] + np.rint(shares * (t_us - last[0])).astype(np.int64)
+        self.num_drawn += steps
+        drawn = np.empty((steps - 1, len(between.moving)), np.float32)
+        for row, share in enumerate(shares.tolist()):
+            drawn[row] = between.at(share)
+        return camera.push_between(between.moving, drawn, times, light, t_us)
 
 
 def interpolator_of(name: Interpolation) -> Interpolator:

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from moving_scene import SIZE, SPEED_PX_S, frames, light, share_found
 
-from ctlev_core.sensor.dvs_pixel import PRESETS, join, simulate_events
+from ctlev_core.sensor.dvs_pixel import PRESETS, Sensor, join, simulate_events
 from ctlev_core.video.frames import FrameOptions, Frames
 from ctlev_core.video.interpolation import Fading, Flow, num_steps
 from ctlev_core.video.simulation import VideoSimulation
+from data_contracts.errors import DataError
 
 INTERVAL_S = 1 / 60
 
@@ -27,13 +28,21 @@ def simulate(times, pictures, **more):
     return join(chunks, SIZE)
 
 
+def draw(between, first, second, share):
+    """The whole frame at a share of the time."""
+    frame = (1 - share) * first + share * second
+    values = between.at(share)
+    assert values.dtype == np.float32 and values.shape == between.moving.shape
+    frame.reshape(-1)[between.moving] = values
+    return frame
+
+
 def test_flow_draws_what_is_between_nearer_than_fading():
     first, second, truth = light(0), light(INTERVAL_S), light(INTERVAL_S / 2)
     inside = (slice(8, -8), slice(10, -10))
     errors = {}
     for interpolator in (Flow(), Fading()):
-        drawn = interpolator.between(first, second).at(0.5)
-        assert drawn.dtype == np.float32 and drawn.shape == first.shape
+        drawn = draw(interpolator.between(first, second), first, second, 0.5)
         errors[type(interpolator).__name__] = float(np.sqrt(np.mean((drawn - truth)[inside] ** 2)))
     assert errors["Flow"] < 0.35 * errors["Fading"]
 
@@ -47,8 +56,8 @@ def test_flow_measures_how_far_things_move():
 def test_both_ends_are_the_frames_themselves(interpolator):
     first, second = light(0), light(INTERVAL_S)
     between = interpolator.between(first, second)
-    np.testing.assert_array_equal(between.at(0.0), first)
-    np.testing.assert_allclose(between.at(1.0), second, atol=1e-6)
+    for share, frame in ((0.0, first), (1.0, second)):
+        np.testing.assert_array_equal(between.at(share), frame.reshape(-1)[between.moving])
 
 
 def test_where_nothing_moves_nothing_is_drawn():
@@ -56,7 +65,7 @@ def test_where_nothing_moves_nothing_is_drawn():
     assert Flow().between(still, still.copy()).displacement_px == 0
     # A lamp that is turned up is no movement, as far as flow can tell; the levels between are those of a fade.
     dark, bright = np.full((40, 40), 0.2, np.float32), np.full((40, 40), 0.4, np.float32)
-    np.testing.assert_allclose(Flow().between(dark, bright).at(0.5), 0.3, atol=0.01)
+    np.testing.assert_allclose(draw(Flow().between(dark, bright), dark, bright, 0.5), 0.3, atol=0.01)
 
 
 def test_tiny_pictures_fade():
@@ -85,6 +94,52 @@ def test_events_of_a_dense_video_are_those_of_the_sensor_alone():
     events = simulate(times, dense, seed=3, interpolator=Fading())
     for name in "txyp":
         np.testing.assert_array_equal(getattr(events, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("kind", ["ideal", "noisy"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_frame_with_some_pixels_seen_between_is_as_all_frames_pushed(kind, dtype):
+    rng = np.random.default_rng(5)
+    times = np.array([0, 900, 2500, 4000, 9000, 30_000], np.int64)
+    first, last = rng.uniform(0.05, 1, (2, *SIZE[::-1])).astype(dtype)
+    moving = np.sort(rng.choice(first.size, 500, replace=False))
+    # Others change linearly: light, not its logarithm, which the sensor joins; so they stay as they are here.
+    last.reshape(-1)[np.setdiff1d(np.arange(first.size), moving)] = np.delete(first.reshape(-1), moving)
+    pushed = np.repeat(first[None], len(times), axis=0)
+    drawn = rng.uniform(0.05, 1, (4, 500)).astype(dtype)
+    pushed[1:5].reshape(4, -1)[:, moving] = drawn
+    pushed[5] = last
+    whole, some = (Sensor(SIZE, PRESETS[kind], sensor_seed=1, seed=[2]) for _ in range(2))
+    expected = whole.push(pushed, times)
+    some.push(first[None], times[:1])
+    found = some.push_between(moving, drawn, times[1:5], last, int(times[5]))
+    assert len(found) == len(expected) > 1000 and some.num_events == len(found)
+    for events in (found, expected):
+        assert (np.diff(events.t) >= 0).all()
+    order = [np.lexsort((one.p, one.x, one.y, one.t)) for one in (found, expected)]
+    for name in "txyp":
+        np.testing.assert_array_equal(getattr(found, name)[order[0]], getattr(expected, name)[order[1]])
+    # And both go on alike.
+    again = (np.array([31_000], np.int64), first[None])
+    after = [sensor.push(again[1], again[0]) for sensor in (whole, some)]
+    for name in "txyp":
+        np.testing.assert_array_equal(getattr(after[0], name), getattr(after[1], name))
+
+
+def test_pixels_seen_between_are_checked():
+    sensor = Sensor((3, 2), PRESETS["ideal"], sensor_seed=0, seed=0)
+    frame, moving, times = np.full((2, 3), 0.5), np.array([1, 4]), np.array([10], np.int64)
+    with pytest.raises(ValueError, match="needs a frame before"):
+        sensor.push_between(moving, np.ones((1, 2)), times, frame, 20)
+    sensor.push(frame[None], np.array([0], np.int64))
+    for drawn, drawn_us, last, message in (
+        (np.array([[1.0, np.nan]]), times, frame, "finite and not negative"),
+        (np.ones((1, 2)), np.array([30], np.int64), frame, "must increase"),
+        (np.ones((1, 2)), times, -frame, "finite and not negative"),
+    ):
+        with pytest.raises(DataError, match=message):
+            sensor.push_between(moving, drawn, drawn_us, last, 20)
+    assert len(sensor.push_between(moving, np.array([[2.0, 0.1]]), times, frame, 20)) > 0
 
 
 def test_a_simulation_counts_and_can_be_repeated():
