@@ -72,7 +72,7 @@ class Flow:
 
         # On video of people at 346 x 260 px, frames left out are drawn with an error of 14.3 of 255 in 12 ms; with its
         # variational refinement 14.7 in 18, coarser (`FAST`) 18.1 in 5; fading 20.8.
-        self._search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._search.setVariationalRefinementIterations(0)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -85,8 +85,8 @@ class Flow:
         height, width = first.shape
         if not changed.any() or min(height, width) < 16:  # smaller ones have no pyramid
             return _Faded()
-        forward = self._search.calc(before, after, None)
-        backward = self._search.calc(after, before, None)
+        forward = self._search.calc(before, after, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        backward = self._search.calc(after, before, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
         lengths = np.linalg.norm(forward, axis=2)[changed]
         moved = float(np.quantile(lengths, 0.99)) if len(lengths) else 0.0
         # An edge may pass a pixel that looks the same before and after: flow says so.
@@ -136,7 +136,8 @@ class _Moved:
         # A picture of any shape will do; OpenCV takes none of more than 32,767 columns.
         places = np.zeros((-(-len(flow) // ROW), ROW, 2), np.float32)
         places.reshape(-1, 2)[: len(flow)] = self._places + flow
-        taken = cv2.remap(frame, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        x, y = places[..., 0].copy(), places[..., 1].copy()
+        taken = cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return taken.reshape(-1)[: len(flow)]
 
 

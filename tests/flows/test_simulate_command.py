@@ -44,7 +44,7 @@ def test_a_video_becomes_events_and_a_preview(video, tmp_path):
         assert np.median(x[t < 60_000]) == pytest.approx(start + 3, abs=4)
         assert np.median(x[t > 300_000]) == pytest.approx(start + 30, abs=4)
     picture = cv2.imread(str(tmp_path / "a.png"))
-    assert picture.shape == (96, 6 * 64, 3)
+    assert picture is not None and picture.shape == (96, 6 * 64, 3)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.parquet", "a.png"]
 
 
