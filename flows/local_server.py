@@ -48,8 +48,8 @@ _SERVER = {
     # One at a time, as Prefect does it, few task runs of a quick flow are recorded before the server ends with it.
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_BATCH_SIZE": "50",
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_FLUSH_INTERVAL": "1",
-    # Nobody reads events of a server that ends with its script, and SQLite has one writer at a time: where thousands of
-    # stages are cached, storing each event with its resources kept requests waiting until they were given up.
+    # Nobody reads events of a server that ends with its script, and SQLite has one writer at a time: each event stored
+    # with its resources is a write that requests wait for. A study of 3,000 cached stages was given up so.
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "false",
     "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
 }

@@ -71,7 +71,7 @@ class Flow:
         import cv2
 
         # On video of people at 346 x 260 px, frames left out are drawn with an error of 14.3 of 255 in 12 ms; with its
-        # variational refinement 14.7 in 18, coarser (`FAST`) 18.1 in 5; fading 20.8.
+        # variational refinement 14.7 in 18, coarser (`FAST`) 18.1 in 5 (one clip, two cores busy).
         self._search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._search.setVariationalRefinementIterations(0)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
