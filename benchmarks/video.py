@@ -44,7 +44,7 @@ class SceneFrames(Frames):
 
     def __init__(self, rate_hz: float, duration_s: float = 0.5) -> None:
         self.times = np.rint(np.arange(0, duration_s + 1e-9, 1 / rate_hz) * 1e6).astype(np.int64)
-        self.num_skipped, self.expected, self.size = 0, len(self.times), SIZE
+        self.expected = len(self.times)
 
     def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         for t_us in self.times.tolist():

@@ -39,8 +39,6 @@ _QUIET = {
     "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
     "PREFECT_CLI_PROMPT": "false",
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
-    # A server on SQLite answers 503 after a minute of waiting for its turn to write; the default is five further tries.
-    "PREFECT_CLIENT_MAX_RETRIES": "20",
 }
 _SERVER = {
     "PREFECT_UI_ENABLED": "0",
@@ -74,7 +72,13 @@ def configure(home: Path, *, verbose: bool) -> None:
         (home / "prefect").mkdir(parents=True, exist_ok=True)
         for path in (home / "prefect").glob("prefect.db*"):  # made by earlier versions for all to read
             path.chmod(0o600)
-    settings = {"PREFECT_HOME": str(home / "prefect"), "PREFECT_LOGGING_LEVEL": "INFO" if verbose else "CRITICAL"}
+    settings = {
+        "PREFECT_HOME": str(home / "prefect"),
+        "PREFECT_LOGGING_LEVEL": "INFO" if verbose else "CRITICAL",
+        # A server on SQLite answers 503 after a minute of waiting for its turn to write. By default a question is asked
+        # 5 times more, each pause twice as long: a minute of pauses. With 8 they are 9 minutes, with 20 days.
+        "PREFECT_CLIENT_MAX_RETRIES": "8",
+    }
     for name, value in {**_QUIET, **settings}.items():
         os.environ.setdefault(name, value)
     # Where there is a proxy to the world outside, it knows nothing of a server on this machine.

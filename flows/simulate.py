@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +13,6 @@ from ctlev_core.duration_text import duration_text
 from ctlev_core.plugin_contracts import FormatWithWriter
 from ctlev_core.plugins import PluginError
 from data_contracts.errors import DataError
-from data_contracts.events import Events
 
 if TYPE_CHECKING:
     from ctlev_core.video.frames import FrameOptions
@@ -25,14 +23,14 @@ if TYPE_CHECKING:
 class SimulateOptions:
     """What a person asked of `ctlev simulate`; see its help."""
 
-    sensor: str = "noisy"
-    noise: float = 1.0
-    interpolation: Interpolation = "flow"
-    max_displacement_px: float = 1.0
-    seed: int = 0
-    format: str = ""
-    preview: Path | None = None
-    overwrite: bool = False
+    sensor: str
+    noise: float
+    interpolation: Interpolation
+    max_displacement_px: float
+    seed: int
+    format: str
+    preview: Path | None
+    overwrite: bool
 
 
 def simulate_file(source: Path, output: Path, frames: FrameOptions, options: SimulateOptions) -> int:
@@ -44,9 +42,10 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
     started = time.perf_counter()
     partial = output.with_name(f".partial-{output.name}")
     try:
-        name, writer = find_writer(output, options.format)
+        name = find_writer(output, options.format)
         for path in filter(None, (output, options.preview)):
             _check_free(path, overwrite=options.overwrite)
+        from ctlev_core.events.files import write_event_chunks
         from ctlev_core.sensor.choice import read_sensor
         from ctlev_core.video.frames import open_frames
         from ctlev_core.video.preview import Preview
@@ -59,13 +58,13 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
             interpolator=interpolator_of(options.interpolation),
             max_displacement_px=options.max_displacement_px,
         )
-        preview = Preview(simulation, simulation.frames.expected)
+        preview = Preview(simulation) if options.preview is not None else None
         try:
-            _write(partial, preview.watch(iter(simulation)), name, writer)
+            write_event_chunks(partial, simulation if preview is None else preview.watch(), name)
             partial.replace(output)
         finally:
             partial.unlink(missing_ok=True)
-        if options.preview is not None:
+        if preview is not None and options.preview is not None:
             preview.write(options.preview)
     except (DataError, PluginError, ValueError, OSError) as error:
         print(f"error: {str(error).replace(str(partial), str(output))}", file=sys.stderr)
@@ -84,8 +83,8 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
     return 0
 
 
-def find_writer(output: Path, name: str = "") -> tuple[str, FormatWithWriter]:
-    """The format to write, by its name or by the suffix of the file.
+def find_writer(output: Path, name: str = "") -> str:
+    """The name of the format to write, as asked for or by the suffix of the file.
 
     Raises:
         PluginError: no such format, or none with that suffix.
@@ -98,14 +97,14 @@ def find_writer(output: Path, name: str = "") -> tuple[str, FormatWithWriter]:
     if name:
         if not writers:
             raise PluginError(f"format {name!r} is read only")
-        return name, writers[name]
+        return name
     suffix = output.suffix.lower()
     found = [one for one, module in writers.items() if suffix in module.SUFFIXES]
     if not found:
         known = ", ".join(f"{one} ({', '.join(module.SUFFIXES)})" for one, module in writers.items())
         raise PluginError(f"{output}: no format is written with the suffix {suffix!r}; known: {known}")
     # Formats that share a suffix: the newest of them, which comes last by name (.raw is EVT3).
-    return found[-1], writers[found[-1]]
+    return found[-1]
 
 
 def _check_free(path: Path, *, overwrite: bool) -> None:
@@ -115,14 +114,3 @@ def _check_free(path: Path, *, overwrite: bool) -> None:
         raise DataError(f"{path}: is there already; --overwrite replaces it")
     if path.is_dir():
         raise DataError(f"{path}: is a folder")
-
-
-def _write(path: Path, chunks: Iterable[Events], name: str, writer: FormatWithWriter) -> None:
-    """Parquet chunk by chunk; other formats write a recording as a whole, which must fit into memory."""
-    from ctlev_core.events.decoding import event_chunks
-    from ctlev_core.formats import parquet
-
-    if name == "parquet":
-        parquet.write_chunks(path, chunks)
-        return
-    writer.write(path, event_chunks.concatenate(chunks))

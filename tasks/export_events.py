@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,7 @@ def export_events(
     else:
         for number, events in enumerate(streams):
             path = folder / f"{number:06d}{_suffix(export.format, writer)}"
-            _write(path, [events], export.format, writer)
+            event_files.write_event_chunks(path, [events], export.format)
             rows[number] |= _place(path, events, 0)
     table = pa.Table.from_pylist(rows)
     for name in ("sample_id", "class_name", "joint_set", *LABEL_COLUMNS.values()):
@@ -194,7 +194,7 @@ def _write_together(
             event_start += len(events)
             yield moved
 
-    _write(path, shifted(), export.format, writer)
+    event_files.write_event_chunks(path, shifted(), export.format)
 
 
 def _place(path: Path, events: Events, event_start: int) -> dict[str, Any]:
@@ -213,11 +213,3 @@ def _suffix(name: str, writer: FormatWithWriter) -> str:
     """The format's own suffix: where several formats share one, that with its name."""
     own = f".{name}"
     return own if own in writer.SUFFIXES else writer.SUFFIXES[0]
-
-
-def _write(path: Path, chunks: Iterable[Events], name: str, writer: FormatWithWriter) -> None:
-    """Parquet chunk by chunk; other formats write a recording as a whole, which must fit into memory."""
-    if name == "parquet":
-        event_files.write_event_chunks_parquet(path, chunks)
-        return
-    writer.write(path, event_chunks.concatenate(chunks))

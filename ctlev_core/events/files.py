@@ -76,6 +76,20 @@ def write_events_parquet(path: Path, events: Events) -> None:
     write_event_chunks_parquet(path, [events])
 
 
+def write_event_chunks(path: Path, chunks: Iterable[Events], name: str) -> None:
+    """Write a recording that comes in chunks in the format of a name.
+
+    Parquet is written chunk by chunk; other formats as a whole, which must fit into memory.
+
+    Raises:
+        DataError: the chunks break `check_events` or do not join, or the format cannot hold them.
+    """
+    if name == "parquet":
+        write_event_chunks_parquet(path, chunks)
+    else:
+        plugins.load("formats", name).write(path, event_chunks.concatenate(chunks))
+
+
 def write_event_chunks_parquet(path: Path, chunks: Iterable[Events]) -> Summary:
     """Write a recording that comes in chunks in the project's own format, in memory that does not grow with it.
 

@@ -146,8 +146,8 @@ class Sensor:
     ) -> Events:
         """The events from the last frame pushed before to one more, of which some pixels are known in between too.
 
-        The same as `push` of all frames in between, if in those every other pixel changes linearly; but it costs no
-        time for them. Events of one microsecond are in any order, always the same.
+        The same as `push` of all frames in between, if in those the logarithm of every other pixel changes linearly;
+        but others are looked at once. The order of events of one microsecond may differ.
 
         Args:
             moving: [K] int64 pixels, row by row of the frame, ascending.
@@ -162,13 +162,13 @@ class Sensor:
         if self.num_frames == 0 or self.max_events is not None:
             raise ValueError("sensor: push_between needs a frame before, and no max_events")
         times = np.append(drawn_us, np.int64(time_us))
-        values = _check_frames(
-            np.append(drawn.reshape(len(drawn_us), len(moving)), intensity.reshape(1, -1)[:, moving], axis=0)[:, None],
-            times, (len(moving), 1), self._last_t_us,
-        )[:, 0] if len(moving) else np.empty((len(times), 0), np.float64)  # fmt: skip
-        frame = _check_frames(intensity[None], times[-1:], self.sensor_size, self._last_t_us).reshape(-1)
-        if frame.dtype != self._frame.dtype:
-            frame, self._frame = frame.astype(np.float64), self._frame.astype(np.float64)
+        if drawn.size == 0:
+            return self.push(intensity[None], times[-1:])
+        frame = self._like_the_last(
+            _check_frames(intensity[None], times[-1:], self.sensor_size, self._last_t_us).reshape(-1)
+        )
+        values = np.vstack([drawn, frame[moving]])
+        values = _check_frames(values[:, None], times, (len(moving), 1), self._last_t_us)[:, 0]
         values = values.astype(frame.dtype, copy=False)
         before, begin_us, count = self._frame[moving], float(self._last_t_us - self._first_t_us), 0
         for one, end_us in zip(values, (times - self._first_t_us).astype(np.float64).tolist(), strict=True):
@@ -179,6 +179,7 @@ class Sensor:
         (still,) = np.nonzero(others)
         begin_us, end_us = (float(time - self._first_t_us) for time in (self._last_t_us, time_us))
         count = self._advance_chosen(self._frame[still], frame[still], still, begin_us, end_us, count)
+        self.num_events += count
         return self._join([self._sorted(frame, time_us, count)])[0]
 
     def _advance_chosen(
@@ -204,8 +205,7 @@ class Sensor:
     def _advance(self, frame: np.ndarray, time_us: int) -> list[np.ndarray]:
         """Columns t, x, y, p and exact times of the events since the last frame."""
         begin_us, end_us = (float(time - self._first_t_us) for time in (self._last_t_us, time_us))
-        if frame.dtype != self._frame.dtype:
-            frame, self._frame = frame.astype(np.float64), self._frame.astype(np.float64)
+        frame = self._like_the_last(frame)
         pixel, count = 0, 0
         while True:
             pixel, count, needed = kernels.advance(
@@ -217,9 +217,14 @@ class Sensor:
             if self.max_events is not None and self.num_events + needed > self.max_events:
                 break  # `push_exact` puts everything back
             self._rows = tuple(_enlarged(column, needed) for column in self._rows)
-        columns = self._sorted(frame, time_us, count)
-        self.num_events += needed - count
-        return columns
+        self.num_events += needed
+        return self._sorted(frame, time_us, count)
+
+    def _like_the_last(self, frame: np.ndarray) -> np.ndarray:
+        """The frame in the dtype of the last one; where they differ, both in float64 from here on."""
+        if frame.dtype != self._frame.dtype:
+            frame, self._frame = frame.astype(np.float64), self._frame.astype(np.float64)
+        return frame
 
     def _sorted(self, frame: np.ndarray, time_us: int, count: int) -> list[np.ndarray]:
         """Columns of the rows that are filled, in the order of time; the frame is the last one from here on."""
@@ -237,7 +242,6 @@ class Sensor:
         )
         self._frame, self._last_t_us = frame.copy(), time_us
         self.num_frames += 1
-        self.num_events += count
         return columns
 
     def _join(self, found: list[list[np.ndarray]]) -> tuple[Events, np.ndarray]:

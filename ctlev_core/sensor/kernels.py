@@ -148,7 +148,8 @@ def advance_chosen(
     """As `advance`, of the pixels `chosen` [K] alone.
 
     `before` and `after` [K] are their intensities, and `number` is which of them to begin with. Returns as `advance`;
-    the first is K when all is done.
+    the first is K when all is done. Its step stands here once more: shared through an inlined function, `advance` took
+    2.5 times as long.
     """
     for k in range(number, len(chosen)):
         i = chosen[k]

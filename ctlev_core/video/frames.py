@@ -12,6 +12,7 @@ BT.709).
 
 from __future__ import annotations
 
+import abc
 import math
 import re
 from collections.abc import Iterator
@@ -67,34 +68,70 @@ class FrameOptions:
                 raise ValueError(str(error)) from None
 
 
-class Frames:
+class Frames(abc.ABC):
     """Frames one after the other, in memory of one; iterating again reads them again.
 
     Attributes:
-        path: where from.
-        size: (width, height) px; known once the first frame was read.
-        expected: number of frames as the file says; 0 = it does not.
+        expected: number of frames as the source says; 0 = it does not.
         is_dense: so close together that nothing need be drawn between two.
         num_skipped: frames whose time is not after that of the frame before; counted while iterating.
     """
 
+    expected = 0
     is_dense = False
+    num_skipped = 0
 
-    def __init__(self, path: Path, options: FrameOptions, expected: int) -> None:
-        self.path, self.options, self.expected = path, options, expected
-        self.size: SensorSize | None = options.size
-        self.num_skipped = 0
-        self._light = (np.arange(256) / 255).astype(np.float32) ** np.float32(options.gamma)
-        self._stored: tuple[int, int] | None = None
-
+    @abc.abstractmethod
     def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         """Times in us of life from the first frame on, and linear light [H, W] float32, white = 1.
 
         Raises:
             DataError: a frame that cannot be read, frames of different sizes, or fewer than two of them.
         """
+
+
+class _Light:
+    """From pixels as they are stored to light on the sensor."""
+
+    def __init__(self, path: Path, options: FrameOptions) -> None:
+        self._path, self._gamma, self._size = path, np.float32(options.gamma), options.size
+        self._of_bytes = (np.arange(256) / 255).astype(np.float32) ** self._gamma
+        self._stored: tuple[int, int] | None = None
+
+    def of(self, stored: np.ndarray, number: int) -> np.ndarray:
+        """Light [height, width] float32 of the frame of a number, [H, W, 3] in blue, green, red."""
+        import cv2
+
+        shape = stored.shape[:2]
+        if self._stored is not None and shape != self._stored:
+            raise DataError(
+                f"{self._path}: frames must have one size, got {shape[1]} x {shape[0]} px at frame {number} after "
+                f"{self._stored[1]} x {self._stored[0]}"
+            )
+        self._stored = shape
+        if self._size is None:
+            self._size = check_sensor_size((shape[1], shape[0]), str(self._path))
+        stored = _cover(stored, self._size)
+        if stored.dtype == np.uint8:
+            light = cv2.LUT(stored, self._of_bytes)
+        elif stored.dtype == np.uint16:
+            light = (stored.astype(np.float32) / 65535) ** self._gamma
+        else:
+            light = stored.astype(np.float32)
+            if not np.isfinite(light).all() or light.min() < 0:
+                raise DataError(f"{self._path}: light must be finite and not negative, it is not in frame {number}")
+        return cv2.transform(light, _LUMINANCE_BGR)
+
+
+class _StoredFrames(Frames):
+    """Frames with a time each."""
+
+    def __init__(self, path: Path, options: FrameOptions, expected: int) -> None:
+        self.path, self.options, self.expected = path, options, expected
+
+    def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         options, first_s, last_us, count = self.options, None, -1, 0
-        self.num_skipped, self._stored = 0, None
+        self.num_skipped, light = 0, _Light(self.path, options)
         for time_s, stored in self._read():
             if time_s < options.start_s:
                 continue
@@ -106,44 +143,26 @@ class Frames:
                 self.num_skipped += 1
                 continue
             last_us, count = t_us, count + 1
-            yield t_us, self._to_light(stored, count - 1)
+            yield t_us, light.of(stored, count - 1)
         if count < 2:
             stretch = "" if options.stop_s is None and not options.start_s else " in this stretch"
             raise DataError(f"{self.path}: expected two frames or more at different times{stretch}, got {count}")
 
+    @abc.abstractmethod
     def _read(self) -> Iterator[tuple[float, np.ndarray]]:
-        """Times in s, and frames as they are stored."""
-        raise NotImplementedError
+        """Times in s, and frames as they are stored, [H, W, 3]."""
 
-    def _to_light(self, stored: np.ndarray, number: int) -> np.ndarray:
+
+class _VideoFile(_StoredFrames):
+    def __init__(self, path: Path, options: FrameOptions) -> None:
         import cv2
 
-        shape = stored.shape[:2]
-        if self._stored is not None and shape != self._stored:
-            raise DataError(
-                f"{self.path}: frames must have one size, got {shape[1]} x {shape[0]} px at frame {number} after "
-                f"{self._stored[1]} x {self._stored[0]}"
-            )
-        self._stored = shape
-        if self.size is None:
-            self.size = check_sensor_size((shape[1], shape[0]), str(self.path))
-        stored = _cover(stored, self.size)
-        if stored.ndim == 3 and stored.shape[2] == 4:
-            stored = stored[..., :3]
-        if stored.dtype == np.uint8:
-            light = cv2.LUT(np.ascontiguousarray(stored), self._light)
-        elif stored.dtype == np.uint16:
-            light = (stored.astype(np.float32) / 65535) ** np.float32(self.options.gamma)
-        else:
-            light = stored.astype(np.float32)
-            if not np.isfinite(light).all() or light.min() < 0:
-                raise DataError(f"{self.path}: light must be finite and not negative, it is not in frame {number}")
-        if light.ndim == 3:
-            light = cv2.transform(light, _LUMINANCE_BGR) if light.shape[2] == 3 else light[..., 0]
-        return np.ascontiguousarray(light.reshape(self.size[1], self.size[0]))
+        capture = _open(path)
+        expected = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        capture.release()
+        is_whole = options.stop_s is None and math.isfinite(expected) and expected > 0
+        super().__init__(path, options, int(expected) if is_whole else 0)
 
-
-class _VideoFile(Frames):
     def _read(self) -> Iterator[tuple[float, np.ndarray]]:
         import cv2
 
@@ -175,7 +194,7 @@ class _VideoFile(Frames):
             )
 
 
-class _PictureFolder(Frames):
+class _PictureFolder(_StoredFrames):
     def __init__(self, path: Path, options: FrameOptions) -> None:
         self._paths, self._times_s = _list_folder(path, options.fps)
         super().__init__(path, options, len(self._paths))
@@ -191,24 +210,25 @@ class _StillPicture(Frames):
     is_dense = True
 
     def __init__(self, path: Path, options: FrameOptions, max_displacement_px: float) -> None:
-        self._picture = _read_picture(path)
-        self.size = options.size or (self._picture.shape[1], self._picture.shape[0])
-        scale = min(self.size) / NMNIST_SIDE_PX
+        self._light = _Light(path, options).of(_read_picture(path), 0)
+        scale = min(self._light.shape) / NMNIST_SIDE_PX
         path_px = tuple((scale * x, scale * y) for x, y in NMNIST_PATH_PX)
         self._times_us, self._moved_px = path_frames(NMNIST_PATH_US, path_px, max_displacement_px)
-        super().__init__(path, options, len(self._times_us))
+        self.expected = len(self._times_us)
 
     def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         import cv2
 
-        light = self._to_light(self._picture, 0)
-        assert self.size is not None
+        size = self._light.shape[::-1]
         for t_us, (right, down) in zip(self._times_us.tolist(), self._moved_px.tolist(), strict=True):
             moved = np.array([[1, 0, right], [0, 1, down]], np.float64)
-            yield (
-                t_us,
-                cv2.warpAffine(light, moved, self.size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-            )
+            light = cv2.warpAffine(self._light, moved, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            yield t_us, light
+
+
+def grey_levels(light: np.ndarray) -> np.ndarray:
+    """uint8 as a picture of that light would be stored: what people see."""
+    return np.rint(255 * np.clip(light, 0, 1) ** (1 / GAMMA)).astype(np.uint8)
 
 
 def open_frames(path: Path, options: FrameOptions, max_displacement_px: float = 1.0) -> Frames:
@@ -227,13 +247,7 @@ def open_frames(path: Path, options: FrameOptions, max_displacement_px: float = 
         raise DataError(f"{path}: expected a video, a folder of pictures or a picture, got nothing there")
     if path.suffix.lower() in PICTURE_SUFFIXES:
         return _StillPicture(path, options, max_displacement_px)
-    import cv2
-
-    capture = _open(path)
-    expected = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-    capture.release()
-    is_whole = options.stop_s is None and math.isfinite(expected) and expected > 0
-    return _VideoFile(path, options, int(expected) if is_whole else 0)
+    return _VideoFile(path, options)
 
 
 def _open(path: Path):

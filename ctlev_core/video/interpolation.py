@@ -17,11 +17,12 @@ from typing import Protocol
 
 import numpy as np
 
+from ctlev_core.video.frames import grey_levels
+
 VISIBLE = 2.0
 """Grey levels of 255 by which a pixel must change so that its flow counts as movement."""
 DISAGREEMENT = 12.0
 """Grey levels of 255 by which two moved frames may differ until half of a pixel fades."""
-GAMMA = 2.2
 STILL_PX = 0.25
 """A pixel that moves less, and looks the same in both frames, is still."""
 ROW = 1024
@@ -78,8 +79,8 @@ class Flow:
 
     def between(self, first: np.ndarray, second: np.ndarray) -> Between:
         """See `Interpolator`."""
-        before = self._last[1] if self._last is not None and self._last[0] is first else _grey(first)
-        after = _grey(second)
+        before = self._last[1] if self._last is not None and self._last[0] is first else grey_levels(first)
+        after = grey_levels(second)
         self._last = second, after
         changed = np.abs(after.astype(np.int16) - before) > VISIBLE
         height, width = first.shape
@@ -148,8 +149,3 @@ def num_steps(displacement_px: float, max_displacement_px: float, max_steps: int
 
 def _stored(light: np.ndarray) -> np.ndarray:
     return np.sqrt(np.clip(light, 0, 1))
-
-
-def _grey(light: np.ndarray) -> np.ndarray:
-    """As stored in 8 bits: flow is found in what people see."""
-    return np.rint(255 * np.clip(light, 0, 1) ** (1 / GAMMA)).astype(np.uint8)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ctlev_core.video.frames import grey_levels
 from ctlev_core.video.simulation import VideoSimulation
 from data_contracts.events import Events
 
@@ -16,32 +17,23 @@ FULL_SCALE = 3
 
 
 class Preview:
-    """Gathers what it shows while the events go by.
+    """Gathers what it shows while events go by: frames evenly over the video, or the first ones if it says no end."""
 
-    Args:
-        simulation: what sends them.
-        num_frames: of the video; with 0 the first frames are shown.
-    """
-
-    def __init__(self, simulation: VideoSimulation, num_frames: int) -> None:
+    def __init__(self, simulation: VideoSimulation) -> None:
         self._simulation = simulation
-        last = max(num_frames - 2, COLUMNS - 1)
+        last = max(simulation.frames.expected - 2, COLUMNS - 1)
         self._shown = set(np.linspace(0, last, COLUMNS).astype(int).tolist())
         self._columns: list[tuple[np.ndarray, np.ndarray]] = []
-        self._interval = -1
 
-    def watch(self, chunks: Iterator[Events]) -> Iterator[Events]:
-        """Hand the events on."""
-        for events in chunks:
-            # Events that come while n frames are finished lie between frame n - 1 and frame n.
-            interval = self._simulation.num_frames - 1
-            if interval in self._shown and self._simulation.last_light is not None:
-                if interval != self._interval:
-                    light = self._simulation.last_light
-                    grey = np.rint(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8)
-                    self._columns.append((grey, np.zeros((2, *light.shape), np.int64)))
-                    self._interval = interval
-                np.add.at(self._columns[-1][1], (events.p, events.y, events.x), 1)
+    def watch(self) -> Iterator[Events]:
+        """The events of the simulation."""
+        for events in self._simulation:
+            # Those that come while n frames are finished lie between frame n - 1 and frame n.
+            light = self._simulation.last_light
+            if light is not None and self._simulation.num_frames - 1 in self._shown:
+                counts = np.zeros((2, *light.shape), np.int64)
+                np.add.at(counts, (events.p, events.y, events.x), 1)
+                self._columns.append((grey_levels(light), counts))
             yield events
 
     def write(self, path: Path) -> None:

@@ -30,7 +30,7 @@ class VideoSimulation:
         seed: of the pixels' mismatch and of noise.
         interpolator: what lies between two frames.
         max_displacement_px: the farthest that anything moves between two drawn frames.
-            last_light: [H, W] the frame that the latest events follow.
+        last_light: [H, W] the frame that the latest events follow.
         size, num_frames, num_drawn, num_events, duration_us: what has been seen, known while iterating.
     """
 
@@ -57,29 +57,30 @@ class VideoSimulation:
             DataError: see `ctlev_core.video.frames.open_frames`.
         """
         camera: Sensor | None = None
-        last: tuple[int, np.ndarray] | None = None
+        self.last_light, self.duration_us = None, 0
         with ProgressBar(desc="simulate", total=self.frames.expected or None, unit="frame") as bar:
             for t_us, light in self.frames:
                 if camera is None:
                     self.size = light.shape[1], light.shape[0]
                     camera = Sensor(self.size, self.sensor, sensor_seed=self.seed, seed=[self.seed, 1])
                     self.num_frames = self.num_drawn = self.num_events = 0
-                events = self._seen(camera, last, t_us, light)
+                events = self._seen(camera, t_us, light)
                 self.num_events += len(events)
                 yield events
-                last, self.last_light, self.duration_us = (t_us, light), light, t_us
+                self.last_light, self.duration_us = light, t_us
                 self.num_frames += 1
                 bar.update()
 
-    def _seen(self, camera: Sensor, last: tuple[int, np.ndarray] | None, t_us: int, light: np.ndarray) -> Events:
+    def _seen(self, camera: Sensor, t_us: int, light: np.ndarray) -> Events:
         """The events from the last frame to this one."""
-        if last is None or self.frames.is_dense:
+        if self.last_light is None or self.frames.is_dense:
             self.num_drawn += 1
             return camera.push(light[None], np.array([t_us], np.int64))
-        between = self.interpolator.between(last[1], light)
-        steps = num_steps(between.displacement_px, self.max_displacement_px, min(MAX_STEPS, t_us - last[0]))
+        span_us = t_us - self.duration_us
+        between = self.interpolator.between(self.last_light, light)
+        steps = num_steps(between.displacement_px, self.max_displacement_px, min(MAX_STEPS, span_us))
         shares = np.arange(1, steps) / steps
-        times = last[0] + np.rint(shares * (t_us - last[0])).astype(np.int64)
+        times = self.duration_us + np.rint(shares * span_us).astype(np.int64)
         self.num_drawn += steps
         drawn = np.empty((steps - 1, len(between.moving)), np.float32)
         for row, share in enumerate(shares.tolist()):

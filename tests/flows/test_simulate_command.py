@@ -76,7 +76,7 @@ def test_a_format_that_cannot_hold_the_events_says_so_of_the_file_asked_for(vide
 
 def test_the_suffix_says_the_format(tmp_path):
     for suffix, name in ((".parquet", "parquet"), (".raw", "evt3"), (".npz", "npz"), (".csv", "csv"), (".dat", "dat")):
-        assert find_writer(tmp_path / f"a{suffix}")[0] == name
+        assert find_writer(tmp_path / f"a{suffix}") == name
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def test_a_video_has_the_times_of_its_container_and_linear_light(tmp_path):
     levels = [0, 60, 120, 180, 240]
     frames = open_frames(write_video(tmp_path / "a.avi", levels), FrameOptions())
     times, light = zip(*frames, strict=True)
-    assert frames.expected == 5 and frames.size == (32, 24) and list(times) == [0, 20_000, 40_000, 60_000, 80_000]
+    assert frames.expected == 5 and light[0].shape == (24, 32) and list(times) == [0, 20_000, 40_000, 60_000, 80_000]
     for level, one in zip(levels, light, strict=True):
         assert one.dtype == np.float32 and one.shape == (24, 32)
         np.testing.assert_allclose(one, (level / 255) ** 2.2, atol=0.02)  # the codec rounds

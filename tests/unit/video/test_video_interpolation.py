@@ -17,7 +17,7 @@ class Known(Frames):
     """Frames that are in memory."""
 
     def __init__(self, times, pictures):
-        self.times, self.pictures, self.num_skipped, self.expected, self.size = times, pictures, 0, len(times), None
+        self.times, self.pictures, self.expected = times, pictures, len(times)
 
     def __iter__(self):
         return iter(zip(self.times.tolist(), self.pictures, strict=True))
