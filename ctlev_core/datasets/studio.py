@@ -1,10 +1,11 @@
 """The dataset the project makes itself: a procedural body moves, cameras watch, a DVS pixel model sends events.
 
 It stands in for recordings of real people, which users must download under their own licences. Training recordings
-show four subjects and the SEEN motions; tests show two other subjects and all motions; `condition` recordings carry
-labels, and grey pictures where asked for, but no events: random people in UNSEEN motions, from whose poses synthetic
-data is sampled; `record_conditions` records the very same people as training recordings, which is what synthetic data
-stands in for. The HELD_OUT motions appear in tests alone.
+show four subjects and the SEEN motions; tests show two other subjects and all motions, or the same ones in other
+performances (`in_distribution_tests`); `condition` recordings carry labels, and grey pictures where asked for, but no
+events: random people in UNSEEN motions, from whose poses synthetic data is sampled; `record_conditions` records the
+very same people as training recordings, which is what synthetic data stands in for. The HELD_OUT motions appear in
+tests alone.
 
 Recordings like those of a real dataset are options: DHP19 is 346 x 260 px, `dhp19`, 4 cameras; CDEHP is 1280 x 800 px,
 `cdehp`, Event-HPE a square sensor, `smpl`, both with intensity frames.
@@ -65,10 +66,11 @@ def list_recordings(options: Options) -> list[Recording]:
 
 
 def _recording(split: str, index: int, camera: int, options: Options) -> Recording:
-    motions = MOTIONS_OF_SPLIT[split]
+    like_training = split == "train" or (split == "test" and options.in_distribution_tests)
+    motions = MOTIONS_OF_SPLIT["train" if like_training else split]
     motion, turn = motions[index % len(motions)], index // len(motions)
     has_events = split != "condition" or options.record_conditions
-    if split == "train":
+    if like_training:
         subject = f"subject{turn % options.num_train_subjects}"
     elif split == "test":
         subject = f"subject{options.num_train_subjects + turn % options.num_test_subjects}"

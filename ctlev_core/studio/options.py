@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from ctlev_core.sensor.choice import check_sensor_preset
 from data_contracts.config import Frozen
@@ -54,6 +54,11 @@ class Options(Frozen):
     max_events: int = Field(default=20_000_000, ge=1, description="A recording with more is an error.")
     num_train_subjects: int = Field(default=4, ge=1, description="Subjects 0 .. n - 1.")
     num_test_subjects: int = Field(default=2, ge=1, description="The subjects after those.")
+    in_distribution_tests: bool = Field(
+        default=False,
+        description="Tests show the subjects and motions of training recordings, in other performances; of a perfect "
+        "generator `c2st` is then 0.5.",
+    )
     num_sensors: int = Field(
         default=2, ge=1, description="Individual sensors of each camera, with their own mismatch and hot pixels."
     )
@@ -100,3 +105,11 @@ class Options(Frozen):
         if min(self.sensor_size) < 1:
             raise ValueError(f"sensor_size must be (width, height) of 1 px or more, got {self.sensor_size}")
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recordings keep the keys that they had before there was a choice of tests."""
+        values = serialize(self)
+        if not values.get("in_distribution_tests"):
+            values.pop("in_distribution_tests", None)
+        return values

@@ -13,6 +13,7 @@ from ctlev_core.body.motion.keyframes import HELD_OUT, SEEN, UNSEEN
 from ctlev_core.datasets import studio
 from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_TO_DHP19
 from ctlev_core.sensor.dvs_pixel import PRESETS, EventBudgetError, simulate_events
+from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 from data_contracts.labels import check_image_track, check_labels
@@ -45,6 +46,20 @@ def test_splits_share_no_subject_and_held_out_motions_are_in_tests_alone():
     assert len({r.recording_id for r in RECORDINGS}) == len(RECORDINGS) == 90
     # Every training subject performs every motion.
     assert len({(r.subject, r.class_name) for r in of_split("train")}) == 16
+
+
+def test_tests_can_show_the_people_and_motions_of_training():
+    alike = changed(in_distribution_tests=True)
+    recordings = studio.list_recordings(alike)
+    training, tests = (
+        [recording for recording in recordings if recording.parts[0].split == split] for split in ("train", "test")
+    )
+    assert {(r.subject, r.class_name) for r in tests} <= {(r.subject, r.class_name) for r in training}
+    assert [r.recording_id for r in training] == [r.recording_id for r in of_split("train")]
+    same = next(r for r in training if (r.subject, r.class_name) == (tests[0].subject, tests[0].class_name))
+    assert not np.array_equal(studio.read_labels(tests[0], alike).joints2d, studio.read_labels(same, alike).joints2d)
+    assert "in_distribution_tests" in cache_material(alike)
+    assert "in_distribution_tests" not in cache_material(OPTIONS)  # recordings made before keep their keys
 
 
 def test_condition_people_can_be_recorded_for_training():
