@@ -44,6 +44,8 @@ SPLIT_NAMES = ("train", "test", "condition")
 MOTIONS_OF_SPLIT = {"train": SEEN, "test": SEEN + UNSEEN + HELD_OUT, "condition": UNSEEN}
 # Streams of random numbers, each with its own seed, so that any recording can be made alone.
 SUBJECT_STREAM, SENSOR_STREAM, SCENE_STREAM, NOISE_STREAM, CAMERA_STREAM = 10, 11, 12, 13, 14
+AGAIN = "_again"
+"""Ends the name of a training subject in tests."""
 KEY_POSE_RATE_HZ = 200.0
 """Between key poses joints turn at constant speed: no joint is ever 1 mm off the path that the labels follow."""
 RECORDING_ID = re.compile(r"(?P<split>\w+)/.+_(?P<index>\d{5,})(_cam(?P<camera>\d+))?")
@@ -71,7 +73,8 @@ def _recording(split: str, index: int, camera: int, options: Options) -> Recordi
     motion, turn = motions[index % len(motions)], index // len(motions)
     has_events = split != "condition" or options.record_conditions
     if like_training:
-        subject = f"subject{turn % options.num_train_subjects}"
+        # Another name, for people who are both learnt from and tested on are otherwise refused.
+        subject = f"subject{turn % options.num_train_subjects}{AGAIN if split == 'test' else ''}"
     elif split == "test":
         subject = f"subject{options.num_train_subjects + turn % options.num_test_subjects}"
     else:
@@ -207,7 +210,7 @@ def _subject(recording: Recording, entropy: list[int], options: Options) -> Subj
     from ctlev_core.studio.scene import sample_subject
 
     is_stranger = recording.subject.startswith("stranger")
-    number = entropy[1:] if is_stranger else [int(recording.subject.removeprefix("subject"))]
+    number = entropy[1:] if is_stranger else [int(recording.subject.removeprefix("subject").removesuffix(AGAIN))]
     return sample_subject(np.random.default_rng([options.seed, SUBJECT_STREAM, *number]), colour=False)
 
 
