@@ -13,10 +13,22 @@ class Frozen(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    @model_serializer(mode="wrap")
+    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values = serialize(self)
+        for name, info in type(self).model_fields.items():
+            if info.json_schema_extra == ADDED_LATER and getattr(self, name) == info.default:
+                values.pop(name, None)
+        return values
+
 
 RUN_SETTING: dict[str, Any] = {"run_setting": True}
 """Pass as `Field(json_schema_extra=RUN_SETTING)`: the field (a path, a device, a worker count) must not
 change any result and therefore stays outside the cache key."""
+
+ADDED_LATER: dict[str, Any] = {"added_later": True}
+"""Pass as `Field(json_schema_extra=ADDED_LATER)`: an option that came when there were artefacts without it. While it
+has its default it is not written, so that those artefacts keep their keys and are not made again."""
 
 
 def cache_material(options: BaseModel, of_choice: Callable[[Choice], Any] | None = None) -> dict[str, Any]:
@@ -116,11 +128,13 @@ class Windows(Frozen):
     min_events: int = Field(default=1, ge=1, description="drop windows with fewer events (duration, whole)")
     anchor: Literal["first_event", "labels"] = Field(
         default="first_event",
+        json_schema_extra=ADDED_LATER,
         description="one window after another from the first event; or one that ends at each label (count, duration), "
         "which overlap where labels follow faster",
     )
     labels: Literal["mean", "interpolated"] = Field(
         default="mean",
+        json_schema_extra=ADDED_LATER,
         description="label of a window that has none of its own: the mean of the positions in it and the last body, or "
         "those nearest to it, as DHP19; or those at its end, between the labels before and after, without which, or "
         "with a gap between them, there is no window",
@@ -131,12 +145,3 @@ class Windows(Frozen):
         if self.anchor == "labels" and self.method not in ("count", "duration"):
             raise ValueError(f"windows.anchor 'labels' needs method count or duration, got {self.method!r}")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Frames of other windows keep the keys that they had before there was a choice."""
-        values = serialize(self)
-        for name, off in (("anchor", "first_event"), ("labels", "mean")):
-            if values.get(name) == off:
-                values.pop(name)
-        return values

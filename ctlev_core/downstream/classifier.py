@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field
 
 from ctlev_core.networks.resnet_files import ARCHITECTURES, SMALL_CNN, check_batch, check_resnet_folder
 from ctlev_core.supervised.binary_tasks import Negatives, is_binary, predict_each, train_each
 from ctlev_core.supervised.options import SupervisedOptions
-from data_contracts.config import RUN_SETTING, cache_material
+from data_contracts.config import ADDED_LATER, RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels
@@ -59,18 +59,11 @@ class Options(SupervisedOptions):
     )
     binary: Negatives | None = Field(
         default=None,
+        json_schema_extra=ADDED_LATER,
         description="one network of each class, that tells it from the others, as in the paper's Table 5; it learns "
         "from all frames of other classes, or from as many as there are of its own (balanced); null = one network of "
         "all classes",
     )
-
-    @model_serializer(mode="wrap")
-    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A network of all classes is the same model, of the same key, as before there were binary ones."""
-        values = serialize(self)
-        if self.binary is None:
-            values.pop("binary", None)
-        return values
 
 
 def input_files(options: Options) -> list[Path]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field
 
 from ctlev_core.body.smpl_files import given_body_file
 from ctlev_core.geometry.joint_sets import joint_indices
@@ -27,7 +27,7 @@ from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_r
 from ctlev_core.supervised.augmentation import BodySamples, mirror_half, shift
 from ctlev_core.supervised.frame_sequences import find_sequences
 from ctlev_core.supervised.options import SupervisedOptions
-from data_contracts.config import RUN_SETTING, cache_material
+from data_contracts.config import ADDED_LATER, RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels, check_labels
@@ -81,17 +81,10 @@ class Options(SupervisedOptions):
     sequence_length: int = Field(
         default=1,
         ge=1,
+        json_schema_extra=ADDED_LATER,
         description="frames of a recording, one after another, that a recurrent unit looks back over; batch_size then "
         "counts sequences; 1 = no such unit; Event-HPE: 8",
     )
-
-    @model_serializer(mode="wrap")
-    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Models of single images are the same models, of the same keys, as before there were sequences."""
-        values = serialize(self)
-        if self.sequence_length == 1:
-            values.pop("sequence_length", None)
-        return values
 
 
 def input_files(options: Options) -> list[Path]:

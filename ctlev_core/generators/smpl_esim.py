@@ -5,9 +5,10 @@ Reconstruction from Contours, BMVC 2022; E-LnR, IJCV 2024), a simulator that ren
 events as ESIM does (Rebecq et al., ESIM: an Open Event Camera Simulator, CoRL 2018); EventHands (Rudnev et al., ICCV
 2021) does the same for hands. Common to them: a textured mesh moves before a still background, pictures are rendered
 closely in time, and each pixel sends an event wherever its log intensity, linear between pictures, is a threshold away
-from that of its last event. All of that is here. There is no noise, no mismatch of thresholds and no lag in it, and
-nothing is learnt from real data: that is the point of the comparison. As in ControlEvents the poses are the ones that
-the other generators get.
+from that of its last event. All of that is here. By default there is no noise, no mismatch of thresholds and no lag in
+it, and nothing is learnt from real data: that is the point of the comparison. With `sensor_preset` the same pictures go
+through a camera that has all of them, as v2e's does (Hu et al., CVPRW 2021). As in ControlEvents the poses are the ones
+that the other generators get.
 
 How we differ:
 
@@ -24,13 +25,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from ctlev_core.body.smpl_files import given_body_file
-from data_contracts.config import RUN_SETTING, Frozen
+from ctlev_core.sensor.choice import check_sensor_preset, read_sensor, sensor_preset_files
+from ctlev_core.sensor.options import PRESETS, SensorOptions
+from data_contracts.config import ADDED_LATER, RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 from data_contracts.labels import BodyMotions, Conditions, check_body_motions
@@ -55,6 +58,18 @@ class SampleOptions(Frozen):
     threshold: float = Field(
         default=0.2, gt=0, description="log-intensity step of an event, of either polarity; that of ESIM's Python code"
     )
+    sensor_preset: Annotated[str, AfterValidator(check_sensor_preset)] | None = Field(
+        default=None,
+        json_schema_extra=ADDED_LATER,
+        description="a camera with noise, lag and mismatch of thresholds, which hold in place of `threshold`: "
+        "a key of `ctlev_core.sensor.dvs_pixel.PRESETS`, or a YAML file such as calibration writes; null = ESIM's",
+    )
+    sensor_seed: int = Field(
+        default=0,
+        ge=0,
+        json_schema_extra=ADDED_LATER,
+        description="which camera of that kind, with its own hot pixels; all rows are of one",
+    )
     max_displacement_px: float = Field(
         default=0.5, gt=0, description="movement between two pictures; lambda = 0.5 is the default of ESIM's code"
     )
@@ -72,12 +87,16 @@ class SampleOptions(Frozen):
 
 
 def input_files(options: SampleOptions) -> list[Path]:
-    """The body file where one is given; its content enters the cache key.
+    """The files of body and sensor where they are given; their content enters the cache key.
 
     Raises:
-        DataError: no such file.
+        DataError: no such file, or one that describes no sensor.
     """
-    return given_body_file(options.body, "generator 'smpl_esim'")
+    files = given_body_file(options.body, "generator 'smpl_esim'")
+    if options.sensor_preset is None:
+        return files
+    read_sensor(options.sensor_preset)
+    return [*files, *sensor_preset_files(options.sensor_preset)]
 
 
 def sample_events(
@@ -119,7 +138,6 @@ def _record(
 ) -> Events:
     """The events of one row."""
     from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
-    from ctlev_core.sensor.dvs_pixel import PRESETS
 
     scene = _scene(motions, row, sensor_size, options, seed, body)
     start_us, stop_us = (int(time_us) for time_us in motions.t_us[row, [0, -1]])
@@ -128,15 +146,13 @@ def _record(
             scene,
             0,
             stop_us - start_us,
-            PRESETS["ideal"].model_copy(
-                update={"threshold": options.threshold, "threshold_minimum": options.threshold}
-            ),
+            _sensor(options),
             RenderingOptions(
                 max_displacement_px=options.max_displacement_px,
                 min_interval_us=MIN_INTERVAL_US,
                 max_interval_us=MAX_INTERVAL_US,
             ),
-            sensor_seed=seed,
+            sensor_seed=seed if options.sensor_preset is None else options.sensor_seed,
             seed=seed,
             speed_bound=scene.speed_bound,
             background=scene.background,
@@ -145,6 +161,13 @@ def _record(
     except DataError as error:
         raise DataError(f"generator 'smpl_esim', row {row}: {error}") from error
     return replace(events, t=events.t + start_us)
+
+
+def _sensor(options: SampleOptions) -> SensorOptions:
+    if options.sensor_preset is not None:
+        return read_sensor(options.sensor_preset)
+    threshold = options.threshold
+    return PRESETS["ideal"].model_copy(update={"threshold": threshold, "threshold_minimum": threshold})
 
 
 def _scene(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from ctlev_core.sensor.choice import check_sensor_preset
-from data_contracts.config import Frozen
+from data_contracts.config import ADDED_LATER, Frozen
 
 
 class Options(Frozen):
@@ -56,6 +56,7 @@ class Options(Frozen):
     num_test_subjects: int = Field(default=2, ge=1, description="The subjects after those.")
     in_distribution_tests: bool = Field(
         default=False,
+        json_schema_extra=ADDED_LATER,
         description="Tests show the subjects and motions of training recordings, in other performances; of a perfect "
         "generator `c2st` is then 0.5.",
     )
@@ -105,11 +106,3 @@ class Options(Frozen):
         if min(self.sensor_size) < 1:
             raise ValueError(f"sensor_size must be (width, height) of 1 px or more, got {self.sensor_size}")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_what_is_off(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recordings keep the keys that they had before there was a choice of tests."""
-        values = serialize(self)
-        if not values.get("in_distribution_tests"):
-            values.pop("in_distribution_tests", None)
-        return values

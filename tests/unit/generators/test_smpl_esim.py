@@ -4,6 +4,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import yaml
+from pydantic import ValidationError
 
 from ctlev_core.body.layer import BUNDLED_BODY, load_body, pose_vertices
 from ctlev_core.body.rotations import matrix_from_axis_angle
@@ -212,6 +214,29 @@ def test_a_larger_threshold_sends_fewer_events():
     fine, coarse = (sum(len(events) for events in sample(motions, threshold=step)) for step in (0.1, 0.4))
     # A quarter of the crossings, and less: changes below the threshold are not seen at all.
     assert 0 < coarse < fine / 3.5
+
+
+def test_a_camera_with_faults_adds_their_events(tmp_path):
+    still = sideways(0.0)
+    assert len(sample(still)[0]) == 0 < 20 < len(sample(still, sensor_preset="noisy")[0])
+
+    def camera(**options):
+        path = tmp_path / f"{len(options)}.yaml"
+        path.write_text(yaml.safe_dump(PRESETS["ideal"].model_copy(update=options).model_dump(mode="json")))
+        return path
+
+    hot = str(camera(hot_pixel_fraction=0.01, hot_rate_hz=(2000.0, 2000.0)))
+    first, second = (counts(events) > 50 for events in sample(take(still, [0, 0]), [1, 2], sensor_preset=hot))
+    assert 5 < first.sum() < 40
+    np.testing.assert_array_equal(first, second)  # all rows are of one camera
+    assert not np.array_equal(first, counts(sample(still, [1], sensor_preset=hot, sensor_seed=4)[0]) > 50)
+
+    coarse = camera(threshold=0.4, threshold_minimum=0.4)
+    moving = sideways(0.2)
+    assert same_events(sample(moving, sensor_preset=str(coarse))[0], sample(moving, threshold=0.4)[0])
+    assert smpl_esim.input_files(smpl_esim.SampleOptions(sensor_preset=str(coarse))) == [coarse]
+    with pytest.raises(ValidationError, match="expected one of ideal"):
+        smpl_esim.SampleOptions(sensor_preset="nosy")
 
 
 def test_texture_is_seen_inside_the_body():
