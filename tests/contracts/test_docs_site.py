@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from browser import CHROMIUM, check_pages
 from doc_pages import PAGES, REPOSITORY
 
 from ctlev_core import plugins
@@ -54,3 +55,10 @@ def test_nothing_is_loaded_from_elsewhere(site):
         assert not _LOADED.search(page.read_text(encoding="utf-8")), page.name
     for sheet in site.rglob("*.css"):
         assert not re.search(r"url\(['\"]?(https?:)?//|@import", sheet.read_text(encoding="utf-8")), sheet.name
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+def test_every_page_can_be_read_at_every_width(site, tmp_path):
+    pages = sorted(str(path.relative_to(site)) for path in site.rglob("*.html"))
+    for start in range(0, len(pages), 10):
+        check_pages(site, pages[start : start + 10], tmp_path)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from browser import CHROMIUM, check_pages
 from flow_scripts import artefacts, run_script
 
 from ctlev_core import plugins
@@ -105,6 +106,11 @@ def test_the_page_says_where_and_shows(finished):
     ):
         assert expected in page
     assert "Told from recorded frames first: " in page or "In no row are frames told" in page
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+def test_the_page_can_be_read_at_every_width(finished, tmp_path):
+    check_pages(finished / "reports", ["smoke_realism_chain.html"], tmp_path)
 
 
 def test_another_time_step_is_all_that_is_computed_again(finished):

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from browser import CHROMIUM, check_pages
 from flow_scripts import artefacts, plan_script, run_script
 
 from ctlev_core.downstream import classifier
@@ -59,6 +60,11 @@ def test_the_page_recommends_and_shows(measured):
     ):
         assert expected in page
     assert "Recommended: " in page or "No setting stays within the interval" in page
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+def test_the_page_can_be_read_at_every_width(measured, tmp_path):
+    check_pages(measured / "reports", ["smoke_speed_vs_error.html"], tmp_path)
 
 
 def test_every_setting_is_measured_and_evaluations_are_counted(rows):

@@ -3,6 +3,8 @@
 import shutil
 
 import pyarrow.parquet as pq
+import pytest
+from browser import CHROMIUM, check_pages
 from flow_scripts import digests, run_script
 
 STUDY = """
@@ -21,12 +23,20 @@ speed_vs_error:
 """
 
 
-def test_a_study_runs_what_its_experiments_have_not_run_yet(smoke_home, tmp_path):
-    home = shutil.copytree(smoke_home, tmp_path / "home")
-    (tmp_path / "pair.yaml").write_text(STUDY)
+@pytest.fixture(scope="module")
+def study(smoke_home, tmp_path_factory):
+    """The home of a finished study, and the digests that its experiments had made before it."""
+    folder = tmp_path_factory.mktemp("study")
+    home = shutil.copytree(smoke_home, folder / "home")
+    (folder / "pair.yaml").write_text(STUDY)
     before = digests(home)
-    finished = run_script("full_experiment", "--preset", str(tmp_path / "pair.yaml"), home=home)
+    finished = run_script("full_experiment", "--preset", str(folder / "pair.yaml"), home=home)
     assert finished.status == 0, finished.errors
+    return home, before
+
+
+def test_a_study_runs_what_its_experiments_have_not_run_yet(study):
+    home, before = study
     made = digests(home)
     assert before.items() <= made.items()
     new = sorted(name.partition("/")[0] for name in made.keys() - before.keys())
@@ -43,3 +53,14 @@ def test_a_study_runs_what_its_experiments_have_not_run_yet(smoke_home, tmp_path
     assert "all: speed against error of sampling" in (speed / "report.html").read_text()
     lines = pq.read_table(speed / "speed_vs_error.parquet")["line"].to_pylist()
     assert set(lines) == {"reference", "converged", "UniPC"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+def test_every_page_can_be_read_at_every_width(study, tmp_path):
+    home, _ = study
+    assert run_script("compare", "smoke", "pair/part", home=home).status == 0
+    reports = home / "reports"
+    pages = sorted(str(path.relative_to(reports)) for path in reports.rglob("*.html"))
+    assert len(pages) >= 6
+    check_pages(reports, pages, tmp_path)

@@ -1,23 +1,15 @@
 """The report in a real browser: nothing is wider than a phone, tables sort, links unfold, and the console is
 silent."""
 
-import contextlib
-import functools
-import html
-import http.server
-import json
 import re
-import shutil
-import subprocess
-import threading
 
 import pytest
+from browser import CHROMIUM, check_pages, run_in_browser
 from report_artefacts import Experiment
 
 from tasks.report import report
 from tasks.stage import Output
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 
 PROBE = """
@@ -52,42 +44,10 @@ for (const [name, width] of [["phone", 360], ["desk", 1280]]) {
 """
 
 
-class Quiet(http.server.SimpleHTTPRequestHandler):
-    """Keeps its log to itself."""
-
-    def log_message(self, format, *args):
-        pass
-
-
-@contextlib.contextmanager
-def served(folder):
-    """The folder on a loopback port."""
-    handler = functools.partial(Quiet, directory=str(folder))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_address[1]}"
-        finally:
-            server.shutdown()
-            thread.join()
-
-
 def in_browser(page: str, folder, *options: str) -> tuple[dict, str]:
     """What the probe measured in frames of the width of a phone and of a desk, and what the console said."""
     (folder / "report.html").write_text(page, encoding="utf-8")
-    probe = f'<!DOCTYPE html><meta charset="utf-8"><body><pre></pre><script>{PROBE}</script>'
-    (folder / "probe.html").write_text(probe, encoding="utf-8")
-    command = [
-        str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--hide-scrollbars",
-        f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=20000", *options, "--dump-dom",
-    ]  # fmt: skip
-    # A page of the file system may not look into its frames; one of a server may.
-    with served(folder) as url:
-        finished = subprocess.run([*command, f"{url}/probe.html"], capture_output=True, text=True, timeout=240)
-    found = re.search(r"<pre>(\{.*?\})</pre>", finished.stdout, re.DOTALL)
-    assert found, finished.stderr[-2000:] + finished.stdout[-500:]
-    return json.loads(html.unescape(found.group(1))), finished.stderr
+    return run_in_browser(PROBE, folder, folder, *options)
 
 
 @pytest.fixture(scope="module")
@@ -121,3 +81,25 @@ def test_dark_mode_turns_ink_and_page_round(page, tmp_path):
     dark, _ = in_browser(page, tmp_path, "--blink-settings=preferredColorScheme=0")
     assert brightness(light["desk"]["paper"]) > 200 > 100 > brightness(light["desk"]["ink"])
     assert brightness(dark["desk"]["paper"]) < 60 < 180 < brightness(dark["desk"]["ink"])
+
+
+def test_every_text_can_be_read_at_every_width_and_nothing_is_too_wide(page, tmp_path):
+    (tmp_path / "report.html").write_text(page, encoding="utf-8")
+    check_pages(tmp_path, ["report.html"], tmp_path)
+
+
+def test_pale_text_wide_boxes_and_messages_are_found(tmp_path):
+    (tmp_path / "page.html").write_text(
+        '<!DOCTYPE html><body style="margin:0"><p style="color:#999">pale</p><p style="color:#767676">dark enough</p>'
+        '<p style="color:#999;font-size:24px">3:1 is enough here: no</p>'
+        '<p style="color:#949494;font-size:24px">large</p>'
+        '<details><summary>more</summary><div style="width:800px">box</div></details>'
+        '<svg width="90" height="20"><text y="15" fill="#ddd">drawn</text></svg><script>console.log("hello")</script>',
+        encoding="utf-8",
+    )
+    with pytest.raises(AssertionError) as told:
+        check_pages(tmp_path, ["page.html"], tmp_path)
+    text = str(told.value)
+    assert "page.html at 390 px, light: DIV. box" in text and "page.html at 1440 px, light:  [" in text
+    assert all(word in text for word in ("2.85: pale", "drawn", "hello", "3:1 is enough here: no"))
+    assert "dark enough" not in text and "large" not in text
