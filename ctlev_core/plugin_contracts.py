@@ -150,6 +150,15 @@ class FormatWithWriter(Format, Protocol):
 
 
 @runtime_checkable
+class FormatWithCheck(Format, Protocol):
+    """A format whose files tell whether they were cut, without being decoded."""
+
+    def check_complete(self, path: Path) -> None:
+        """Raise `DataError` where the file is cut, in a time that hardly depends on its length."""
+        ...
+
+
+@runtime_checkable
 class MotionFormat(Protocol):
     """A file format of motions: poses over time.
 

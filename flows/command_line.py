@@ -26,7 +26,7 @@ from data_contracts.study import Study
 from data_contracts.yaml_text import load_yaml
 from flows import local_server, settings
 from flows.costs import HOW_ESTIMATED, estimate_costs
-from flows.inputs import InputsMissing, check_inputs
+from flows.inputs import InputsMissing, check_inputs, check_recordings
 from flows.plan_table import print_plan_with_costs
 from flows.preset_list import PRESETS, preset_names
 from flows.run_progress import shown
@@ -165,11 +165,13 @@ class Command:
         flow: of one parameter, its options.
         describe: from the flow's result and its options to the lines printed at the end.
         load: from a preset's name and overrides to the options.
+        foretell: from the options to what a dry run says of files outside the store; empty = nothing.
     """
 
     flow: ScriptFlow[..., Any]
     describe: Callable[[Any, Any], str]
     load: Callable[[str, list[str]], Any] = load_experiment
+    foretell: Callable[[Any], str] = lambda _: ""
 
 
 @dataclass(frozen=True)
@@ -214,8 +216,12 @@ def run_command(command: Command, asked: Asked) -> int:
         with planning() as rows:
             flow.fn(options)
         if asked.dry_run:
+            if isinstance(options, Experiment | Study):
+                check_recordings(options)
             (partial(print_plan_with_costs, home=home) if asked.costs else print_plan)(rows)
             print_costs(options)
+            if foretold := command.foretell(options):
+                print(foretold)
             return 0
         use_cores(rows)
         all_cached = all(row.cached for row in rows)

@@ -13,7 +13,7 @@ from flows.inputs import check_whole_counts
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from flows.synthesize import synthesize
-from tasks.export_events import export_events, publish_events
+from tasks.export_events import events_folder, export_events, publish_events
 from tasks.stage import call_flow
 from tasks.store import home_folder
 
@@ -38,7 +38,20 @@ def export_streams(
     )
 
 
-COMMAND = Command(export_streams, lambda made, experiment: publish_events(made, home_folder(), experiment.name))
+def _foretell(experiment: Experiment) -> str:
+    export = experiment.export or EventExport()
+    files = "one file" if export.one_file else "a file each"
+    return (
+        f"would write to {events_folder(home_folder(), experiment.name)}: at most {experiment.num_synthetic} event "
+        f"streams, {files}, as {export.format}, and their table"
+    )
+
+
+COMMAND = Command(
+    export_streams,
+    lambda made, experiment: publish_events(made, home_folder(), experiment.name),
+    foretell=_foretell,
+)
 
 
 if __name__ == "__main__":

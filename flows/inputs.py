@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 from ctlev_core import plugins
+from ctlev_core.events.files import check_complete
 from ctlev_core.events.image_grid import ImageFit
+from ctlev_core.events.windows import spread
 from ctlev_core.plugin_contracts import ConditionOfClasses, Dataset, Generator, GeneratorFromWeights, PluginWithFiles
 from ctlev_core.plugins import PluginError
 from ctlev_core.scoring.checks import check_dataset
@@ -13,6 +16,10 @@ from data_contracts.config import Choice, ConditionChoice, DatasetChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
 from data_contracts.study import Study
+
+MAX_OPENED = 20_000
+"""Files that a dry run opens: half a minute on a busy disk."""
+MAX_LISTED = 20
 
 
 class InputsMissing(PluginError):
@@ -49,6 +56,31 @@ def check_inputs(asked: Experiment | Study, *, thoroughly: bool = False) -> None
         # What is found by looking again need not be what was found first: folders change.
         raise InputsMissing(_problems(experiments) or [str(error)], asked) from error
     if thoroughly and (problems := _problems(experiments)):
+        raise InputsMissing(problems, asked)
+
+
+def check_recordings(asked: Experiment | Study) -> None:
+    """Raise `InputsMissing` where files of recordings are cut, as far as can be told without decoding them.
+
+    It opens every file, which a run does later anyway; of more than `MAX_OPENED` files so many, evenly spread.
+    """
+    experiments = asked.experiments.values() if isinstance(asked, Study) else [asked]
+    files: dict[Path, None] = {}
+    for choice in (choice for experiment in experiments for choice in experiment.choices):
+        plugin = plugins.load_options(choice)
+        if isinstance(plugin.module, Dataset):
+            for recording in plugin.module.list_recordings(plugin.options):
+                files |= dict.fromkeys(recording.files)
+    listed = list(files)
+    problems = []
+    for number in spread(len(listed), MAX_OPENED).tolist():
+        try:
+            check_complete(listed[number])
+        except (DataError, OSError) as error:
+            problems.append(str(error))
+    if len(problems) > MAX_LISTED:
+        problems[MAX_LISTED:] = [f"and {len(problems) - MAX_LISTED} more files"]
+    if problems:
         raise InputsMissing(problems, asked)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ctlev_core.report.sections.rejections import count_rejections
 from data_contracts.experiment import Experiment
+from data_contracts.image_folder import LABELS_FILE, METADATA_FILE, PROVENANCE_FILE, README_FILE
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.synthesis import Synthesis
 from flows.cli import script
@@ -83,7 +84,17 @@ def _describe(made: ManifestRef, synthesis: Synthesis) -> str:
     return "\n".join(lines)
 
 
-COMMAND = Command(synthesize, _describe, load=load_synthesis)
+def _foretell(synthesis: Synthesis) -> str:
+    if synthesis.export_folder is None:
+        return ""
+    streams = " and event streams" if synthesis.export else ""
+    return (
+        f"would write to {synthesis.export_folder}: at most {synthesis.num_synthetic} images{streams}, without those "
+        f"that the quality filter rejects, {LABELS_FILE}, {METADATA_FILE}, {PROVENANCE_FILE} and {README_FILE}"
+    )
+
+
+COMMAND = Command(synthesize, _describe, load=load_synthesis, foretell=_foretell)
 
 
 if __name__ == "__main__":

@@ -75,9 +75,14 @@ def export_events(
     return table.select([column.name for column in tables.EVENT_STREAMS.columns]).cast(tables.EVENT_STREAMS.arrow())
 
 
+def events_folder(home: Path, name: str) -> Path:
+    """Where a person looks for the events of an experiment."""
+    return home / "events" / name
+
+
 def publish_events(ref: ManifestRef, home: Path, name: str) -> str:
     """Put the newest events of an experiment where a person looks for them, and say where that is."""
-    folder = home / "events" / name
+    folder = events_folder(home, name)
     temporary = folder.with_name(f".{name}")
     shutil.rmtree(temporary, ignore_errors=True)
     shutil.copytree(ref.path / "events", temporary / "events")

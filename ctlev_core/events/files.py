@@ -9,6 +9,7 @@ from types import ModuleType
 
 from ctlev_core import plugins
 from ctlev_core.events.decoding import event_chunks
+from ctlev_core.plugin_contracts import FormatWithCheck
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 
@@ -28,13 +29,27 @@ def find_format(path: Path) -> ModuleType:
     """
     if not path.is_file():
         raise DataError(f"{path}: expected an event file, got {'a folder' if path.is_dir() else 'nothing there'}")
-    formats = {name: plugins.load("formats", name) for name in plugins.names("formats")}
+    formats = _load_formats()
     if (module := plugins.recognise(formats, path)) is not None:
         return module
     known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in formats.items())
     raise DataError(
         f"{path}: not an event file of a known format ({path.stat().st_size} bytes); known formats: {known}"
     )
+
+
+def _load_formats() -> dict[str, ModuleType]:
+    return {name: plugins.load("formats", name) for name in plugins.names("formats")}
+
+
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where a file is cut, as far as its format tells without decoding it.
+
+    Files of no known format pass: datasets have readers of their own for them.
+    """
+    module = plugins.recognise(_load_formats(), path)
+    if isinstance(module, FormatWithCheck):
+        module.check_complete(path)
 
 
 def read_events_file(path: Path) -> Events:

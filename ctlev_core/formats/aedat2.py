@@ -65,6 +65,11 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
     return record_files.read_chunks(_open(path), num_events)
 
 
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where the file is cut, as far as can be told without decoding it."""
+    aedat2.check_size(path, aedat2.read_header(path))
+
+
 def _open(path: Path) -> record_files.RecordFile:
     from ctlev_core.events.decoding import aedat2_decoding as decoding
 

@@ -7,6 +7,7 @@ Source: iniVation, "AEDAT 4.0 file format"; decoded by the `aedat` package, in a
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +22,8 @@ HAS_SIGNATURE = True
 SUFFIXES = (".aedat4",)
 
 _MAGIC = b"#!AER-DAT4.0"
+_SHORT, _INT, _UINT, _LONG = (struct.Struct(f"<{code}") for code in "HiIq")
+_PACKET = struct.Struct("<ii")  # stream, bytes
 
 
 def sniff(path: Path) -> bool:
@@ -45,6 +48,39 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
         DataError: as `read`.
     """
     return event_chunks.regroup(_read_packets(path), num_events)
+
+
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where the file ends within a packet; the packets are counted, not decoded."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        file.readline()
+        try:
+            (header_bytes,) = _INT.unpack(file.read(_INT.size))
+            header = file.read(header_bytes)
+            end = _table_position(header)
+            position, end = file.tell(), size if end < 0 else end
+            while position < end:
+                file.seek(position)
+                _, packet_bytes = _PACKET.unpack(file.read(_PACKET.size))
+                position += _PACKET.size + max(packet_bytes, 0)
+        except struct.error:
+            position = size + 1
+    if position > size:
+        raise DataError(f"{path}: not a complete AEDAT 4 file: it ends at byte {size}, within a packet or the header")
+
+
+def _table_position(header: bytes) -> int:
+    """Where the table of packets starts that follows the last one; -1 = there is none.
+
+    It is the second field of a FlatBuffers table. Source: iniVation, "AEDAT 4.0 file format", IOHeader; FlatBuffers,
+    "Internals": a table starts with the distance back to the list of its fields' places.
+    """
+    (table,) = _UINT.unpack_from(header, 0)
+    (back,) = _INT.unpack_from(header, table)
+    (num_bytes,) = _SHORT.unpack_from(header, table - back)
+    place = _SHORT.unpack_from(header, table - back + 6)[0] if num_bytes >= 8 else 0
+    return _LONG.unpack_from(header, table + place)[0] if place else -1
 
 
 def _read_packets(path: Path) -> Iterator[Events]:

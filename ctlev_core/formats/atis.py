@@ -76,6 +76,11 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
     return record_files.read_chunks(_open(path), num_events)
 
 
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where the file is cut, as far as can be told without decoding it."""
+    _open(path).num_records()
+
+
 def _open(path: Path) -> record_files.RecordFile:
     from ctlev_core.events.decoding.atis_decoding import decode_atis
 

@@ -44,6 +44,11 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
     return prophesee.read_chunks(path, num_events, "EVT3")
 
 
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where the file is cut, as far as can be told without decoding it."""
+    prophesee.check_complete(path, "EVT3")
+
+
 def write(path: Path, events: Events) -> None:
     """Write events, with vectors where they take fewer words, so that `read` returns them unchanged.
 

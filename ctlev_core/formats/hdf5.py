@@ -63,6 +63,12 @@ def read_chunks(path: Path, num_events: int, camera: str = "left") -> Iterator[E
     return event_chunks.regroup(_chunks(path, min(num_events, _BLOCK), camera), num_events)
 
 
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where the file is cut, as far as can be told without decoding it."""
+    with _open(path):
+        pass  # HDF5 compares the size that its superblock states
+
+
 def write(path: Path, events: Events) -> None:
     """Write the layout of DSEC, compressed with gzip, with `sensor_size`, so that `read` returns the events unchanged.
 

@@ -54,6 +54,12 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
     return event_chunks.regroup(_chunks(path, min(num_events, _BLOCK)), num_events)
 
 
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where the file is cut, as far as can be told without decoding it."""
+    with path.open("rb") as file:
+        array_files.read_array_header(file, str(path), path.stat().st_size)
+
+
 def write(path: Path, events: Events) -> None:
     """Write a structured array, so that `read` returns the events unchanged.
 

@@ -68,6 +68,12 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
     return event_chunks.regroup(_chunks(path, min(num_events, _BLOCK)), num_events)
 
 
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where the file is cut, as far as can be told without decoding it."""
+    with _as_data_error(path), zipfile.ZipFile(path):
+        pass  # its table of contents is the last thing in it
+
+
 def write(path: Path, events: Events, compressed: bool = True) -> None:
     """Write events in the compressed or the plain layout, with `sensor_size`, so that `read` returns them unchanged.
 

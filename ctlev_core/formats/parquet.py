@@ -125,6 +125,12 @@ def _to_events(table: pa.Table | pa.RecordBatch, sensor_size: SensorSize, path: 
     return Events(t, x, y, p, sensor_size)
 
 
+def check_complete(path: Path) -> None:
+    """Raise `DataError` where the file is cut, as far as can be told without decoding it."""
+    with _open(path):
+        pass  # its footer is the last thing in it
+
+
 def write(path: Path, events: Events) -> None:
     """Write events so that `read` returns them unchanged.
 

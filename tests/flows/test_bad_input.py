@@ -151,3 +151,25 @@ def test_what_was_computed_stays(smoke_home, tmp_path):
     assert "this base model makes images of 64 x 64 px, event images are 48 x 48 px" in line
     assert before.items() <= digests(home).items()
     assert not list((home / "tmp").iterdir())
+
+
+def test_a_dry_run_finds_recordings_that_are_cut(tmp_path):
+    (tmp_path / "mine" / "walk").mkdir(parents=True)
+    for name in ("a", "b", "c"):
+        np.save(tmp_path / "mine" / "walk" / f"{name}.npy", np.tile([1.0, 2.0, 3.0, 1.0], (50, 1)))
+    cut = tmp_path / "mine" / "walk" / "b.npy"
+    cut.write_bytes(cut.read_bytes()[:-5])
+    settings = ("--set", f"dataset.options.root={tmp_path / 'mine'}", "--dry-run")
+    refused = plan_script("synthesize", "--preset", "folder", *settings, home=tmp_path / "home")
+    assert refused.status == 2 and refused.errors.count(".npy") == 1
+    assert f"{cut}: not a complete NumPy file" in refused.errors
+
+
+def test_a_dry_run_says_what_an_export_would_write(tmp_path):
+    def plan(flow, setting):
+        return plan_script(flow, "--preset", "smoke", "--set", setting, "--dry-run", home=tmp_path).output
+
+    folder, events = tmp_path / "out", tmp_path / "events" / "smoke"
+    assert f"would write to {folder}: at most 8 images, without those" in plan("synthesize", f"export_folder={folder}")
+    told = plan("export_events", "export.one_file=true")
+    assert f"would write to {events}: at most 8 event streams, one file, as parquet" in told

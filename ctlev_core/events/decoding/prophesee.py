@@ -101,6 +101,11 @@ def read_chunks(path: Path, num_events: int, encoding: str) -> Iterator[Events]:
     return record_files.read_chunks(_open(path, encoding), num_events)
 
 
+def check_complete(path: Path, encoding: str) -> None:
+    """Raise `DataError` where the file ends within its header or a word."""
+    _open(path, encoding).num_records()
+
+
 def _open(path: Path, encoding: str) -> record_files.RecordFile:
     from ctlev_core.events.decoding import prophesee_decoding as decoding
 

@@ -75,6 +75,35 @@ def test_a_cut_aedat4_is_an_error_not_a_shorter_recording(keep, tmp_path):
         event_files.read_events_file(path)
 
 
+@pytest.mark.parametrize("name", ["aedat2", "aedat4", "dat", "evt2", "evt3", "hdf5", "npy", "npz", "parquet"])
+def test_a_cut_is_found_without_decoding(name, tmp_path):
+    path = tmp_path / "recording"
+    rows = [(50 + 3 * i, i % 30, i % 20, i % 2) for i in range(400)]
+    if name == "aedat4":
+        packets = [aedat4_writer.packet(rows[start : start + 100]) for start in range(0, 400, 100)]
+        path.write_bytes(aedat4_writer.aedat4(packets))
+    else:
+        sizes = {"aedat2": (346, 260), "npy": (34, 34)}
+        plugins.load("formats", name).write(path, make_events(rows, sizes.get(name, (304, 240))))
+    event_files.check_complete(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) - 51])  # within a record of whatever size
+    with pytest.raises(DataError, match=r"cut inside|not a complete"):
+        event_files.check_complete(path)
+
+
+def test_files_of_no_event_format_are_left_to_their_readers(tmp_path):
+    path = tmp_path / "labels.mat"
+    path.write_bytes(b"MATLAB 5.0 MAT-file")
+    event_files.check_complete(path)
+
+
+@needs_real
+def test_real_recordings_are_complete():
+    for path in (REAL_AEDAT4, REAL_EVT2, REAL_EVT3):
+        event_files.check_complete(path)
+
+
 @needs_real
 @pytest.mark.parametrize("first", [30, 300_000], ids=["header, where the decoder panics", "packet"])
 def test_a_corrupt_aedat4_names_the_file(first, tmp_path):
