@@ -466,6 +466,13 @@ class MetricOfSkeletons(Metric, Protocol):
 
 
 @runtime_checkable
+class MetricOnSensor(Metric, Protocol):
+    """A metric of `joints2d` that is given predictions and labels in px of the sensor rather than of the image."""
+
+    IN_SENSOR_PX: bool
+
+
+@runtime_checkable
 class MetricOfRows(Metric, Protocol):
     """A metric that is a mean over rows, so that two models can be compared row by row."""
 

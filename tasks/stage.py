@@ -196,6 +196,7 @@ class Stage:
         schema: TableSchema,
         raw_files: RawFiles | None,
         readers: Sequence[str] = (),
+        optional: Sequence[str] = (),
     ) -> None:
         self.function = function
         self.name = function.__name__
@@ -203,6 +204,7 @@ class Stage:
         self.schema = schema
         self.raw_files = raw_files
         self.readers = readers
+        self.optional = optional
         self.signature = inspect.signature(function)
         self.__doc__ = function.__doc__
 
@@ -220,7 +222,7 @@ class Stage:
         arguments = dict(list(bound.arguments.items())[1:])
         self.check(arguments)
         store = Store()
-        materials = {name: _material(value) for name, value in arguments.items()}
+        materials = self._materials(arguments)
         key = self._key(arguments, materials, store)
         label = f"{self.name}: {label}" if label else self.name
         plan = _plan.get()
@@ -236,7 +238,12 @@ class Stage:
 
     def key(self, arguments: dict[str, Any], store: Store) -> str:
         """The cache key: 32 hexadecimal digits of a SHA-256."""
-        return self._key(arguments, {name: _material(value) for name, value in arguments.items()}, store)
+        return self._key(arguments, self._materials(arguments), store)
+
+    def _materials(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """What of each argument decides the result; of an optional one that is not given nothing."""
+        given = {name: value for name, value in arguments.items() if value is not None or name not in self.optional}
+        return {name: _material(value) for name, value in given.items()}
 
     def _key(self, arguments: dict[str, Any], materials: dict[str, Any], store: Store) -> str:
         material: dict[str, Any] = {"stage": self.name, "version": self.version, "table": self.schema.version}
@@ -299,7 +306,7 @@ class Stage:
                 "stage": self.name,
                 "stage_version": self.version,
                 "key": key,
-                "arguments": {name: _material(value) for name, value in arguments.items()},
+                "arguments": self._materials(arguments),
                 "upstream": upstream,
                 "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
                 "wall_seconds": round(time.perf_counter() - wall, 3),
@@ -389,7 +396,12 @@ def input_files_of(argument: str) -> RawFiles:
 
 
 def stage(
-    *, version: int, schema: TableSchema, raw_files: RawFiles | None = None, readers: Sequence[str] = ()
+    *,
+    version: int,
+    schema: TableSchema,
+    raw_files: RawFiles | None = None,
+    readers: Sequence[str] = (),
+    optional: Sequence[str] = (),
 ) -> Callable[[Callable[..., pa.Table]], Stage]:
     """Make a function a stage.
 
@@ -398,8 +410,9 @@ def stage(
         schema: of the table the function returns.
         raw_files: names the files from outside the store that the stage reads.
         readers: kinds of plug-ins that read them, found by what is in the files: one that is mended reads all anew.
+        optional: parameters that leave the key as it is where they are None: what is stored without them stays valid.
     """
-    return lambda function: Stage(function, version, schema, raw_files, readers)
+    return lambda function: Stage(function, version, schema, raw_files, readers, optional)
 
 
 def _run_stage(module: str, name: str, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
