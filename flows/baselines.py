@@ -50,10 +50,11 @@ def baselines(experiment: Experiment, dataset: PreparedDataset | None = None) ->
 
 def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: int) -> BaselineFrames:
     baseline, seed, label = experiment.baselines[name], experiment.seed + number, numbered(name, number)
+    part = baseline.part
     poses = dataset.poses
     if baseline.poses is not None:
         poses = ingest(dataset=baseline.poses, label=f"{baseline.poses.name}, poses of {name}")
-    asked = condition_asked_samples(experiment, poses, dataset.recordings, dataset.frames, baseline.condition)
+    asked = condition_asked_samples(experiment, poses, dataset.recordings, dataset.frames, baseline.condition, part)
     if isinstance(plugins.load("generators", baseline.generator.name), EventGenerator):
         synthetic = simulate(
             dataset.recordings,
@@ -63,10 +64,11 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
             encoding=experiment.encoding,
             windows=experiment.windows,
             seed=seed,
+            part=part,
             label=label,
         )
         return BaselineFrames(sample_conditions=asked, checkpoint=None, synthetic=synthetic)
-    learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition)
+    learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition, part)
     base_model = base_model_of(experiment, baseline.generator)
     checkpoint = finetune(dataset.frames, learnt, base_model, generator=baseline.generator, seed=seed, label=label)
     synthetic = sample_generator(
@@ -77,6 +79,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         asked,
         sampling=baseline.sampling_choice,
         number=number,
+        part=part,
         label=label,
     )
     return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)

@@ -96,16 +96,21 @@ def _more_frames(experiment: Experiment) -> ManifestRef | None:
 
 
 def condition_training_frames(
-    experiment: Experiment, recordings: ManifestRef, frames: ManifestRef, condition: ConditionChoice
+    experiment: Experiment,
+    recordings: ManifestRef,
+    frames: ManifestRef,
+    condition: ConditionChoice,
+    part: str | None = None,
 ) -> ManifestRef:
-    """The conditions a generator learns from."""
+    """The conditions a generator learns from; of one `part` of a union, or of all."""
     return condition_frames(
         recordings,
         frames,
         condition=condition,
         encoding=experiment.encoding,
         seed=experiment.seed,
-        label=f"{condition.name}, training",
+        part=part,
+        label=_of_part(f"{condition.name}, training", part),
     )
 
 
@@ -115,8 +120,9 @@ def condition_asked_samples(
     recordings: ManifestRef,
     frames: ManifestRef,
     condition: ConditionChoice,
+    part: str | None = None,
 ) -> ManifestRef:
-    """The conditions a generator is asked for; of the same labels for every condition."""
+    """The conditions a generator is asked for; of the same labels for every condition of a `part`, or of all."""
     return condition_samples(
         poses,
         recordings,
@@ -128,8 +134,13 @@ def condition_asked_samples(
         order="in_time" if experiment.temporal_order else "random",
         views=experiment.view,
         seed=experiment.seed,
-        label=f"{condition.name}, to sample",
+        part=part,
+        label=_of_part(f"{condition.name}, to sample", part),
     )
+
+
+def _of_part(label: str, part: str | None) -> str:
+    return label if part is None else f"{label}, {part} alone"
 
 
 COMMAND = Command(

@@ -32,6 +32,7 @@ from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest
+from data_contracts.parts import only_part
 from data_contracts.training_sets import LabelAgreement
 from tasks.stage import Output, Stage
 
@@ -111,7 +112,7 @@ def score_model(
         metric = plugins.load_options(choice)
         predicted, true = prediction, labels
         if sensor is not None and is_on_sensor(choice):
-            sizes = sensor_sizes(data, rows, sensor.recordings)
+            sizes = sensor_sizes(data, rows, only_part(sensor.recordings, sensor.part))
             predicted, true = on_sensor(prediction, labels, sizes, sensor.encoding)
         for group, members in groups:
             try:

@@ -23,11 +23,13 @@ from data_contracts.manifest import Manifest
 class SensorSource:
     """What tells where sensor pixels lie in event images: `recordings` (a manifest, or its reference) and `encoding`.
 
-    The recordings are those of the frames, or of the experiment that synthetic frames were asked for in.
+    The recordings are those of the frames, or of the experiment that synthetic frames were asked for in; with `part`
+    those of one dataset of a union.
     """
 
     recordings: Any
     encoding: EncodingChoice
+    part: str | None = None
 
 
 def is_on_sensor(metric: MetricChoice) -> bool:
