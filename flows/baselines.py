@@ -21,8 +21,7 @@ from flows.prepare_dataset import (
 )
 from flows.sampling import sample_generator
 from flows.settings import flow
-from flows.train_generator import base_model_of
-from tasks.finetune import finetune
+from flows.train_generator import fine_tuned
 from tasks.ingest import ingest
 from tasks.sample import simulate
 from tasks.stage import call_flow, call_together, numbered
@@ -69,8 +68,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         )
         return BaselineFrames(sample_conditions=asked, checkpoint=None, synthetic=synthetic)
     learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition, part)
-    base_model = base_model_of(experiment, baseline.generator)
-    checkpoint = finetune(dataset.frames, learnt, base_model, generator=baseline.generator, seed=seed, label=label)
+    checkpoint = fine_tuned(experiment, dataset.frames, learnt, generator=baseline.generator, seed=seed, label=label)
     synthetic = sample_generator(
         experiment,
         checkpoint,

@@ -197,6 +197,7 @@ class Stage:
         raw_files: RawFiles | None,
         readers: Sequence[str] = (),
         optional: Sequence[str] = (),
+        aside: Sequence[str] = (),
     ) -> None:
         self.function = function
         self.name = function.__name__
@@ -205,6 +206,7 @@ class Stage:
         self.raw_files = raw_files
         self.readers = readers
         self.optional = optional
+        self.aside = aside
         self.signature = inspect.signature(function)
         self.__doc__ = function.__doc__
 
@@ -233,6 +235,17 @@ class Stage:
         found = self.find(key, arguments) if _in_one_run.get() else None
         return found or run_as_task(self.name, label, functools.partial(self.run, key, arguments))
 
+    def is_made(self, *inputs: Any, **settings: Any) -> bool:
+        """Is the artefact there already, which a call with these arguments would make?"""
+        bound = self.signature.bind(None, *inputs, **settings)
+        bound.apply_defaults()
+        arguments = dict(list(bound.arguments.items())[1:])
+        store = Store()
+        key = self.key(arguments, store)
+        # Digests are not known while planning.
+        upstream = None if _plan.get() is not None else self._upstream(arguments)
+        return store.find(self.name, key, upstream) is not None
+
     def check(self, arguments: dict[str, Any]) -> None:
         """Raise `DataError` where the settings do not go together: where a stage is planned, and where it is run."""
 
@@ -243,7 +256,12 @@ class Stage:
     def _materials(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """What of each argument decides the result; of an optional one that is not given nothing."""
         given = {name: value for name, value in arguments.items() if value is not None or name not in self.optional}
-        return {name: _material(value) for name, value in given.items()}
+        return {name: _material(value) for name, value in given.items() if name not in self.aside}
+
+    def _upstream(self, arguments: dict[str, Any]) -> dict[str, str]:
+        """Digests of the inputs, by their keys."""
+        values = [value for name, value in arguments.items() if name not in self.aside]
+        return {ref.key: ref.digest for value in values for ref in _references(value)}
 
     def _key(self, arguments: dict[str, Any], materials: dict[str, Any], store: Store) -> str:
         material: dict[str, Any] = {"stage": self.name, "version": self.version, "table": self.schema.version}
@@ -276,7 +294,7 @@ class Stage:
                 if found is not None:
                     return found, True
                 return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
-        store, upstream = Store(), _upstream(arguments)
+        store, upstream = Store(), self._upstream(arguments)
         with store.lock(key, f"artefact {self.name}/{key}"):
             # Another process may have just finished it.
             found = store.find(self.name, key, upstream, make_room=True)
@@ -286,7 +304,7 @@ class Stage:
 
     def find(self, key: str, arguments: dict[str, Any]) -> ManifestRef | None:
         """The artefact, if it is there and was made from inputs of the same content."""
-        return Store().find(self.name, key, _upstream(arguments))
+        return Store().find(self.name, key, self._upstream(arguments))
 
     def _compute(self, store: Store, key: str, arguments: dict[str, Any], upstream: dict[str, str]) -> ManifestRef:
         if (report := current_report()) is not None:
@@ -402,6 +420,7 @@ def stage(
     raw_files: RawFiles | None = None,
     readers: Sequence[str] = (),
     optional: Sequence[str] = (),
+    aside: Sequence[str] = (),
 ) -> Callable[[Callable[..., pa.Table]], Stage]:
     """Make a function a stage.
 
@@ -411,18 +430,14 @@ def stage(
         raw_files: names the files from outside the store that the stage reads.
         readers: kinds of plug-ins that read them, found by what is in the files: one that is mended reads all anew.
         optional: parameters that leave the key as it is where they are None: what is stored without them stays valid.
+        aside: parameters that spare work and change no result: they are in neither key nor record.
     """
-    return lambda function: Stage(function, version, schema, raw_files, readers, optional)
+    return lambda function: Stage(function, version, schema, raw_files, readers, optional, aside)
 
 
 def _run_stage(module: str, name: str, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
     """`Stage.run` in another process."""
     return getattr(importlib.import_module(module), name).run(key, arguments)
-
-
-def _upstream(arguments: dict[str, Any]) -> dict[str, str]:
-    """Digests of the inputs, by their keys."""
-    return {ref.key: ref.digest for value in arguments.values() for ref in _references(value)}
 
 
 def _references(value: Any) -> list[ManifestRef]:

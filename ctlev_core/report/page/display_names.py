@@ -93,6 +93,7 @@ STAGES = {
     "condition_frames": "Conditions of recorded frames",
     "condition_samples": "Conditions to sample from",
     "pretrain": "Base model",
+    "encode_latents": "Latents of recorded frames",
     "finetune": "Training of generators",
     "sample": "Sampled frames",
     "simulate": "Simulated frames",
