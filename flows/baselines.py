@@ -68,7 +68,15 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         )
         return BaselineFrames(sample_conditions=asked, checkpoint=None, synthetic=synthetic)
     learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition, part)
-    checkpoint = fine_tuned(experiment, dataset.frames, learnt, generator=baseline.generator, seed=seed, label=label)
+    checkpoint = fine_tuned(
+        experiment,
+        dataset.frames,
+        learnt,
+        generator=baseline.generator,
+        seed=seed,
+        label=label,
+        of_all=part is None,
+    )
     synthetic = sample_generator(
         experiment,
         checkpoint,

@@ -47,12 +47,24 @@ def fine_tuned(
     generator: GeneratorChoice,
     seed: int,
     label: str,
+    of_all: bool = True,
 ) -> ManifestRef:
-    """The checkpoint of a generator; its frames are encoded first, once for several, where that is dear."""
+    """The checkpoint of a generator; its frames are encoded first, once for several, where that is dear.
+
+    Args:
+        experiment: what is asked for.
+        frames: recorded ones.
+        conditions: of the training frames among them.
+        generator: what learns.
+        seed: of it.
+        label: of the stage.
+        of_all: the conditions are those of every training frame. Of some, other batches would be encoded together than
+            in the stage, and the last bits of latents may hang on that.
+    """
     base_model = base_model_of(experiment, generator)
     asked: dict[str, Any] = {"generator": generator, "seed": seed}
     plugin, latents = plugins.load_options(generator), None
-    if base_model is None and isinstance(plugin.module, GeneratorOfLatents):
+    if of_all and base_model is None and isinstance(plugin.module, GeneratorOfLatents):
         options = plugin.module.latent_options(plugin.options)
         # A checkpoint that is there does not need them.
         if options is not None and not finetune.is_made(frames, conditions, **asked):
