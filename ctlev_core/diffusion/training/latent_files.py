@@ -36,6 +36,8 @@ ENCODE_BATCH = 32
 """Images that are encoded at once, unless memory runs out: of 512 px each takes .7 GB in Stable Diffusion's."""
 FILE_FRAMES = 1024
 """Frames of a file of the stage, whole batches: what a killed run loses at most. 128 MB for 512 px and no turns."""
+CHECK_BYTES = 8 << 20
+"""Latents that are looked at together; in float64 they take twice as much."""
 MEAN, STD = "mean", "std"
 
 
@@ -130,7 +132,7 @@ def check_latents(latents: Latents, count: int, scaling_factor: float) -> None:
     squares = []
     for name, values in (("mean", latents.mean), ("standard deviation", latents.std)):
         start = 0
-        for chunk in () if values is None else image_chunks(values):
+        for chunk in () if values is None else image_chunks(values, CHECK_BYTES):
             wrong = np.flatnonzero(~np.isfinite(chunk.reshape(len(chunk), -1)).all(axis=1))
             if len(wrong):
                 raise DataError(
