@@ -313,6 +313,29 @@ class GeneratorFromWeights(Generator, Protocol):
 
 
 @runtime_checkable
+class GeneratorOfLatents(Generator, Protocol):
+    """A generator that learns from latents of frames, which may be encoded before, once for several trainings."""
+
+    def latent_options(self, options: Any) -> Any:
+        """`LatentOptions` of the stage that encodes them; None: each training does so itself."""
+        ...
+
+    def train_from_latents(
+        self,
+        frames: Images,
+        conditions: Conditions,
+        options: Any,
+        *,
+        latents: Any,
+        seed: int,
+        out: Path,
+        work: Path,
+    ) -> History:
+        """As `train`, with the same result; `latents` are those of the frames."""
+        ...
+
+
+@runtime_checkable
 class GeneratorOfNames(Generator, Protocol):
     """A generator that reads words, and can tell which names are alike to it."""
 
@@ -472,6 +495,13 @@ class MetricOfSkeletons(Metric, Protocol):
     def check_joint_set(self, joint_set: str, options: Any) -> None:
         """Raise `ValueError` for a joint set, a key of `geometry.joint_sets.JOINT_SETS` or empty, without them."""
         ...
+
+
+@runtime_checkable
+class MetricOnSensor(Metric, Protocol):
+    """A metric of `joints2d` that is given predictions and labels in px of the sensor rather than of the image."""
+
+    IN_SENSOR_PX: bool
 
 
 @runtime_checkable

@@ -49,6 +49,11 @@ class Baseline(Frozen):
     poses: DatasetChoice | None = Field(
         None, description="another dataset whose poses it is asked for; None = those of the experiment"
     )
+    part: str | None = Field(
+        None,
+        description="the dataset of a union that it learns from, and whose labels it is asked for; tested on all; "
+        "None = every one",
+    )
 
     @property
     def sampling_choice(self) -> SamplingChoice:
@@ -234,6 +239,19 @@ class Experiment(Frozen):
             parts = mixture.split("+")
             if len(parts) < 2 or len(set(parts)) < len(parts) or not set(parts) <= known:
                 raise ValueError(f"mixtures join different ones of {', '.join(sorted(known))} by +, got {mixture!r}")
+        return self
+
+    @model_validator(mode="after")
+    def _baselines_learn_from_parts_that_there_are(self) -> Experiment:
+        parts = self.dataset.options.get("parts", {}) if self.dataset.name == "union" else {}
+        for name, baseline in self.baselines.items():
+            if baseline.part is None:
+                continue
+            if baseline.part not in parts:
+                known = f"one of {', '.join(parts)}" if parts else "a dataset that is a union"
+                raise ValueError(f"baselines.{name}.part: expected {known}, got {baseline.part!r}")
+            if baseline.poses or self.poses or self.target:
+                raise ValueError(f"baselines.{name}.part: it is asked for labels of that part; leave out other poses")
         return self
 
     @property

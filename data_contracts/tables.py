@@ -180,6 +180,15 @@ TRAINING = TableSchema(
         Column("loss", pa.float64(), "mean loss since the last logged step"),
     ),
 )
+LATENTS = TableSchema(
+    "latents",
+    1,
+    None,
+    (
+        Column("sample_id", pa.string(), "the frame; rows of the files `mean_NNNN`, in order, are rows of this table"),
+        Column("quarter_turns", pa.int32(), "turns against the clock before it was encoded", minimum=0, maximum=3),
+    ),
+)
 SYNTHETIC = TableSchema(
     "synthetic",
     4,
@@ -346,6 +355,7 @@ _ALL = (
     FRAMES,
     CONDITIONS,
     TRAINING,
+    LATENTS,
     SYNTHETIC,
     EVENT_STREAMS,
     SCORES,

@@ -21,8 +21,7 @@ from flows.prepare_dataset import (
 )
 from flows.sampling import sample_generator
 from flows.settings import flow
-from flows.train_generator import base_model_of
-from tasks.finetune import finetune
+from flows.train_generator import fine_tuned
 from tasks.ingest import ingest
 from tasks.sample import simulate
 from tasks.stage import call_flow, call_together, numbered
@@ -50,10 +49,11 @@ def baselines(experiment: Experiment, dataset: PreparedDataset | None = None) ->
 
 def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: int) -> BaselineFrames:
     baseline, seed, label = experiment.baselines[name], experiment.seed + number, numbered(name, number)
+    part = baseline.part
     poses = dataset.poses
     if baseline.poses is not None:
         poses = ingest(dataset=baseline.poses, label=f"{baseline.poses.name}, poses of {name}")
-    asked = condition_asked_samples(experiment, poses, dataset.recordings, dataset.frames, baseline.condition)
+    asked = condition_asked_samples(experiment, poses, dataset.recordings, dataset.frames, baseline.condition, part)
     if isinstance(plugins.load("generators", baseline.generator.name), EventGenerator):
         synthetic = simulate(
             dataset.recordings,
@@ -63,12 +63,20 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
             encoding=experiment.encoding,
             windows=experiment.windows,
             seed=seed,
+            part=part,
             label=label,
         )
         return BaselineFrames(sample_conditions=asked, checkpoint=None, synthetic=synthetic)
-    learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition)
-    base_model = base_model_of(experiment, baseline.generator)
-    checkpoint = finetune(dataset.frames, learnt, base_model, generator=baseline.generator, seed=seed, label=label)
+    learnt = condition_training_frames(experiment, dataset.recordings, dataset.frames, baseline.condition, part)
+    checkpoint = fine_tuned(
+        experiment,
+        dataset.frames,
+        learnt,
+        generator=baseline.generator,
+        seed=seed,
+        label=label,
+        of_all=part is None,
+    )
     synthetic = sample_generator(
         experiment,
         checkpoint,
@@ -77,6 +85,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         asked,
         sampling=baseline.sampling_choice,
         number=number,
+        part=part,
         label=label,
     )
     return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)

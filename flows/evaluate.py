@@ -6,6 +6,7 @@ import itertools
 import sys
 from functools import partial
 
+from ctlev_core.scoring.sensor_pixels import SensorSource, check_in_image, is_on_sensor
 from data_contracts.config import DownstreamChoice, Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
@@ -80,14 +81,18 @@ def _train_and_score(
     frames = [_frames_of(experiment, dataset, generated, source, seed) for source in training_set.sources]
     label = f"{experiment.downstream.name} on {training_set}, seed {seed}"
     model = train_downstream(frames, downstream=experiment.downstream, seed=seed, label=label)
-    tested = [(dataset.tested_frames, "test", str(training_set), [dataset.poses])]
+    sensor = partial(sensor_of, experiment, dataset.recordings)
+    own = sensor_of(experiment, dataset.tested_recordings)
+    tested = [(dataset.tested_frames, "test", str(training_set), [dataset.poses], own)]
     if training_set == TrainingSet.of(RECORDED):
         # Do the synthetic frames show what their labels say? The recorded row is the best they can do, labels of other
         # frames the worst.
         for name, sets in generated.items():
             made = _of_seed(experiment, sets, seed)
-            tested += [(made, "train", str(LabelAgreement(name)), [])]
-            tested += [(made, "train", str(LabelAgreement(name, shuffled=True)), [])] * (name == SYNTHETIC)
+            part = experiment.baselines[name].part if name in experiment.baselines else None
+            tested += [(made, "train", str(LabelAgreement(name)), [], sensor(part))]
+            if name == SYNTHETIC:
+                tested += [(made, "train", str(LabelAgreement(name, shuffled=True)), [], sensor(part))]
     scores = [
         score_model(
             model,
@@ -99,11 +104,19 @@ def _train_and_score(
             subject=row,
             split=split,
             seed=seed,
+            sensor=seen_by,
             label=f"{label}: {row}",
         )
-        for data, split, row, poses in tested
+        for data, split, row, poses, seen_by in tested
     ]
     return model, scores
+
+
+def sensor_of(experiment: Experiment, recordings: ManifestRef, part: str | None = None) -> SensorSource | None:
+    """What metrics on the sensor need; None where the experiment has none, whose scores then keep their keys."""
+    if not any(map(is_on_sensor, experiment.metrics)):
+        return None
+    return SensorSource(recordings, experiment.encoding, part)
 
 
 def _frames_of(
@@ -115,6 +128,7 @@ def _frames_of(
     if source.name == ORACLE and dataset.more_frames is not None:
         return dataset.more_frames
     if source.name == LABEL_CONSISTENT:
+        check_in_image(experiment.metrics[0], "keep_fraction")
         synthetic = _of_seed(experiment, generated[SYNTHETIC], seed)
         real = [dataset.tested_frames]
         judge = train_downstream(real, downstream=experiment.downstream, seed=seed, label="judge of labels")

@@ -158,10 +158,16 @@ def _check_intensity(experiment: Experiment) -> None:
         if plugins.load("conditions", condition.name).NEEDS != "intensity":
             continue
         for dataset in (experiment.dataset, poses):
-            if dataset is not None and not _has_intensity(dataset):
-                raise PluginError(
-                    f"{name}: needs intensity frames, and dataset {dataset.name!r} with these options has none"
-                )
+            if dataset is None:
+                continue
+            for part, choice in _learnt_from(experiment, name, dataset).items():
+                if not _has_intensity(choice):
+                    of = f"part {part!r}, " if part else ""
+                    hint = "; name another by `part` of the baseline" if part and name != "condition" else ""
+                    raise PluginError(
+                        f"{name}: needs intensity frames, and {of}dataset {choice.name!r} with these options has none"
+                        f"{hint}"
+                    )
 
 
 def _check_classes(experiment: Experiment) -> None:
@@ -199,6 +205,15 @@ def _conditions(experiment: Experiment) -> dict[str, tuple[ConditionChoice, Data
     for name, baseline in experiment.baselines.items():
         found[f"baselines.{name}.condition"] = baseline.condition, baseline.poses or asked
     return found
+
+
+def _learnt_from(experiment: Experiment, name: str, dataset: DatasetChoice) -> dict[str, DatasetChoice]:
+    """The dataset; of a union its parts, or the one that the baseline of the setting `name` learns from."""
+    if dataset.name != "union":
+        return {"": dataset}
+    parts = plugins.load_options(dataset).options.parts
+    baseline = experiment.baselines.get(name.removeprefix("baselines.").removesuffix(".condition"))
+    return parts if baseline is None or baseline.part is None else {baseline.part: parts[baseline.part]}
 
 
 def _has_intensity(dataset: DatasetChoice) -> bool:

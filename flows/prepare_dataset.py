@@ -20,7 +20,8 @@ from tasks.subset import take_recorded
 
 class PreparedDataset(Frozen):
     """Manifests of a dataset ready for training and sampling; `poses` are the recordings whose labels are sampled,
-    `more_frames` other recorded frames to train on, `target_frames` those of another dataset to train and test on.
+    `more_frames` other recorded frames to train on, `target_frames` those of another dataset to train and test on, of
+    `target_recordings`.
     """
 
     recordings: ManifestRef
@@ -31,11 +32,17 @@ class PreparedDataset(Frozen):
     contact_sheet: ManifestRef
     more_frames: ManifestRef | None = None
     target_frames: ManifestRef | None = None
+    target_recordings: ManifestRef | None = None
 
     @property
     def tested_frames(self) -> ManifestRef:
         """What downstream models are trained on as `recorded`, and tested on."""
         return self.target_frames or self.frames
+
+    @property
+    def tested_recordings(self) -> ManifestRef:
+        """What these frames are of."""
+        return self.target_recordings or self.recordings
 
 
 @flow(name="prepare-dataset")
@@ -49,9 +56,9 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         frames = take_recorded(
             frames, count=experiment.num_recorded, seed=experiment.seed, label="frames to learn from"
         )
-    poses, target_frames = recordings, None
+    poses, target_frames, target_recordings = recordings, None, None
     if experiment.target is not None:
-        poses = ingest(dataset=experiment.target, label=f"{experiment.target.name}, target")
+        poses = target_recordings = ingest(dataset=experiment.target, label=f"{experiment.target.name}, target")
         target_frames = encode(poses, encoding=experiment.encoding, windows=experiment.windows, label="target")
     if experiment.poses is not None:
         poses = ingest(dataset=experiment.poses, label=f"{experiment.poses.name}, poses")
@@ -74,6 +81,7 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         contact_sheet=sheet,
         more_frames=_more_frames(experiment),
         target_frames=target_frames,
+        target_recordings=target_recordings,
     )
 
 
@@ -88,16 +96,21 @@ def _more_frames(experiment: Experiment) -> ManifestRef | None:
 
 
 def condition_training_frames(
-    experiment: Experiment, recordings: ManifestRef, frames: ManifestRef, condition: ConditionChoice
+    experiment: Experiment,
+    recordings: ManifestRef,
+    frames: ManifestRef,
+    condition: ConditionChoice,
+    part: str | None = None,
 ) -> ManifestRef:
-    """The conditions a generator learns from."""
+    """The conditions a generator learns from; of one `part` of a union, or of all."""
     return condition_frames(
         recordings,
         frames,
         condition=condition,
         encoding=experiment.encoding,
         seed=experiment.seed,
-        label=f"{condition.name}, training",
+        part=part,
+        label=_of_part(f"{condition.name}, training", part),
     )
 
 
@@ -107,8 +120,9 @@ def condition_asked_samples(
     recordings: ManifestRef,
     frames: ManifestRef,
     condition: ConditionChoice,
+    part: str | None = None,
 ) -> ManifestRef:
-    """The conditions a generator is asked for; of the same labels for every condition."""
+    """The conditions a generator is asked for; of the same labels for every condition of a `part`, or of all."""
     return condition_samples(
         poses,
         recordings,
@@ -120,8 +134,13 @@ def condition_asked_samples(
         order="in_time" if experiment.temporal_order else "random",
         views=experiment.view,
         seed=experiment.seed,
-        label=f"{condition.name}, to sample",
+        part=part,
+        label=_of_part(f"{condition.name}, to sample", part),
     )
+
+
+def _of_part(label: str, part: str | None) -> str:
+    return label if part is None else f"{label}, {part} alone"
 
 
 COMMAND = Command(

@@ -22,6 +22,7 @@ from data_contracts.regeneration import Regeneration
 from data_contracts.training_sets import RECORDED, SYNTHETIC, LabelAgreement
 from flows.cli import script
 from flows.command_line import Command, load_experiment
+from flows.evaluate import sensor_of
 from flows.prepare_dataset import PreparedDataset, condition_asked_samples, prepare_dataset
 from flows.sampling import sample_generator
 from flows.settings import flow
@@ -136,8 +137,8 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
     frames, downstream, seed = dataset.tested_frames, regeneration.downstream, regeneration.downstream_seeds[0]
     model = train_downstream([frames], downstream=downstream, seed=seed, label=f"{downstream.name} on recorded")
     scored = [
-        (frames, "test", RECORDED, [dataset.poses]),
-        (synthetic, "train", str(LabelAgreement(SYNTHETIC)), []),
+        (frames, "test", RECORDED, [dataset.poses], dataset.tested_recordings),
+        (synthetic, "train", str(LabelAgreement(SYNTHETIC)), [], dataset.recordings),
     ]
     return [
         score_model(
@@ -150,9 +151,10 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
             subject=subject,
             split=split,
             seed=seed,
+            sensor=sensor_of(regeneration, recordings),
             label=f"{downstream.name}: {subject}",
         )
-        for data, split, subject, poses in scored
+        for data, split, subject, poses, recordings in scored
     ]
 
 

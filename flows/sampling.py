@@ -26,6 +26,7 @@ def sample_generator(
     sampling: SamplingChoice,
     number: int = 0,
     seed: int | None = None,
+    part: str | None = None,
     label: str,
 ) -> ManifestRef:
     """Sampled frames, drawn by a pixel decoder where the experiment asks for one.
@@ -39,6 +40,7 @@ def sample_generator(
         sampling: the generator's sampling options.
         number: of the generator, of several.
         seed: of the noise; None = that of the experiment and of the generator's number.
+        part: of a union, whose training frames alone samples are compared with; None = all.
         label: of the stages.
     """
     decoder = train_decoder(experiment, checkpoint, frames, learnt, sampling=sampling, number=number, label=label)
@@ -50,6 +52,7 @@ def sample_generator(
         max_attempts=experiment.max_attempts,
         rounding=experiment.rounding if decoder is None else None,
         seed=experiment.seed + number if seed is None else seed,
+        part=part,
         label=label,
     )
     if decoder is None:

@@ -14,6 +14,7 @@ from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.report.studies.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
+from ctlev_core.scoring.sensor_pixels import check_in_image
 from data_contracts.config import DownstreamChoice, SamplingChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
@@ -190,6 +191,7 @@ def _errors(
     """Errors of all settings; with label errors by the model that `evaluate` trains on recorded frames."""
     experiment, model = measured.experiment, None
     if measured.options.label_errors:
+        check_in_image(experiment.metrics[0], "label_errors")
         seed = experiment.downstream_seeds[0]
         label = f"{experiment.downstream.name} on recorded, seed {seed}"
         model = train_downstream([dataset.tested_frames], downstream=experiment.downstream, seed=seed, label=label)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ctlev_core import plugins
+from ctlev_core.plugin_contracts import GeneratorOfLatents
 from ctlev_core.plugins import validate_options
 from data_contracts.config import GeneratorChoice
 from data_contracts.experiment import Experiment
@@ -15,6 +16,7 @@ from flows.command_line import Command
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from tasks.finetune import finetune
+from tasks.latents import encode_latents
 from tasks.pretrain import pretrain
 from tasks.stage import call_flow, numbered
 
@@ -27,14 +29,47 @@ def train_generator(experiment: Experiment, dataset: PreparedDataset | None = No
     """Fine-tune the experiment's generator, the `number`-th of several; the dataset is prepared unless it is given."""
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
-    return finetune(
+    return fine_tuned(
+        experiment,
         dataset.frames,
         dataset.frame_conditions,
-        base_model_of(experiment, experiment.generator),
         generator=experiment.generator,
         seed=experiment.seed + number,
         label=numbered(experiment.generator.name, number),
     )
+
+
+def fine_tuned(
+    experiment: Experiment,
+    frames: ManifestRef,
+    conditions: ManifestRef,
+    *,
+    generator: GeneratorChoice,
+    seed: int,
+    label: str,
+    of_all: bool = True,
+) -> ManifestRef:
+    """The checkpoint of a generator; its frames are encoded first, once for several, where that is dear.
+
+    Args:
+        experiment: what is asked for.
+        frames: recorded ones.
+        conditions: of the training frames among them.
+        generator: what learns.
+        seed: of it.
+        label: of the stage.
+        of_all: the conditions are those of every training frame. Of some, other batches would be encoded together than
+            in the stage, and the last bits of latents may hang on that.
+    """
+    base_model = base_model_of(experiment, generator)
+    asked: dict[str, Any] = {"generator": generator, "seed": seed}
+    plugin, latents = plugins.load_options(generator), None
+    if of_all and base_model is None and isinstance(plugin.module, GeneratorOfLatents):
+        options = plugin.module.latent_options(plugin.options)
+        # A checkpoint that is there does not need them.
+        if options is not None and not finetune.is_made(frames, conditions, **asked):
+            latents = encode_latents(frames, latents=options, label=f"{generator.name}, autoencoder")
+    return finetune(frames, conditions, base_model, latents, label=label, **asked)
 
 
 def base_model_of(experiment: Experiment, generator: GeneratorChoice) -> ManifestRef | None:

@@ -21,13 +21,14 @@ from data_contracts.errors import DataError
 from data_contracts.experiment import LabelOrder, View
 from data_contracts.labels import BodyMotions
 from data_contracts.manifest import Manifest, condition_arrays, label_columns
+from data_contracts.parts import only_part
 from tasks.stage import Output, input_files_of, stage
 
 BLOCK_ROWS = 256
 """Rows rendered at a time; pictures of 512 x 512 px take 0.2 GiB."""
 
 
-@stage(version=5, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
+@stage(version=5, schema=tables.CONDITIONS, raw_files=input_files_of("condition"), optional=("part",))
 def condition_frames(
     out: Output,
     recordings: Manifest,
@@ -36,8 +37,10 @@ def condition_frames(
     condition: ConditionChoice,
     encoding: EncodingChoice,
     seed: int,
+    part: str | None = None,
 ) -> pa.Table:
-    """Render the condition of every training frame; rows join the frames on `sample_id`."""
+    """Render the condition of every training frame, or those of one `part`; rows join the frames on `sample_id`."""
+    recordings, frames = only_part(recordings, part), only_part(frames, part)
     rows = rows_of_frames(recordings, frames, frames.rows_where(split="train"))
     return _render(out, rows.source_ids, rows, condition, recordings, frames, encoding, seed)
 
@@ -66,7 +69,7 @@ def condition_some_frames(
     return _render(out, chosen.source_ids, chosen, condition, recordings, frames, encoding, seed)
 
 
-@stage(version=8, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
+@stage(version=8, schema=tables.CONDITIONS, raw_files=input_files_of("condition"), optional=("part",))
 def condition_samples(
     out: Output,
     poses: Manifest,
@@ -80,8 +83,13 @@ def condition_samples(
     order: LabelOrder,
     views: View,
     seed: int,
+    part: str | None = None,
 ) -> pa.Table:
-    """Choose `count` labels to sample from, as `choose_rows_to_sample` says, and render them."""
+    """Choose `count` labels to sample from, as `choose_rows_to_sample` says, and render them.
+
+    With a `part` of a union they are chosen as if it were all there is.
+    """
+    poses, recordings, frames = (only_part(one, part) for one in (poses, recordings, frames))
     rows = choose_rows_to_sample(
         poses,
         recordings,

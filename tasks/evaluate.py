@@ -18,6 +18,7 @@ from ctlev_core.plugin_contracts import (
 )
 from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
 from ctlev_core.scoring.scored_rows import score_each_row, score_rows
+from ctlev_core.scoring.sensor_pixels import SensorSource, is_on_sensor, on_sensor, sensor_sizes
 from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, part_groups, subject_groups
 from ctlev_core.statistics.feature_distances import (
     DISTANCE_ESTIMATES,
@@ -31,6 +32,7 @@ from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest
+from data_contracts.parts import only_part
 from data_contracts.training_sets import LabelAgreement
 from tasks.stage import Output, Stage
 
@@ -44,6 +46,8 @@ class _ModelScores(Stage):
     def check(self, arguments: dict[str, Any]) -> None:
         check_metrics(arguments["downstream"], arguments["metrics"])
         check_frames(arguments["metrics"], arguments["data"].path)
+        if arguments["sensor"] is None and any(map(is_on_sensor, arguments["metrics"])):
+            raise DataError("score_model: a metric in px of the sensor needs the argument `sensor`")
 
 
 class _DistanceScores(Stage):
@@ -53,7 +57,7 @@ class _DistanceScores(Stage):
         check_distances(arguments["downstream"], arguments["distances"])
 
 
-@partial(_ModelScores, version=9, schema=tables.SCORES, raw_files=None)
+@partial(_ModelScores, version=9, schema=tables.SCORES, raw_files=None, optional=("sensor",))
 def score_model(
     out: Output,
     model: Manifest,
@@ -66,6 +70,7 @@ def score_model(
     subject: str,
     split: str,
     seed: int,
+    sensor: SensorSource | None = None,
 ) -> pa.Table:
     """Every metric on one split, for all rows and for each class, with an interval over recordings.
 
@@ -73,7 +78,7 @@ def score_model(
     that neither has are groups of their own: what synthetic data adds is in the second. So are subjects of whom there
     is nothing to learn from, beside others, and each of a few subjects (`ctlev_core.scoring.subsets`). Beside the table
     lie the scores of the single samples, from which two models can be compared in pairs. The subject of
-    shuffled label agreement gives every frame the labels of another.
+    shuffled label agreement gives every frame the labels of another. Metrics on the sensor need `sensor`.
 
     Raises:
         DataError: the split has no rows, or a recording is both learnt from and tested on.
@@ -105,16 +110,20 @@ def score_model(
     groups = _groups(labels.class_names, data, rows, poses, split)
     for choice in metrics:
         metric = plugins.load_options(choice)
+        predicted, true = prediction, labels
+        if sensor is not None and is_on_sensor(choice):
+            sizes = sensor_sizes(data, rows, only_part(sensor.recordings, sensor.part))
+            predicted, true = on_sensor(prediction, labels, sizes, sensor.encoding)
         for group, members in groups:
             try:
-                scores, low, high = score_rows(metric, prediction, labels.take(members), members, recordings[members])
+                scores, low, high = score_rows(metric, predicted, true.take(members), members, recordings[members])
             except ValueError:
                 if group == "all":
                     raise
                 continue  # a class without a visible joint, for example, has no score of its own
             if group == "all" and isinstance(metric.module, MetricOfRows):
                 columns = {"sample_id": sample_ids, "recording_id": recordings}
-                sample_scores.append(pa.table(columns | score_each_row(metric, prediction, labels, scores)))
+                sample_scores.append(pa.table(columns | score_each_row(metric, predicted, true, scores)))
             found += [
                 {
                     **same,

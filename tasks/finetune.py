@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,26 +24,34 @@ def _base_model_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     return files_of(places) + [(f"rehearsal/{name}", path) for name, path in files_of(shown)]
 
 
-@stage(version=1, schema=tables.TRAINING, raw_files=_base_model_files)
+@stage(version=1, schema=tables.TRAINING, raw_files=_base_model_files, aside=("latents",))
 def finetune(
     out: Output,
     frames: Manifest,
     conditions: Manifest,
     base_model: Manifest | None = None,
+    latents: Manifest | None = None,
     *,
     generator: GeneratorChoice,
     seed: int,
 ) -> pa.Table:
     """Tune the base model on the training frames; the artefact's `checkpoint/` is an ordinary diffusers folder.
 
-    With `base_model`, an artefact of pre-training, that is the base model.
+    With `base_model`, an artefact of pre-training, that is the base model. With `latents`, those of the training frames
+    from its autoencoder, the frames are not encoded again; weights are the same.
     """
     plugin = plugins.load_options(generator)
     rows = matching_rows(frames, conditions)
     options = plugin.options
     if base_model is not None:
         options = options.model_copy(update={"base_model": base_model.ref.path / "base_model"})
-    history = plugin.module.train(
+    train = plugin.module.train
+    if latents is not None:
+        from ctlev_core.diffusion.training.latent_files import stored_latents
+
+        stored = stored_latents(latents, conditions.column("sample_id"), options.num_turns)
+        train = partial(plugin.module.train_from_latents, latents=stored)
+    history = train(
         frames.images(rows),
         conditions_of(conditions),
         options,

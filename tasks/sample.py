@@ -36,6 +36,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 from data_contracts.labels import Conditions
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef, by_recording, conditions_of, read_manifest
+from data_contracts.parts import only_part
 from tasks.stage import Output, input_files_of, stage
 from tasks.workers import map_shards
 
@@ -49,7 +50,7 @@ MAX_FILTER_FRAMES = 2_000
 """Training frames the quality filter is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
-@stage(version=3, schema=tables.SYNTHETIC)
+@stage(version=3, schema=tables.SYNTHETIC, optional=("part",))
 def sample(
     out: Output,
     checkpoint: Manifest,
@@ -60,13 +61,16 @@ def sample(
     max_attempts: int,
     seed: int,
     rounding: EncodingChoice | None = None,
+    part: str | None = None,
 ) -> pa.Table:
     """One frame per condition row, each from a seed of its own; the labels come along unchanged.
 
     A row whose frame cannot be an event image, beside the training frames among `frames`, is sampled again, in all
     `max_attempts` times. If the last is rejected too it is kept, and says why. With `rounding`, the encoding of the
-    training frames, each frame becomes the rendering of event counts that it is the expectation of.
+    training frames, each frame becomes the rendering of event counts that it is the expectation of. Training frames are
+    those of one `part` of a union where one is named.
     """
+    frames = only_part(frames, part)
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
     num_events = None if rounding is None else training_counts(frames)
     folder = checkpoint.ref.path / "checkpoint"
@@ -121,7 +125,7 @@ def quality_filter_of(frames: Manifest) -> QualityFilter:
     return fit_quality_filter(real, polarity=not real[..., 1].any())
 
 
-@stage(version=2, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"))
+@stage(version=2, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"), optional=("part",))
 def simulate(
     out: Output,
     recordings: Manifest,
@@ -132,6 +136,7 @@ def simulate(
     encoding: EncodingChoice,
     windows: Windows,
     seed: int,
+    part: str | None = None,
 ) -> pa.Table:
     """The events of each condition row on a sensor like that of `recordings`, encoded as those are.
 
@@ -140,8 +145,10 @@ def simulate(
     frame. What the quality filter of `sample` would reject says so, but is not simulated again: a body that keeps still
     would send no events then either.
 
-    A generator that can be calibrated is, on the training recordings; `calibration.json` says with what result.
+    A generator that can be calibrated is, on the training recordings; `calibration.json` says with what result. With a
+    `part` of a union the sensor is the first of that part, and training recordings are those of it.
     """
+    recordings, frames = only_part(recordings, part), only_part(frames, part)
     plugin, size = plugins.load_options(sampling), sensor_size_of(recordings)
     try:
         plugin.module.sample_events(conditions_of(conditions).take(slice(0, 1)), size, plugin.options, seeds=[0])

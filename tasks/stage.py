@@ -196,6 +196,8 @@ class Stage:
         schema: TableSchema,
         raw_files: RawFiles | None,
         readers: Sequence[str] = (),
+        optional: Sequence[str] = (),
+        aside: Sequence[str] = (),
     ) -> None:
         self.function = function
         self.name = function.__name__
@@ -203,6 +205,8 @@ class Stage:
         self.schema = schema
         self.raw_files = raw_files
         self.readers = readers
+        self.optional = optional
+        self.aside = aside
         self.signature = inspect.signature(function)
         self.__doc__ = function.__doc__
 
@@ -220,7 +224,7 @@ class Stage:
         arguments = dict(list(bound.arguments.items())[1:])
         self.check(arguments)
         store = Store()
-        materials = {name: _material(value) for name, value in arguments.items()}
+        materials = self._materials(arguments)
         key = self._key(arguments, materials, store)
         label = f"{self.name}: {label}" if label else self.name
         plan = _plan.get()
@@ -231,12 +235,33 @@ class Stage:
         found = self.find(key, arguments) if _in_one_run.get() else None
         return found or run_as_task(self.name, label, functools.partial(self.run, key, arguments))
 
+    def is_made(self, *inputs: Any, **settings: Any) -> bool:
+        """Is the artefact there already, which a call with these arguments would make?"""
+        bound = self.signature.bind(None, *inputs, **settings)
+        bound.apply_defaults()
+        arguments = dict(list(bound.arguments.items())[1:])
+        store = Store()
+        key = self.key(arguments, store)
+        # Digests are not known while planning.
+        upstream = None if _plan.get() is not None else self._upstream(arguments)
+        return store.find(self.name, key, upstream) is not None
+
     def check(self, arguments: dict[str, Any]) -> None:
         """Raise `DataError` where the settings do not go together: where a stage is planned, and where it is run."""
 
     def key(self, arguments: dict[str, Any], store: Store) -> str:
         """The cache key: 32 hexadecimal digits of a SHA-256."""
-        return self._key(arguments, {name: _material(value) for name, value in arguments.items()}, store)
+        return self._key(arguments, self._materials(arguments), store)
+
+    def _materials(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """What of each argument decides the result; of an optional one that is not given nothing."""
+        given = {name: value for name, value in arguments.items() if value is not None or name not in self.optional}
+        return {name: _material(value) for name, value in given.items() if name not in self.aside}
+
+    def _upstream(self, arguments: dict[str, Any]) -> dict[str, str]:
+        """Digests of the inputs, by their keys."""
+        values = [value for name, value in arguments.items() if name not in self.aside]
+        return {ref.key: ref.digest for value in values for ref in _references(value)}
 
     def _key(self, arguments: dict[str, Any], materials: dict[str, Any], store: Store) -> str:
         material: dict[str, Any] = {"stage": self.name, "version": self.version, "table": self.schema.version}
@@ -269,7 +294,7 @@ class Stage:
                 if found is not None:
                     return found, True
                 return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
-        store, upstream = Store(), _upstream(arguments)
+        store, upstream = Store(), self._upstream(arguments)
         with store.lock(key, f"artefact {self.name}/{key}"):
             # Another process may have just finished it.
             found = store.find(self.name, key, upstream, make_room=True)
@@ -279,7 +304,7 @@ class Stage:
 
     def find(self, key: str, arguments: dict[str, Any]) -> ManifestRef | None:
         """The artefact, if it is there and was made from inputs of the same content."""
-        return Store().find(self.name, key, _upstream(arguments))
+        return Store().find(self.name, key, self._upstream(arguments))
 
     def _compute(self, store: Store, key: str, arguments: dict[str, Any], upstream: dict[str, str]) -> ManifestRef:
         if (report := current_report()) is not None:
@@ -299,7 +324,7 @@ class Stage:
                 "stage": self.name,
                 "stage_version": self.version,
                 "key": key,
-                "arguments": {name: _material(value) for name, value in arguments.items()},
+                "arguments": self._materials(arguments),
                 "upstream": upstream,
                 "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
                 "wall_seconds": round(time.perf_counter() - wall, 3),
@@ -389,7 +414,13 @@ def input_files_of(argument: str) -> RawFiles:
 
 
 def stage(
-    *, version: int, schema: TableSchema, raw_files: RawFiles | None = None, readers: Sequence[str] = ()
+    *,
+    version: int,
+    schema: TableSchema,
+    raw_files: RawFiles | None = None,
+    readers: Sequence[str] = (),
+    optional: Sequence[str] = (),
+    aside: Sequence[str] = (),
 ) -> Callable[[Callable[..., pa.Table]], Stage]:
     """Make a function a stage.
 
@@ -398,18 +429,15 @@ def stage(
         schema: of the table the function returns.
         raw_files: names the files from outside the store that the stage reads.
         readers: kinds of plug-ins that read them, found by what is in the files: one that is mended reads all anew.
+        optional: parameters that leave the key as it is where they are None: what is stored without them stays valid.
+        aside: parameters that spare work and change no result: they are in neither key nor record.
     """
-    return lambda function: Stage(function, version, schema, raw_files, readers)
+    return lambda function: Stage(function, version, schema, raw_files, readers, optional, aside)
 
 
 def _run_stage(module: str, name: str, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
     """`Stage.run` in another process."""
     return getattr(importlib.import_module(module), name).run(key, arguments)
-
-
-def _upstream(arguments: dict[str, Any]) -> dict[str, str]:
-    """Digests of the inputs, by their keys."""
-    return {ref.key: ref.digest for value in arguments.values() for ref in _references(value)}
 
 
 def _references(value: Any) -> list[ManifestRef]:

@@ -10,17 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
 
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.training.options import FineTuningOptions
+from ctlev_core.diffusion.training.options import FineTuningOptions, LatentOptions
 from data_contracts.config import RUN_SETTING, ConditionChoice
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images
 from data_contracts.labels import Conditions, History
+
+if TYPE_CHECKING:  # torch, which plans do without
+    from ctlev_core.diffusion.training.latent_files import Latents
 
 VERSION = 3
 
@@ -71,6 +74,13 @@ def check_fit(options: Options, image_size: tuple[int, int] | None, condition: C
     fit.check_fit(base_model, image_size, condition, controlnet=options.controlnet, with_controlnet=True)
 
 
+def latent_options(options: Options) -> LatentOptions | None:
+    """How frames are encoded before a training; None where it encodes them itself."""
+    from ctlev_core.diffusion.training.latent_choice import choose_latents
+
+    return choose_latents(options)
+
+
 def train(frames: Images, conditions: Conditions, options: Options, *, seed: int, out: Path, work: Path) -> History:
     """Fine-tune on event images and write a `StableDiffusionControlNetPipeline` folder.
 
@@ -88,6 +98,20 @@ def train(frames: Images, conditions: Conditions, options: Options, *, seed: int
         ValueError: options do not go together, frames do not fit the base model or the conditions, or
             there are no condition images.
     """
+    return train_from_latents(frames, conditions, options, latents=None, seed=seed, out=out, work=work)
+
+
+def train_from_latents(
+    frames: Images,
+    conditions: Conditions,
+    options: Options,
+    *,
+    latents: Latents | None,
+    seed: int,
+    out: Path,
+    work: Path,
+) -> History:
+    """`train`, with the latents of its frames where they were encoded before: the weights are the same."""
     from ctlev_core.diffusion.training.entry import train_checkpoint
 
     _check_images(conditions)
@@ -101,6 +125,7 @@ def train(frames: Images, conditions: Conditions, options: Options, *, seed: int
         seed=seed,
         out=out,
         work=work,
+        latents=latents,
     )
 
 

@@ -82,11 +82,17 @@ def labels_in_image(
         joints = map_points(labels.joints2d).astype(np.float32)
         moved = {"joints2d": joints, "visible": labels.visible & is_inside(joints, image_size)}
     if labels.intrinsics is not None:
-        offset, unit = map_points(np.array([[0.0, 0.0], [1.0, 1.0]]))
-        focal = labels.intrinsics[:, :2] * (unit - offset)
+        scale, _ = scale_and_offset(map_points)
+        focal = labels.intrinsics[:, :2] * scale
         centre = map_points(labels.intrinsics[:, 2:].astype(np.float64))
         moved["intrinsics"] = np.concatenate([focal, centre], axis=1).astype(np.float32)
     return replace(labels, **moved)
+
+
+def scale_and_offset(map_points: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Image px = scale [2] * sensor px + offset [2], of the map that an encoding has for points of a sensor."""
+    offset, unit = map_points(np.array([[0.0, 0.0], [1.0, 1.0]]))
+    return unit - offset, offset
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:

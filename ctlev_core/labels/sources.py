@@ -10,6 +10,7 @@ import numpy as np
 from ctlev_core import plugins
 from ctlev_core.events.image_resampling import resample_images
 from ctlev_core.labels import label_windows
+from ctlev_core.labels.labelling import scale_and_offset
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
@@ -137,9 +138,8 @@ def read_motions(rows: LabelledRows, recordings: Manifest, frames: Manifest, enc
     motions = label_windows.body_motions([found[row] for row in range(len(found))], rows.labelled, rows.labels, where)
     # Simulated events are encoded as the real ones are, so they come from a sensor of the real one's size.
     plugin, size = plugins.load_options(encoding), sensor_size_of(recordings)
-    offset, unit = plugin.module.map_points(np.array([[0.0, 0.0], [1.0, 1.0]]), size, plugin.options)
-    scale = np.tile(unit - offset, 2)
-    on_sensor = (motions.intrinsics - np.array([0.0, 0.0, *offset])) / scale
+    scale, offset = scale_and_offset(lambda points: plugin.module.map_points(points, size, plugin.options))
+    on_sensor = (motions.intrinsics - np.array([0.0, 0.0, *offset])) / np.tile(scale, 2)
     return replace(motions, intrinsics=on_sensor.astype(np.float32))
 
 

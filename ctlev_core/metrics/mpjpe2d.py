@@ -9,14 +9,12 @@ label by up to half a pixel; by default labels stay where they are.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from ctlev_core.scoring.pose import Counted, Sums, compute_joint_errors_px, quotients, row_means, row_sums
+from ctlev_core.scoring.pose import JointErrorOptions, Sums, quotients, row_means, row_sums
 from ctlev_core.scoring.score_info import ScoreInfo
-from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 VERSION = 1
@@ -30,15 +28,8 @@ SCORES = (
 )
 
 
-class Options(Frozen):
+class Options(JointErrorOptions):
     """Which joints count, and how labels are read."""
-
-    joints: Counted = Field(
-        default="visible", description="joints that count: those visible, or all whose position is known"
-    )
-    protocol: Literal["exact", "dhp19"] = Field(
-        default="exact", description="labels as they are, or moved to the centre of their pixel as DHP19's code does"
-    )
 
 
 def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> dict[str, float]:
@@ -58,15 +49,9 @@ def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> d
 
 def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options) -> Sums:
     """Of each row the sum [N] px and number [N] of its errors; `compute` is their quotient over all rows."""
-    protocol = "_dhp19" if options.protocol == "dhp19" else ""
-    counted = "_known" if options.joints == "known" else ""
-    return {f"mpjpe2d{protocol}{counted}_px": row_sums(_errors_px(predicted, target, options))}
+    return {f"mpjpe2d{options.suffix}": row_sums(options.errors_px(predicted, target))}
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
     """Mean error [N] px of each row, NaN for a row without a joint that counts: what intervals are made of."""
-    return row_means(_errors_px(predicted, target, options))
-
-
-def _errors_px(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:
-    return compute_joint_errors_px(predicted, target, options.joints, whole_pixels=options.protocol == "dhp19")
+    return row_means(options.errors_px(predicted, target))

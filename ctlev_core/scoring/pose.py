@@ -6,15 +6,37 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.geometry.procrustes import align_similarity
+from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
 Alignment = Literal["none", "pelvis", "procrustes"]
 Counted = Literal["visible", "known"]
 Sums = dict[str, tuple[np.ndarray, np.ndarray]]
 """Of each score, by name, numerators [N] and denominators [N] of the rows."""
+
+
+class JointErrorOptions(Frozen):
+    """Which joints count in the image, and how labels are read."""
+
+    joints: Counted = Field(
+        default="visible", description="joints that count: those visible, or all whose position is known"
+    )
+    protocol: Literal["exact", "dhp19"] = Field(
+        default="exact", description="labels as they are, or moved to the centre of their pixel as DHP19's code does"
+    )
+
+    @property
+    def suffix(self) -> str:
+        """What the name of a score says of them."""
+        return ("_dhp19" if self.protocol == "dhp19" else "") + ("_known" if self.joints == "known" else "") + "_px"
+
+    def errors_px(self, predicted: Mapping[str, Any], target: Labels) -> np.ndarray:
+        """`compute_joint_errors_px` by these options."""
+        return compute_joint_errors_px(predicted, target, self.joints, whole_pixels=self.protocol == "dhp19")
 
 
 def compute_joint_errors_px(

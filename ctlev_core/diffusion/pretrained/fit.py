@@ -27,6 +27,15 @@ def check_fit(
         controlnet: as for `find_controlnet`.
         with_controlnet: the ControlNet is used.
     """
+    check_image_size(base_model, image_size)
+    place = find_controlnet(base_model, controlnet) if with_controlnet else None
+    if place is not None:
+        order = read_controlnet(place).config.get("controlnet_conditioning_channel_order", "rgb")
+        check_channel_order(order, condition)
+
+
+def check_image_size(base_model: Path, image_size: tuple[int, int] | None) -> None:
+    """Raise `DataError` where event images are not of the size that a base model makes; arguments as `check_fit`."""
     parts = read_parts(base_model).parts
     side = parts["unet"].config["sample_size"] * 2 ** (len(parts["vae"].config["block_out_channels"]) - 1)
     if image_size is not None and tuple(image_size) != (side, side):
@@ -34,10 +43,6 @@ def check_fit(
             f"{base_model}: this base model makes images of {side} x {side} px, event images are {image_size[0]} x "
             f"{image_size[1]} px; set encoding.options.image_size=[{side},{side}]"
         )
-    place = find_controlnet(base_model, controlnet) if with_controlnet else None
-    if place is not None:
-        order = read_controlnet(place).config.get("controlnet_conditioning_channel_order", "rgb")
-        check_channel_order(order, condition)
 
 
 def check_channel_order(order: str, condition: ConditionChoice | None) -> None:

@@ -18,7 +18,7 @@ import torch
 from ctlev_core.diffusion.pretrained.checks import complete_schedule
 from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.model_building import build_model
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, read_base_model_files
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, read_base_model_files, read_parts
 from data_contracts.errors import DataError
 
 logger = logging.getLogger(__name__)
@@ -110,6 +110,15 @@ def load_base_model(
     )
 
 
+def load_autoencoder(path: Path, device: str | torch.device = "cpu") -> Any:
+    """The autoencoder of a base model alone, as `load_base_model` has it in float32.
+
+    Raises:
+        DataError: as `load_base_model`.
+    """
+    return build_model(read_parts(path).parts["vae"], torch.float32).to(device)
+
+
 def _load_tokenizer(folder: Path, max_length: int) -> Any:
     from transformers import CLIPTokenizer
 
@@ -189,14 +198,14 @@ def encode_prompts(base_model: PretrainedModel, prompts: list[str]) -> torch.Ten
     return torch.cat(parts)
 
 
-def encode_posterior(base_model: PretrainedModel, images: Any) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """What the autoencoder makes of images [B, H, W, 3] uint8, not scaled, on its device.
+def encode_posterior(vae: Any, images: Any) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """What an autoencoder makes of images [B, H, W, 3] uint8, not scaled, on its device.
 
     Returns:
         Means [B, C, h, w] float32 of the latents, and their standard deviations; None for a code without noise.
     """
-    tensor = images_to_tensor(images).to(base_model.vae.device, base_model.vae.dtype)
-    posterior = base_model.vae.encode(tensor).latent_dist
+    tensor = images_to_tensor(images).to(vae.device, vae.dtype)
+    posterior = vae.encode(tensor).latent_dist
     return posterior.mean.float(), posterior.std.float() if hasattr(posterior, "std") else None
 
 

@@ -101,6 +101,13 @@ def base_model_places(
     return list(dict.fromkeys(places))
 
 
+def learned_autoencoder(base_model: Path) -> list[Path] | None:
+    """Folder or files of a learned autoencoder; None where it is the patch code, which costs next to nothing."""
+    if read_parts(base_model).parts["vae"].config.get("_class_name") == "PatchAutoencoder":
+        return None
+    return [base_model, *files_beside(base_model)] if base_model.is_file() else [base_model / "vae"]
+
+
 def find_controlnet(folder: Path, controlnet: Path | None) -> Path | None:
     """The ControlNet that is asked for, else the subfolder `controlnet` of the base model, else None.
 

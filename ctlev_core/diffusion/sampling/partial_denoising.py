@@ -50,7 +50,7 @@ def encode_frames(base_model: PretrainedModel, frames: np.ndarray, seeds: Sequen
         frames: [B, H, W, 3] uint8.
         seeds: B non-negative integers, of what is drawn from the posteriors; a code without noise needs none.
     """
-    latents, deviations = encode_posterior(base_model, frames)
+    latents, deviations = encode_posterior(base_model.vae, frames)
     if deviations is not None:
         latents = latents + deviations * _noise(latents, seeds, ENCODING_STREAM)
     return latents * base_model.scaling_factor

@@ -22,6 +22,7 @@ from ctlev_core.diffusion.sampling.value_table import write_value_table
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.finetuning import Tune, fine_tune, forget_weights
 from ctlev_core.diffusion.training.fsdp import check_sharding, gather_networks, shard_networks
+from ctlev_core.diffusion.training.latent_files import Latents
 from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.diffusion.training.trainer import TrainingHistory
@@ -42,6 +43,7 @@ def train_checkpoint(
     out: Path,
     work: Path,
     class_names: Sequence[str] | None = None,
+    latents: Latents | None = None,
 ) -> TrainingHistory:
     """Load the base model, fine-tune it and write it to `out` as a diffusers folder: `train` of both generators.
 
@@ -56,6 +58,7 @@ def train_checkpoint(
         out: the checkpoint folder to write.
         work: resumable state.
         class_names: N; see `cache_latents`.
+        latents: likewise.
     Raises:
         ValueError: options or data do not fit.
         TrainingError: the loss stayed not finite, or one of several processes failed.
@@ -76,14 +79,14 @@ def train_checkpoint(
     if job["fsdp"]:
         check_sharding(options)
     if count == 1:
-        return _train(frames, conditions, options, job, SINGLE_PROCESS, choose_device(options.device))
+        return _train(frames, conditions, options, job, SINGLE_PROCESS, choose_device(options.device), latents)
     DistributedContext(0, count).batches(options.gradient_accumulation)  # raises before processes are started
     if options.device not in ("auto", "cuda", "cpu"):
         raise ValueError(
             f"device must be auto, cuda or cpu with {count} processes, each takes a GPU of its own, got "
             f"{options.device!r}; choose among GPUs by CUDA_VISIBLE_DEVICES"
         )
-    return _train_in_processes(count, frames, conditions, options, job)
+    return _train_in_processes(count, frames, conditions, options, job, latents)
 
 
 def _train(
@@ -93,6 +96,7 @@ def _train(
     job: Mapping[str, Any],
     distributed: DistributedContext,
     device: torch.device,
+    latents: Latents | None,
 ) -> TrainingHistory:
     controlnet = None if job["controlnet"] is None else Path(job["controlnet"])
     base_model = load_base_model(
@@ -112,6 +116,7 @@ def _train(
         seed=job["seed"],
         work=Path(job["work"]),
         class_names=job["class_names"],
+        latents=latents,
         distributed=distributed,
     )
     written = gather_networks(base_model, keep=distributed.rank == 0) if distributed.sharded else base_model
@@ -124,13 +129,22 @@ def _train(
 
 
 def _train_in_processes(
-    count: int, frames: Images, conditions: Conditions, options: FineTuningOptions, job: dict[str, Any]
+    count: int,
+    frames: Images,
+    conditions: Conditions,
+    options: FineTuningOptions,
+    job: dict[str, Any],
+    latents: Latents | None,
 ) -> TrainingHistory:
     folder = Path(job["work"]) / "job"
     folder.mkdir(parents=True, exist_ok=True)
     as_image_rows(frames).save(folder / "frames")
     if conditions.images is not None:
         as_image_rows(conditions.images).save(folder / "conditions")
+    kinds = {} if latents is None else {"mean": latents.mean, "std": latents.std}
+    for kind, values in kinds.items():
+        if values is not None:
+            as_image_rows(values).save(folder / f"latents_{kind}")
     plain = options.model_dump(mode="json", include=set(FineTuningOptions.model_fields))
     written = {
         **job,
@@ -138,6 +152,7 @@ def _train_in_processes(
         "options": plain,
         "prompts": conditions.prompts,
         "with_images": conditions.images is not None,
+        "latents": [kind for kind, values in kinds.items() if values is not None],
     }
     return train_in_processes(count, __name__, folder, written)
 
@@ -149,7 +164,9 @@ def _train_rank(
     frames = load_image_rows(folder / "frames")
     made_by = None if job["made_by"] is None else ConditionChoice(**job["made_by"])
     conditions = Conditions(tuple(job["prompts"]), images, made_by=made_by)
-    return _train(frames, conditions, FineTuningOptions(**job["options"]), job, distributed, device)
+    stored = {kind: load_image_rows(folder / f"latents_{kind}") for kind in job["latents"]}
+    latents = Latents(stored["mean"], stored.get("std")) if stored else None
+    return _train(frames, conditions, FineTuningOptions(**job["options"]), job, distributed, device, latents)
 
 
 if __name__ == "__main__":

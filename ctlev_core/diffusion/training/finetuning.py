@@ -33,6 +33,7 @@ from ctlev_core.diffusion.training.latent_cache import (
     check_training_data,
     encode_images,
 )
+from ctlev_core.diffusion.training.latent_files import Latents
 from ctlev_core.diffusion.training.loop import check_run, run_training, sample_rows
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.diffusion.training.tensorboard import picture_of_samples
@@ -76,6 +77,7 @@ def fine_tune(
     seed: int,
     work: Path,
     class_names: Sequence[str] | None = None,
+    latents: Latents | None = None,
     distributed: DistributedContext = SINGLE_PROCESS,
 ) -> TrainingHistory:
     """Train the networks named by `tune` in place; autoencoder and text encoder stay frozen.
@@ -90,6 +92,7 @@ def fine_tune(
         work: folder of the resumable state.
         class_names: N; at every step a frame is shown with a random one of the prompts that occur in its class, as the
             paper draws a class name per iteration. None = each frame keeps its own prompt.
+        latents: of the frames, where they were encoded and checked before; None = they are encoded here.
         distributed: which of several processes this is.
     Returns:
         Loss curves; `shuffled_loss` is the validation loss with the conditions of other frames.
@@ -122,17 +125,17 @@ def fine_tune(
     check_run(trainer, distributed, validated=validated)
     denoiser = Denoiser(base_model.unet, base_model.controlnet)
     schedule = NoiseSchedule(base_model.scheduler_config)
-    num_turns = 4 if options.rot90_probability else 1
     cache = cache_latents(
         base_model,
         frames,
         conditions,
         class_names,
-        num_turns=num_turns,
+        num_turns=options.num_turns,
+        latents=latents,
         folder=work,
         distributed=distributed,
     )
-    check_cache(cache, conditions)
+    check_cache(cache, conditions, latents_are_checked=latents is not None)
     base_model.text_encoder.to("cpu")
     num_pictures = round(options.batch_size * options.rehearsal_share)
     rehearsal = Rehearsal(options.rehearsal, base_model.image_size[0]) if num_pictures else None

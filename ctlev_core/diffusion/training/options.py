@@ -176,8 +176,21 @@ class FineTuningOptions(TrainingOptions):
         "less memory of each GPU for more traffic between them; null = as `accelerate launch` was told",
     )
 
+    @property
+    def num_turns(self) -> int:
+        """Quarter turns in which frames may be shown, the one as they are among them."""
+        return 4 if self.rot90_probability else 1
+
     @model_validator(mode="after")
     def _rehearsal_needs_pictures(self) -> Self:
         if self.rehearsal_share and self.rehearsal.root is None:
             raise ValueError("rehearsal_share needs rehearsal.root, the pictures that are shown")
         return self
+
+
+class LatentOptions(Frozen):
+    """How latents are encoded before a training; what the autoencoder is, the digests of its files tell."""
+
+    base_model: Path = Field(json_schema_extra=RUN_SETTING, description="diffusers folder or single file")
+    device: str = Field(default="auto", json_schema_extra=RUN_SETTING, description="as of fine-tuning")
+    num_turns: int = Field(default=1, ge=1, le=4, description="quarter turns, the one as they are among them")

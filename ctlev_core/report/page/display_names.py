@@ -39,10 +39,12 @@ _METRICS = (
     (r"calibration_error_.+", "calibration error", ""),
     (r"binary_accuracy_mean", "one-against-rest accuracy", ""),
     (r"binary_accuracy_(.+)", "one-against-rest accuracy, {0}", ""),
-    (r"mpjpe2d_px", "2D joint error (MPJPE)", "px"),
-    (r"mpjpe2d_dhp19_px", "2D joint error (MPJPE, DHP19 protocol)", "px"),
-    (r"mpjpe2d_known_px", "2D joint error (MPJPE, known joints)", "px"),
-    (r"mpjpe2d_dhp19_known_px", "2D joint error (MPJPE, DHP19 protocol, known joints)", "px"),
+    *(
+        (rf"mpjpe2d_{sensor}{protocol}{counted}px", f"2D joint error (MPJPE{by}{of})", unit)
+        for sensor, unit in (("", "px"), ("sensor_", "sensor px"))
+        for protocol, by in (("", ""), ("dhp19_", ", DHP19 protocol"))
+        for counted, of in (("", ""), ("known_", ", known joints"))
+    ),
     (r"mpjpe3d_(?:(pelvis|pa)_)?mm", "3D joint error (MPJPE{aligned})", "mm"),
     (r"pve_(?:(pelvis|pa)_)?mm", "surface error (PVE{aligned})", "mm"),
     (r"pck_px([\d.]+)", "joints within {0} px (PCK)", ""),
@@ -91,6 +93,7 @@ STAGES = {
     "condition_frames": "Conditions of recorded frames",
     "condition_samples": "Conditions to sample from",
     "pretrain": "Base model",
+    "encode_latents": "Latents of recorded frames",
     "finetune": "Training of generators",
     "sample": "Sampled frames",
     "simulate": "Simulated frames",

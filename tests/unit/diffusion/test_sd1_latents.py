@@ -148,8 +148,8 @@ def test_cached_latents_are_those_of_a_direct_call(frames, latents, base_model_o
         base_model, np.stack(list(frames.values())), Conditions(tuple(f"a {name}" for name in frames))
     )
     direct = torch.stack(list(latents.values()))
-    assert cache.std is None
-    torch.testing.assert_close(torch.from_numpy(cache.mean), direct, rtol=0, atol=0)
+    assert cache.latents.std is None
+    torch.testing.assert_close(torch.from_numpy(cache.latents.mean), direct, rtol=0, atol=0)
     rows = np.array([5, 0, 3])
     batch = cache.batch(rows, torch.Generator().manual_seed(0), 0.0, torch.device("cpu"))
     torch.testing.assert_close(batch.latents, direct[rows] * SCALING_FACTOR)

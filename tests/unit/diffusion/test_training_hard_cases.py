@@ -15,7 +15,7 @@ from ctlev_core.diffusion.pretrained.fit import check_channel_order
 from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_base_model
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
-from ctlev_core.diffusion.training import latent_cache, trainer
+from ctlev_core.diffusion.training import latent_files, trainer
 from ctlev_core.diffusion.training.distributed import DistributedContext
 from ctlev_core.diffusion.training.entry import train_checkpoint
 from ctlev_core.diffusion.training.finetuning import fine_tune
@@ -197,18 +197,18 @@ def test_latents_are_encoded_fewer_at_a_time_where_memory_runs_out(monkeypatch):
     monkeypatch.setattr(base_model.vae, "encode", narrow)
     cache = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
     assert encoded == [4, 2, *[1] * 16]
-    torch.testing.assert_close(cache.mean[:4], whole.mean)
+    torch.testing.assert_close(cache.latents.mean[:4], whole.latents.mean)
 
 
 def with_deviations(base_model, monkeypatch):
     """The base model's code is without noise; here as if it had some."""
-    encode = latent_cache.encode_posterior
+    encode = latent_files.encode_posterior
 
-    def encode_with_deviations(base_model, images):
-        mean, _ = encode(base_model, images)
+    def encode_with_deviations(vae, images):
+        mean, _ = encode(vae, images)
         return mean, mean.abs() + 1
 
-    monkeypatch.setattr(latent_cache, "encode_posterior", encode_with_deviations)
+    monkeypatch.setattr(latent_files, "encode_posterior", encode_with_deviations)
     return base_model
 
 
@@ -216,8 +216,8 @@ def test_latents_on_disk_are_those_in_memory_and_are_encoded_once(tmp_path, monk
     base_model = with_deviations(make_base_model(), monkeypatch)
     whole = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
     stored = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4, folder=tmp_path)
-    np.testing.assert_array_equal(stored.mean, whole.mean)
-    np.testing.assert_array_equal(stored.std, whole.std)
+    np.testing.assert_array_equal(stored.latents.mean, whole.latents.mean)
+    np.testing.assert_array_equal(stored.latents.std, whole.latents.std)
     rows, turns = np.array([3, 0, 2]), np.array([0, 3, 1])
     batches = [
         cache.batch(rows, torch.Generator().manual_seed(0), 0.0, torch.device("cpu"), turns).latents
@@ -230,7 +230,7 @@ def test_latents_on_disk_are_those_in_memory_and_are_encoded_once(tmp_path, monk
 
     monkeypatch.setattr(base_model.vae, "encode", refuse)
     again = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4, folder=tmp_path)
-    np.testing.assert_array_equal(again.mean, whole.mean)
+    np.testing.assert_array_equal(again.latents.mean, whole.latents.mean)
     for other in (FRAMES[::-1], FRAMES[:3]):  # a run of other frames does not take them for its own
         with pytest.raises(AssertionError, match="encoded again"):
             cache_latents(base_model, other, CONDITIONS, num_turns=4, folder=tmp_path)
@@ -238,7 +238,7 @@ def test_latents_on_disk_are_those_in_memory_and_are_encoded_once(tmp_path, monk
 
 def test_each_process_encodes_its_share_of_the_frames(tmp_path, monkeypatch):
     """Process 1 of 3 finds the shares of the others, which have been here before; together they are the whole."""
-    monkeypatch.setattr(latent_cache, "ENCODE_BATCH", 1)
+    monkeypatch.setattr(latent_files, "ENCODE_BATCH", 1)
     base_model, taken = with_deviations(make_base_model(), monkeypatch), []
     whole = cache_latents(base_model, FRAMES, CONDITIONS, num_turns=4)
     encode = base_model.vae.encode
@@ -254,8 +254,8 @@ def test_each_process_encodes_its_share_of_the_frames(tmp_path, monkeypatch):
         base_model, FRAMES, CONDITIONS, num_turns=4, folder=tmp_path, distributed=DistributedContext(1, 3)
     )
     assert sum(taken) == 4 * 2, "two of the four frames in four turns"
-    torch.testing.assert_close(np.asarray(cache.mean), whole.mean)
-    torch.testing.assert_close(np.asarray(cache.std), whole.std)
+    torch.testing.assert_close(np.asarray(cache.latents.mean), whole.latents.mean)
+    torch.testing.assert_close(np.asarray(cache.latents.std), whole.latents.std)
 
 
 def test_many_prompts_are_embedded_some_at_a_time(monkeypatch):

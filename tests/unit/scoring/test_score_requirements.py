@@ -23,8 +23,8 @@ from tasks.stage import call_flow, planning
 
 FITTING = {
     "classifier": {"classification", "zero_shot"},
-    "pose2d": {"mpjpe2d", "oks", "pck2d"},
-    "smpl_regressor": {"mpjpe2d", "oks", "pck2d", "mpjpe3d", "pck3d", "pve"},
+    "pose2d": {"mpjpe2d", "mpjpe2d_sensor", "oks", "pck2d"},
+    "smpl_regressor": {"mpjpe2d", "mpjpe2d_sensor", "oks", "pck2d", "mpjpe3d", "pck3d", "pve"},
     "inception": set(),
     "torchscript": set(),
     "transformers_features": set(),

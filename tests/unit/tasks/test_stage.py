@@ -364,3 +364,21 @@ def test_versions_of_readers_enter_the_key_of_stages_that_read_files(tmp_path, m
             monkeypatch.setattr(plugins, "versions", lambda kind, v=version: {"evt3": v})
             keys.append(reads.key({"windows": Windows(), "seed": 0}, Store()))
     assert keys[0] != keys[1] and keys[2] == keys[3]
+
+
+@stage(version=1, schema=tables.TRAINING, optional=("more",))
+def grown(out, *, seed, more=None):
+    """Has had an option more for a while."""
+    return curve([seed])
+
+
+def test_an_optional_argument_that_is_not_given_leaves_key_and_record_as_they_were():
+    @stage(version=1, schema=tables.TRAINING)
+    def before(out, *, seed):
+        return curve([seed])
+
+    before.name = grown.name
+    assert grown.key({"seed": 1, "more": None}, Store()) == before.key({"seed": 1}, Store())
+    assert grown.key({"seed": 1, "more": 2}, Store()) != before.key({"seed": 1}, Store())
+    made, _ = run(grown, seed=1)
+    assert read_run_record(made.path).arguments == {"seed": 1}
