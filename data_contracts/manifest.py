@@ -171,28 +171,38 @@ def read_manifest(ref: ManifestRef, *, full: bool = False) -> Manifest:
     digest = hashlib.sha256(content).hexdigest()
     if ref.digest and digest != ref.digest:
         raise DataError(f"{path}: content has changed; expected digest {ref.digest[:12]}, got {digest[:12]}")
-    table = read_table(pa.BufferReader(content), path)
-    metadata = table.schema.metadata or {}
-    if _SCHEMA_KEY not in metadata or _FILES_KEY not in metadata:
-        raise DataError(f"{path}: is not a ctlev manifest; its metadata names no schema")
     try:
-        declared, files = json.loads(metadata[_SCHEMA_KEY]), json.loads(metadata[_FILES_KEY])
-        name, version = declared["name"], declared["version"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path}: is not a ctlev manifest; its metadata cannot be read: {error!r}") from error
-    schema = TABLES.get(name)
-    if schema is None:
-        raise DataError(f"{path}: table {name!r}; this code reads {sorted(TABLES)}")
-    if schema.version != version:
-        raise TableVersionError(f"{path}: table {name!r} version {version}; this code reads version {schema.version}")
+        table = read_table(pa.BufferReader(content), path)
+        schema, files = _declared(table.schema.metadata or {}, path)
+        checked = check_table(table.replace_schema_metadata(None), schema, str(path))
+    except (UnicodeDecodeError, pa.ArrowException) as error:  # text that is not UTF-8, types that nobody wrote
+        raise DataError(f"{path}: damaged: {error}") from error
     for name, expected in files.items():
         _check_file(ref.path / name, expected, full or name == FILE_LIST)
     if FILE_LIST in files:
         files = read_file_list(ref.path / FILE_LIST)
         for name, expected in files.items():
             _check_file(ref.path / name, expected, full)
-    checked = check_table(table.replace_schema_metadata(None), schema, str(path))
     return Manifest(ManifestRef(key=ref.key, path=ref.path, digest=digest, rows=len(checked)), schema, checked, files)
+
+
+def _declared(metadata: Mapping[bytes, bytes], path: Path) -> tuple[TableSchema, dict[str, Any]]:
+    """The schema that a manifest names, and size and digest of the files beside it."""
+    if _SCHEMA_KEY not in metadata or _FILES_KEY not in metadata:
+        raise DataError(f"{path}: is not a ctlev manifest; its metadata names no schema")
+    try:
+        declared, files = json.loads(metadata[_SCHEMA_KEY]), json.loads(metadata[_FILES_KEY])
+        name, version = declared["name"], declared["version"]
+        if any(not isinstance(stated["bytes"], int) or not stated["sha256"] for stated in files.values()):
+            raise TypeError("sizes and digests of files")
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: is not a ctlev manifest; its metadata cannot be read: {error!r}") from error
+    schema = TABLES.get(name)
+    if schema is None:
+        raise DataError(f"{path}: table {name!r}; this code reads {sorted(TABLES)}")
+    if schema.version != version:
+        raise TableVersionError(f"{path}: table {name!r} version {version}; this code reads version {schema.version}")
+    return schema, files
 
 
 def _check_file(path: Path, expected: Mapping[str, Any], full: bool) -> None:

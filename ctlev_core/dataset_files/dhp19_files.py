@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctlev_core.safe_files import hdf5_files
+from ctlev_core.safe_files.mat_files import read_struct
+from ctlev_core.safe_files.numpy_files import read_numbers
 from data_contracts.errors import DataError
 
 if TYPE_CHECKING:
@@ -168,23 +170,12 @@ def read_vicon(path: Path) -> np.ndarray:
     Raises:
         DataError: not a .mat file of this kind, a joint is missing, or joints differ in length.
     """
-    from scipy.io import loadmat
-
-    try:
-        positions = loadmat(path, struct_as_record=False, squeeze_me=True)["XYZPOS"]
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except KeyError:
-        raise DataError(f"{path}: expected a variable XYZPOS, got none") from None
-    except Exception as error:
-        # scipy raises many kinds of errors for damaged files, and NotImplementedError for MATLAB 7.3.
-        raise DataError(f"{path}: expected a .mat file up to version 7, got: {error}") from error
+    positions = read_struct(path, "XYZPOS")
     joints = []
     for name in VICON_JOINTS:
-        rows = np.asarray(getattr(positions, name, np.zeros(0)))
-        rows = rows[None] if rows.shape == (3,) else rows  # loadmat squeezes a single row
-        if rows.ndim != 2 or rows.shape[1] != 3 or rows.dtype.kind not in "fiu":
-            found = ", ".join(getattr(positions, "_fieldnames", [])) or "none"
+        rows = positions.get(name, np.zeros(0))
+        if rows.ndim != 2 or rows.shape[1] != 3:
+            found = ", ".join(positions)[:200] or "none"
             raise DataError(f"{path}: XYZPOS.{name} must be [N, 3] numbers, got {rows.shape}; fields: {found}")
         joints.append(rows.astype(np.float64))
     lengths = {name: len(rows) for name, rows in zip(VICON_JOINTS, joints, strict=True)}
@@ -200,14 +191,13 @@ def read_projection(path: Path) -> np.ndarray:
         DataError: not such a matrix.
     """
     try:
-        matrix = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        with path.open("rb") as file:
+            matrix = read_numbers(file, path.stat().st_size, path.name)
+    except (DataError, FileNotFoundError) as error:
         raise DataError(f"{path}: expected a projection matrix in a .npy file: {error}") from error
-    if matrix.shape != (3, 4) or matrix.dtype.kind != "f" or not np.isfinite(matrix).all():
-        raise DataError(
-            f"{path}: expected a projection matrix [3, 4] of finite floats, got {matrix.shape} {matrix.dtype}"
-        )
-    return matrix.astype(np.float64)
+    if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
+        raise DataError(f"{path}: expected a projection matrix [3, 4] of finite numbers, got {list(matrix.shape)}")
+    return matrix
 
 
 def camera_of(matrix: np.ndarray, where: str) -> Camera:
