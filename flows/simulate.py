@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ctlev_core import plugins
 from ctlev_core.duration_text import duration_text
 from ctlev_core.plugin_contracts import FormatWithWriter
@@ -15,8 +17,14 @@ from ctlev_core.plugins import PluginError
 from data_contracts.errors import DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from ctlev_core.video.frames import FrameOptions
     from ctlev_core.video.simulation import Interpolation
+    from data_contracts.events import Events
+
+SIGNAL_SUFFIX = ".signal.npy"
+"""Of the file beside the events that says of each whether it is signal: [N] bool."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +39,7 @@ class SimulateOptions:
     format: str
     preview: Path | None
     overwrite: bool
+    marks: bool = False
 
 
 def simulate_file(source: Path, output: Path, frames: FrameOptions, options: SimulateOptions) -> int:
@@ -41,9 +50,12 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
     """
     started = time.perf_counter()
     partial = output.with_name(f".partial-{output.name}")
+    signal_file: Path | None = None
     try:
         name = find_writer(output, options.format)
-        for path in filter(None, (output, options.preview)):
+        if options.marks and not getattr(plugins.load("formats", name), "HOLDS_SIGNAL", False):
+            signal_file = output.with_suffix(SIGNAL_SUFFIX)
+        for path in filter(None, (output, options.preview, signal_file)):
             _check_free(path, overwrite=options.overwrite)
         from ctlev_core.events.files import write_event_chunks
         from ctlev_core.sensor.choice import read_sensor
@@ -57,10 +69,15 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
             seed=options.seed,
             interpolator=interpolator_of(options.interpolation),
             max_displacement_px=options.max_displacement_px,
+            marks=options.marks,
         )
         preview = Preview(simulation) if options.preview is not None else None
+        chunks: Iterable[Events] = simulation if preview is None else preview.watch()
+        signal: list[np.ndarray] = []
         try:
-            write_event_chunks(partial, simulation if preview is None else preview.watch(), name)
+            write_event_chunks(partial, chunks if signal_file is None else _watch_signal(chunks, signal), name)
+            if signal_file is not None:
+                np.save(signal_file, np.concatenate(signal))
             partial.replace(output)
         finally:
             partial.unlink(missing_ok=True)
@@ -78,7 +95,8 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
         f"({rate:.3g} million a second), from {simulation.num_frames} frames, {simulation.num_drawn} drawn"
         + (f"; {skipped} frames not after the one before were left out" if skipped else "")
     )
-    print(f"events: {output}" + (f"\npreview: {options.preview}" if options.preview else ""))
+    written = {"events": output, "signal or noise": signal_file, "preview": options.preview}
+    print("\n".join(f"{what}: {path}" for what, path in written.items() if path is not None))
     print(f"in {duration_text(time.perf_counter() - started)}")
     return 0
 
@@ -105,6 +123,14 @@ def find_writer(output: Path, name: str = "") -> str:
         raise PluginError(f"{output}: no format is written with the suffix {suffix!r}; known: {known}")
     # Formats that share a suffix: the newest of them, which comes last by name (.raw is EVT3).
     return found[-1]
+
+
+def _watch_signal(chunks: Iterable[Events], signal: list[np.ndarray]) -> Iterator[Events]:
+    """Hand the chunks on, their marks gathered."""
+    for chunk in chunks:
+        assert chunk.signal is not None
+        signal.append(chunk.signal)
+        yield chunk
 
 
 def _check_free(path: Path, *, overwrite: bool) -> None:

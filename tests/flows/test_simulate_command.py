@@ -125,3 +125,43 @@ def test_a_still_picture_and_a_folder(tmp_path):
     assert invoke(folder, tmp_path / "folder.npz")[0] == 2
     assert invoke(folder, tmp_path / "folder.npz", "--fps", 100)[0] == 0
     assert read_events(tmp_path / "folder.npz").t[-1] <= 30_000
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_each_event_is_marked_in_every_format(video, tmp_path, name):
+    """In the file where it can hold the marks, else beside it; the events are those without marks."""
+    output, size = tmp_path / f"a{load('formats', name).SUFFIXES[0]}", (240, 180) if name == "atis" else (346, 260)
+    status, text, errors = invoke(video, output, "--format", name, "--size", f"{size[0]}x{size[1]}", "--marks")
+    assert status == 0, errors
+    made = simulate_video(video, size=size, marks=True)
+    assert made.signal is not None and 0 < made.signal.sum() < len(made)
+    if name == "parquet":
+        signal = read_events(output).signal
+    elif name == "csv":
+        rows = output.read_text().splitlines()[1:]
+        assert rows[0] == "t,x,y,p,signal"
+        signal = np.array([row.endswith(",1") for row in rows[1:]])
+    else:
+        signal = np.load(tmp_path / "a.signal.npy")
+        assert signal.dtype == np.bool_ and f"signal or noise: {tmp_path}/a.signal.npy" in text
+    np.testing.assert_array_equal(signal, made.signal)
+    plain, written = simulate_video(video, size=size), read_events(output)
+    assert plain.signal is None
+    for column in "txyp":
+        np.testing.assert_array_equal(getattr(made, column), getattr(plain, column))
+    np.testing.assert_array_equal(written.t, plain.t)
+    again = invoke(video, output, "--format", name, "--marks")
+    assert again[0] == 2 and "is there already" in again[2]
+
+
+def test_marks_of_no_events_are_written_too(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((20, 20, 3), 90, np.uint8))
+    for suffix in ("parquet", "npz"):
+        status, _, errors = invoke(folder, tmp_path / f"a.{suffix}", "--fps", 30, "--sensor", "ideal", "--marks")
+        assert status == 0, errors
+    assert np.load(tmp_path / "a.signal.npy").shape == (0,)
+    signal = read_events(tmp_path / "a.parquet").signal
+    assert signal is None or len(signal) == 0

@@ -22,7 +22,9 @@ def concatenate(chunks: Iterable[Events]) -> Events:
     if len(parts) == 1:
         return parts[0]
     t, x, y, p = (np.concatenate([getattr(part, name) for part in parts]) for name in EVENT_DTYPES)
-    return Events(t, x, y, p, parts[0].sensor_size)
+    marks = [part.signal for part in parts if part.signal is not None]
+    signal = np.concatenate(marks) if len(marks) == len(parts) else None
+    return Events(t, x, y, p, parts[0].sensor_size, signal)
 
 
 def regroup(chunks: Iterable[Events], num_events: int) -> Iterator[Events]:
@@ -37,10 +39,9 @@ def regroup(chunks: Iterable[Events], num_events: int) -> Iterator[Events]:
     waiting: list[Events] = []
     num_waiting = 0
     any_given = False
-    sensor_size = (1, 1)
+    nothing = empty_events((1, 1))
     for chunk in chunks:
-        sensor_size = chunk.sensor_size
-        start = 0
+        nothing, start = chunk.slice(0, 0), 0
         while len(chunk) - start >= num_events - num_waiting:
             stop = start + num_events - num_waiting
             yield concatenate([*waiting, chunk.slice(start, stop)])
@@ -51,7 +52,7 @@ def regroup(chunks: Iterable[Events], num_events: int) -> Iterator[Events]:
     if waiting:
         yield concatenate(waiting)
     elif not any_given:
-        yield empty_events(sensor_size)
+        yield nothing
 
 
 def check_chunks(chunks: Iterable[Events], where: str) -> Iterator[Events]:
