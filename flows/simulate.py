@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 SIGNAL_SUFFIX = ".signal.npy"
 """Of the file beside the events that says of each whether it is signal: [N] bool."""
+LABELS_SUFFIX = ".labels.json"
+"""Of the file beside the events that has the labels of the video, as COCO has them."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class SimulateOptions:
     preview: Path | None
     overwrite: bool
     marks: bool = False
+    labels: Path | None = None
+    label_rate_hz: float | None = None
 
 
 def simulate_file(source: Path, output: Path, frames: FrameOptions, options: SimulateOptions) -> int:
@@ -50,16 +54,20 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
     """
     started = time.perf_counter()
     partial = output.with_name(f".partial-{output.name}")
-    signal_file: Path | None = None
+    signal_file = labels_file = None
     try:
         name = find_writer(output, options.format)
         if options.marks and not getattr(plugins.load("formats", name), "HOLDS_SIGNAL", False):
             signal_file = output.with_suffix(SIGNAL_SUFFIX)
-        for path in filter(None, (output, options.preview, signal_file)):
+        if options.labels is not None:
+            labels_file = output.with_suffix(LABELS_SUFFIX)
+        for path in filter(None, (output, options.preview, signal_file, labels_file)):
             _check_free(path, overwrite=options.overwrite)
         from ctlev_core.events.files import write_event_chunks
         from ctlev_core.sensor.choice import read_sensor
+        from ctlev_core.video.carried_labels import label_times, write_labels
         from ctlev_core.video.frames import open_frames
+        from ctlev_core.video.label_files import read_video_labels
         from ctlev_core.video.preview import Preview
         from ctlev_core.video.simulation import VideoSimulation, interpolator_of
 
@@ -72,12 +80,18 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
             marks=options.marks,
         )
         preview = Preview(simulation) if options.preview is not None else None
+        labels = read_video_labels(options.labels, simulation.frames) if options.labels is not None else None
+        label_times([0], options.label_rate_hz)  # refused before the work starts
         chunks: Iterable[Events] = simulation if preview is None else preview.watch()
         signal: list[np.ndarray] = []
         try:
             write_event_chunks(partial, chunks if signal_file is None else _watch_signal(chunks, signal), name)
             if signal_file is not None:
                 np.save(signal_file, np.concatenate(signal))
+            if labels_file is not None and labels is not None and simulation.size is not None:
+                write_labels(
+                    labels_file, labels, simulation.frames, simulation.size, output.name, options.label_rate_hz
+                )
             partial.replace(output)
         finally:
             partial.unlink(missing_ok=True)
@@ -95,7 +109,7 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
         f"({rate:.3g} million a second), from {simulation.num_frames} frames, {simulation.num_drawn} drawn"
         + (f"; {skipped} frames not after the one before were left out" if skipped else "")
     )
-    written = {"events": output, "signal or noise": signal_file, "preview": options.preview}
+    written = {"events": output, "signal or noise": signal_file, "labels": labels_file, "preview": options.preview}
     print("\n".join(f"{what}: {path}" for what, path in written.items() if path is not None))
     print(f"in {duration_text(time.perf_counter() - started)}")
     return 0

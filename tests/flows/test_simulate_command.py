@@ -1,5 +1,7 @@
 """`ctlev simulate`: every format, a preview, and refusals that leave nothing behind."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -165,3 +167,30 @@ def test_marks_of_no_events_are_written_too(tmp_path):
     assert np.load(tmp_path / "a.signal.npy").shape == (0,)
     signal = read_events(tmp_path / "a.parquet").signal
     assert signal is None or len(signal) == 0
+
+
+def test_labels_are_carried_along(video, tmp_path):
+    """The square's box lies where its events are, at every time that is asked for."""
+    rows = [f"{k},1,square,{4 + 3 * k},14,20,20" for k in range(12)]
+    (tmp_path / "in.csv").write_text("frame,instance,category,x,y,width,height\n" + "\n".join(rows))
+    asked = ("--sensor", "ideal", "--size", "32x24", "--labels", tmp_path / "in.csv", "--label-rate", 300)
+    status, text, errors = invoke(video, tmp_path / "a.parquet", *asked)
+    assert status == 0 and f"labels: {tmp_path}/a.labels.json" in text, errors
+    table, events = json.loads((tmp_path / "a.labels.json").read_text()), read_events(tmp_path / "a.parquet")
+    assert len(table["images"]) == len(table["annotations"]) == 111 and table["categories"][0]["name"] == "square"
+    for one in table["annotations"][1:-1]:
+        near = np.abs(events.t - one["t_us"]) < 4000
+        left, top, width, height = one["bbox"]
+        assert (np.abs(events.x[near & (events.p == 1)] + 0.5 - left - width) < 2.5).mean() > 0.9
+        assert (np.abs(events.y[near] + 0.5 - top - height / 2) < height / 2 + 1.5).mean() > 0.95
+    plain = simulate_video(video, sensor="ideal", size=(32, 24))
+    np.testing.assert_array_equal(events.t, plain.t)
+
+
+def test_wrong_labels_leave_nothing(video, tmp_path):
+    (tmp_path / "in.csv").write_text("frame,instance,x,y,width,height\n12,1,1,2,3,4\n")
+    status, _, errors = invoke(video, tmp_path / "a.parquet", "--labels", tmp_path / "in.csv")
+    assert status == 2 and "in.csv: labels of frame 12, expected frames 0 to 11" in errors
+    status, _, errors = invoke(video, tmp_path / "a.parquet", "--label-rate", 0)
+    assert status == 2 and "label_rate_hz must be above 0" in errors
+    assert [path.name for path in tmp_path.iterdir()] == ["in.csv"]
