@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,7 +54,6 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
         Exit status: 0 written, 2 wrong input; then nothing is left at `output`.
     """
     started = time.perf_counter()
-    partial = output.with_name(f".partial-{output.name}")
     signal_file = labels_file = None
     try:
         name = find_writer(output, options.format)
@@ -84,21 +84,17 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
         label_times([0], options.label_rate_hz)  # refused before the work starts
         chunks: Iterable[Events] = simulation if preview is None else preview.watch()
         signal: list[np.ndarray] = []
-        try:
-            write_event_chunks(partial, chunks if signal_file is None else _watch_signal(chunks, signal), name)
+        with _written_whole(filter(None, (output, signal_file, labels_file))) as partial:
+            write_event_chunks(partial[output], chunks if signal_file is None else _watch_signal(chunks, signal), name)
             if signal_file is not None:
-                np.save(signal_file, np.concatenate(signal))
+                np.save(partial[signal_file], np.concatenate(signal))
             if labels_file is not None and labels is not None and simulation.size is not None:
-                write_labels(
-                    labels_file, labels, simulation.frames, simulation.size, output.name, options.label_rate_hz
-                )
-            partial.replace(output)
-        finally:
-            partial.unlink(missing_ok=True)
+                seen = simulation.frames, simulation.size
+                write_labels(partial[labels_file], labels, *seen, output.name, options.label_rate_hz)
         if preview is not None and options.preview is not None:
             preview.write(options.preview)
     except (DataError, PluginError, ValueError, OSError) as error:
-        print(f"error: {str(error).replace(str(partial), str(output))}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         return 2
     assert simulation.size is not None
     width, height = simulation.size
@@ -137,6 +133,24 @@ def find_writer(output: Path, name: str = "") -> str:
         raise PluginError(f"{output}: no format is written with the suffix {suffix!r}; known: {known}")
     # Formats that share a suffix: the newest of them, which comes last by name (.raw is EVT3).
     return found[-1]
+
+
+@contextmanager
+def _written_whole(paths: Iterable[Path]) -> Iterator[dict[Path, Path]]:
+    """Other names to write files under, by path; they get their own when all are complete. Errors name their own."""
+    partial = {path: path.with_name(f".partial-{path.name}") for path in paths}
+    try:
+        yield partial
+        for path, unfinished in partial.items():
+            unfinished.replace(path)
+    except (DataError, OSError) as error:
+        message = str(error)
+        for path, unfinished in partial.items():
+            message = message.replace(str(unfinished), str(path))
+        raise DataError(message) from None
+    finally:
+        for unfinished in partial.values():
+            unfinished.unlink(missing_ok=True)
 
 
 def _watch_signal(chunks: Iterable[Events], signal: list[np.ndarray]) -> Iterator[Events]:
