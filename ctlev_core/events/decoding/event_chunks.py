@@ -71,9 +71,11 @@ def check_joints(chunks: Iterable[Events], where: str) -> Iterator[Events]:
     """Hand on chunks that were checked one by one, with the promises of `Events` kept across their joints too.
 
     Raises:
-        DataError: a chunk starts before the last one ended, or has another sensor size.
+        DataError: a chunk starts before the last one ended, has another sensor size, or says of its events whether
+            they are signal where another did not.
     """
     num_before = last_t = 0
+    has_signal = False
     sensor_size: SensorSize | None = None
     for chunk in chunks:
         if sensor_size is not None and chunk.sensor_size != sensor_size:
@@ -84,6 +86,9 @@ def check_joints(chunks: Iterable[Events], where: str) -> Iterator[Events]:
         sensor_size = chunk.sensor_size
         _check_joint(chunk, where, num_before, last_t)
         if len(chunk):
+            if num_before and has_signal != (chunk.signal is not None):
+                raise DataError(f"{where}: signal must be known of all events or of none, not so from {num_before} on")
+            has_signal = chunk.signal is not None
             last_t = int(chunk.t[-1])
             num_before += len(chunk)
         yield chunk
