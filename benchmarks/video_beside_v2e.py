@@ -74,7 +74,7 @@ def v2e(frames: Frames, options: SensorOptions, flow: Flow | None) -> Events:
     kinds = np.int64, np.uint16, np.uint16, np.uint8
     columns = [column.astype(kind) for column, kind in zip((np.rint(1e6 * t), x, y, p), kinds, strict=True)]
     order = np.argsort(columns[0], kind="stable")
-    return Events(*(column[order] for column in columns), size)  # pyright: ignore[reportCallIssue]
+    return Events(*(column[order] for column in columns), size)
 
 
 def drawn(frames: Frames, flow: Flow) -> Iterator[tuple[int, np.ndarray]]:

@@ -5,7 +5,7 @@ Columns, not an array of structs: every encoder and the Parquet files read them 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,7 +39,7 @@ class Events:
     y: np.ndarray
     p: np.ndarray
     sensor_size: SensorSize
-    signal: np.ndarray | None = None
+    signal: np.ndarray | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -53,7 +53,7 @@ class Events:
         """Events start .. stop - 1 as views of the same columns."""
         signal = None if self.signal is None else self.signal[start:stop]
         t, x, y, p = (getattr(self, name)[start:stop] for name in EVENT_DTYPES)
-        return Events(t, x, y, p, self.sensor_size, signal)
+        return Events(t, x, y, p, self.sensor_size, signal=signal)
 
 
 def check_sensor_size(size: SensorSize, where: str) -> SensorSize:

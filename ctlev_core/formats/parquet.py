@@ -123,10 +123,11 @@ def _to_events(table: pa.Table | pa.RecordBatch, sensor_size: SensorSize, path: 
     names = table.schema.names
     if any(table[name].null_count for name in names):
         raise DataError(f"{path}: expected no nulls in the columns {', '.join(names)}")
-    columns = (np.asarray(table[name]) for name in (*EVENT_DTYPES, *(["signal"] if "signal" in names else [])))
+    columns = (np.asarray(table[name]) for name in EVENT_DTYPES)
+    signal = np.array(table["signal"]) if "signal" in names else None
     # A copy where Arrow hands out its own read-only memory: Events are plain, writable arrays whatever they came from.
-    t, x, y, p, *signal = (np.require(column, requirements="W") for column in columns)
-    return Events(t, x, y, p, sensor_size, *signal)
+    t, x, y, p = (np.require(column, requirements="W") for column in columns)
+    return Events(t, x, y, p, sensor_size, signal=signal)
 
 
 def write(path: Path, events: Events) -> None:

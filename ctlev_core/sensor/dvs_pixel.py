@@ -256,7 +256,8 @@ class Sensor:
     def _join(self, found: list[list[np.ndarray]]) -> tuple[Events, np.ndarray]:
         found = found or [_empty_columns(0, marks=self.marks)]
         t, x, y, p, exact_us, *signal = (np.concatenate(column) for column in zip(*found, strict=True))
-        return check_events(Events(t, x, y, p, self.sensor_size, *signal), "sensor"), exact_us
+        events = Events(t, x, y, p, self.sensor_size, signal=signal[0] if self.marks else None)
+        return check_events(events, "sensor"), exact_us
 
     def _snapshot(self) -> tuple:
         state = kernels.PixelState(*(plane.copy() for plane in self._state))

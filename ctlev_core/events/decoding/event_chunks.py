@@ -24,7 +24,7 @@ def concatenate(chunks: Iterable[Events]) -> Events:
     t, x, y, p = (np.concatenate([getattr(part, name) for part in parts]) for name in EVENT_DTYPES)
     marks = [part.signal for part in parts if part.signal is not None]
     signal = np.concatenate(marks) if len(marks) == len(parts) else None
-    return Events(t, x, y, p, parts[0].sensor_size, signal)
+    return Events(t, x, y, p, parts[0].sensor_size, signal=signal)
 
 
 def regroup(chunks: Iterable[Events], num_events: int) -> Iterator[Events]:
