@@ -108,6 +108,7 @@ def simulate_video(
     fps: float | None = None,
     slow_motion: float = 1.0,
     seed: int = 0,
+    marks: bool = False,
 ) -> Events:
     """The events of a simulated event camera that watches a video file, a folder of pictures or one picture.
 
@@ -122,6 +123,7 @@ def simulate_video(
         fps: frames a second, in the place of the file's times.
         slow_motion: so many times slower than life the video plays.
         seed: as `simulate`.
+        marks: say of each event whether it is signal or noise, in `signal` of the result.
     Returns:
         Times in us from the first frame on.
     Raises:
@@ -134,7 +136,7 @@ def simulate_video(
     from ctlev_core.video.simulation import VideoSimulation
 
     frames = open_frames(Path(path), FrameOptions(size=size, fps=fps, slow_motion=slow_motion))
-    simulation = VideoSimulation(frames, read_sensor(str(sensor), noise), seed=seed)
+    simulation = VideoSimulation(frames, read_sensor(str(sensor), noise), seed=seed, marks=marks)
     chunks = list(simulation)
     assert simulation.size is not None
     return join(chunks, simulation.size)

@@ -5,7 +5,7 @@ Columns, not an array of structs: every encoder and the Parquet files read them 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,6 +31,7 @@ class Events:
         y: [N] uint16, pixels, 0 <= y < sensor height, top to bottom.
         p: [N] uint8, 1 = ON (brighter), 0 = OFF (darker).
         sensor_size: (width, height) in pixels.
+        signal: [N] bool, True = light changed, False = the sensor's noise; None = nobody knows, as of a real camera.
     """
 
     t: np.ndarray
@@ -38,6 +39,7 @@ class Events:
     y: np.ndarray
     p: np.ndarray
     sensor_size: SensorSize
+    signal: np.ndarray | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -49,7 +51,9 @@ class Events:
 
     def slice(self, start: int, stop: int) -> Events:
         """Events start .. stop - 1 as views of the same columns."""
-        return Events(self.t[start:stop], self.x[start:stop], self.y[start:stop], self.p[start:stop], self.sensor_size)
+        signal = None if self.signal is None else self.signal[start:stop]
+        t, x, y, p = (getattr(self, name)[start:stop] for name in EVENT_DTYPES)
+        return Events(t, x, y, p, self.sensor_size, signal=signal)
 
 
 def check_sensor_size(size: SensorSize, where: str) -> SensorSize:
@@ -84,6 +88,9 @@ def check_events(events: Events, where: str) -> Events:
             raise DataError(f"{where}: column {name} must be [N] {np.dtype(dtype)}, got {column.shape} {column.dtype}")
         if len(column) != len(events.t):
             raise DataError(f"{where}: column {name} has {len(column)} rows, column t has {len(events.t)}")
+    signal = events.signal
+    if signal is not None and (signal.shape != events.t.shape or signal.dtype != np.bool_):
+        raise DataError(f"{where}: column signal must be [{len(events)}] bool, got {signal.shape} {signal.dtype}")
     if len(events) == 0:
         return events
     if events.t[0] < 0:

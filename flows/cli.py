@@ -247,6 +247,18 @@ def simulate(
     preview: Annotated[
         Path | None, typer.Option(help="a picture of some frames and their events", show_default=False)
     ] = None,
+    marks: Annotated[
+        bool,
+        typer.Option("--marks", help="mark each event as signal or noise: column `signal`, or a file .signal.npy"),
+    ] = False,
+    labels: Annotated[
+        Path | None,
+        typer.Option(help="boxes, keypoints, masks of the frames: COCO .json, or .csv", show_default=False),
+    ] = None,
+    label_rate_hz: Annotated[
+        float | None,
+        typer.Option("--label-rate", help="labels a second that are written; default: one a frame", show_default=False),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace what is there")] = False,
 ) -> None:
     """Turn a video, or pictures, into the events of a simulated camera."""
@@ -264,7 +276,17 @@ def simulate(
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     options = SimulateOptions(
-        sensor, noise, interpolation, max_displacement_px, seed, format_name, preview, overwrite=overwrite
+        sensor,
+        noise,
+        interpolation,
+        max_displacement_px,
+        seed,
+        format_name,
+        preview,
+        overwrite,
+        marks,
+        labels,
+        label_rate_hz,
     )
     raise typer.Exit(simulate_file(source, output, frames, options))
 

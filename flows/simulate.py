@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ctlev_core import plugins
 from ctlev_core.duration_text import duration_text
@@ -15,8 +18,16 @@ from ctlev_core.plugins import PluginError
 from data_contracts.errors import DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from ctlev_core.video.frames import FrameOptions
     from ctlev_core.video.simulation import Interpolation
+    from data_contracts.events import Events
+
+SIGNAL_SUFFIX = ".signal.npy"
+"""Of the file beside the events that says of each whether it is signal: [N] bool."""
+LABELS_SUFFIX = ".labels.json"
+"""Of the file beside the events that has the labels of the video, as COCO has them."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +42,9 @@ class SimulateOptions:
     format: str
     preview: Path | None
     overwrite: bool
+    marks: bool = False
+    labels: Path | None = None
+    label_rate_hz: float | None = None
 
 
 def simulate_file(source: Path, output: Path, frames: FrameOptions, options: SimulateOptions) -> int:
@@ -40,14 +54,20 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
         Exit status: 0 written, 2 wrong input; then nothing is left at `output`.
     """
     started = time.perf_counter()
-    partial = output.with_name(f".partial-{output.name}")
+    signal_file = labels_file = None
     try:
         name = find_writer(output, options.format)
-        for path in filter(None, (output, options.preview)):
+        if options.marks and not getattr(plugins.load("formats", name), "HOLDS_SIGNAL", False):
+            signal_file = output.with_suffix(SIGNAL_SUFFIX)
+        if options.labels is not None:
+            labels_file = output.with_suffix(LABELS_SUFFIX)
+        for path in filter(None, (output, options.preview, signal_file, labels_file)):
             _check_free(path, overwrite=options.overwrite)
         from ctlev_core.events.files import write_event_chunks
         from ctlev_core.sensor.choice import read_sensor
+        from ctlev_core.video.carried_labels import label_times, write_labels
         from ctlev_core.video.frames import open_frames
+        from ctlev_core.video.label_files import read_video_labels
         from ctlev_core.video.preview import Preview
         from ctlev_core.video.simulation import VideoSimulation, interpolator_of
 
@@ -57,17 +77,24 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
             seed=options.seed,
             interpolator=interpolator_of(options.interpolation),
             max_displacement_px=options.max_displacement_px,
+            marks=options.marks,
         )
         preview = Preview(simulation) if options.preview is not None else None
-        try:
-            write_event_chunks(partial, simulation if preview is None else preview.watch(), name)
-            partial.replace(output)
-        finally:
-            partial.unlink(missing_ok=True)
+        labels = read_video_labels(options.labels, simulation.frames) if options.labels is not None else None
+        label_times([0], options.label_rate_hz)  # refused before the work starts
+        chunks: Iterable[Events] = simulation if preview is None else preview.watch()
+        signal: list[np.ndarray] = []
+        with _written_whole(filter(None, (output, signal_file, labels_file))) as partial:
+            write_event_chunks(partial[output], chunks if signal_file is None else _watch_signal(chunks, signal), name)
+            if signal_file is not None:
+                np.save(partial[signal_file], np.concatenate(signal))
+            if labels_file is not None and labels is not None and simulation.size is not None:
+                seen = simulation.frames, simulation.size
+                write_labels(partial[labels_file], labels, *seen, output.name, options.label_rate_hz)
         if preview is not None and options.preview is not None:
             preview.write(options.preview)
     except (DataError, PluginError, ValueError, OSError) as error:
-        print(f"error: {str(error).replace(str(partial), str(output))}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         return 2
     assert simulation.size is not None
     width, height = simulation.size
@@ -78,7 +105,8 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
         f"({rate:.3g} million a second), from {simulation.num_frames} frames, {simulation.num_drawn} drawn"
         + (f"; {skipped} frames not after the one before were left out" if skipped else "")
     )
-    print(f"events: {output}" + (f"\npreview: {options.preview}" if options.preview else ""))
+    written = {"events": output, "signal or noise": signal_file, "labels": labels_file, "preview": options.preview}
+    print("\n".join(f"{what}: {path}" for what, path in written.items() if path is not None))
     print(f"in {duration_text(time.perf_counter() - started)}")
     return 0
 
@@ -105,6 +133,32 @@ def find_writer(output: Path, name: str = "") -> str:
         raise PluginError(f"{output}: no format is written with the suffix {suffix!r}; known: {known}")
     # Formats that share a suffix: the newest of them, which comes last by name (.raw is EVT3).
     return found[-1]
+
+
+@contextmanager
+def _written_whole(paths: Iterable[Path]) -> Iterator[dict[Path, Path]]:
+    """Other names to write files under, by path; they get their own when all are complete. Errors name their own."""
+    partial = {path: path.with_name(f".partial-{path.name}") for path in paths}
+    try:
+        yield partial
+        for path, unfinished in partial.items():
+            unfinished.replace(path)
+    except (DataError, OSError) as error:
+        message = str(error)
+        for path, unfinished in partial.items():
+            message = message.replace(str(unfinished), str(path))
+        raise DataError(message) from None
+    finally:
+        for unfinished in partial.values():
+            unfinished.unlink(missing_ok=True)
+
+
+def _watch_signal(chunks: Iterable[Events], signal: list[np.ndarray]) -> Iterator[Events]:
+    """Hand the chunks on, their marks gathered."""
+    for chunk in chunks:
+        assert chunk.signal is not None
+        signal.append(chunk.signal)
+        yield chunk
 
 
 def _check_free(path: Path, *, overwrite: bool) -> None:

@@ -29,6 +29,7 @@ from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
 
 VERSION = 2
 SUFFIXES = (".csv", ".txt")
+HOLDS_SIGNAL = True
 HAS_SIGNATURE = False
 """Any text of four columns of numbers looks like this: asked only where no other format is recognised."""
 
@@ -84,17 +85,25 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
 def write(path: Path, events: Events) -> None:
     """Write events in microseconds under a header, with the sensor size, so that `read` returns them unchanged.
 
+    Where `Events.signal` is known it is one more column, 1 and 0, which `read` passes over.
+
     Raises:
         DataError: events break `check_events`.
     """
     check_events(events, f"events to be written to {path}")
     width, height = events.sensor_size
     with path.open("w", encoding="ascii") as file:
-        file.write(f"# sensor_size {width}x{height}\n{','.join(EVENT_DTYPES)}\n")
+        names = (*EVENT_DTYPES, *(["signal"] if events.signal is not None else []))
+        file.write(f"# sensor_size {width}x{height}\n{','.join(names)}\n")
         for start in range(0, len(events), 1 << 16):
             part = events.slice(start, start + (1 << 16))
-            rows = zip(part.t.tolist(), part.x.tolist(), part.y.tolist(), part.p.tolist(), strict=True)
-            file.writelines(f"{t},{x},{y},{p}\n" for t, x, y, p in rows)
+            if part.signal is None:
+                rows = zip(part.t.tolist(), part.x.tolist(), part.y.tolist(), part.p.tolist(), strict=True)
+                file.writelines(f"{t},{x},{y},{p}\n" for t, x, y, p in rows)
+            else:
+                columns = (part.t, part.x, part.y, part.p, part.signal.astype(np.uint8))
+                rows = zip(*(column.tolist() for column in columns), strict=True)
+                file.writelines(",".join(map(str, row)) + "\n" for row in rows)
 
 
 def _chunks(path: Path) -> Iterator[Events]:

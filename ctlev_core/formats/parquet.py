@@ -1,7 +1,8 @@
 """ctlev's own event files: Parquet with the columns of `Events`, zstd compressed.
 
-Columns t int64 (microseconds), x and y uint16 (px), p uint8; the metadata `sensor_size` is `WIDTHxHEIGHT`. Rows lie in
-groups of `ROW_GROUP`, so that a stretch of a long recording is read without the rest.
+Columns t int64 (microseconds), x and y uint16 (px), p uint8, and where `Events.signal` is known, signal bool; the
+metadata `sensor_size` is `WIDTHxHEIGHT`. Rows lie in groups of `ROW_GROUP`, so that a stretch of a long recording is
+read without the rest.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 VERSION = 1
 HAS_SIGNATURE = True
 SUFFIXES = (".parquet",)
+HOLDS_SIGNAL = True
 ROW_GROUP = 1 << 18
 """Events a row group."""
 
@@ -103,7 +105,8 @@ def _open(path: Path) -> Iterator[tuple[pq.ParquetFile, SensorSize]]:
         with pq.ParquetFile(path, memory_map=False, pre_buffer=False) as file:
             got = {field.name: str(field.type) for field in file.schema_arrow}
             expected = {name: np.dtype(dtype).name for name, dtype in EVENT_DTYPES.items()}
-            if got != expected or len(file.schema_arrow) != len(expected):
+            any_signal = {"signal": "bool"} if "signal" in got else {}
+            if got != expected | any_signal or len(file.schema_arrow) != len(got):
                 raise DataError(f"{path}: expected the columns {expected}, got {got}")
             text = (file.schema_arrow.metadata or {}).get(b"sensor_size", b"").decode("ascii", errors="replace")
             sensor_size = parse_sensor_size(text)
@@ -117,12 +120,14 @@ def _open(path: Path) -> Iterator[tuple[pq.ParquetFile, SensorSize]]:
 
 
 def _to_events(table: pa.Table | pa.RecordBatch, sensor_size: SensorSize, path: Path) -> Events:
-    if any(table[name].null_count for name in EVENT_DTYPES):
-        raise DataError(f"{path}: expected no nulls in the columns {', '.join(EVENT_DTYPES)}")
+    names = table.schema.names
+    if any(table[name].null_count for name in names):
+        raise DataError(f"{path}: expected no nulls in the columns {', '.join(names)}")
     columns = (np.asarray(table[name]) for name in EVENT_DTYPES)
+    signal = np.array(table["signal"]) if "signal" in names else None
     # A copy where Arrow hands out its own read-only memory: Events are plain, writable arrays whatever they came from.
     t, x, y, p = (np.require(column, requirements="W") for column in columns)
-    return Events(t, x, y, p, sensor_size)
+    return Events(t, x, y, p, sensor_size, signal=signal)
 
 
 def check_complete(path: Path) -> None:
@@ -151,12 +156,13 @@ def write_chunks(path: Path, chunks: Iterable[Events]) -> None:
     import pyarrow.parquet as pq
 
     # Time stamps grow slowly: their differences take a fraction of a dictionary of them.
-    encodings = {"t": "DELTA_BINARY_PACKED", "x": "PLAIN", "y": "PLAIN", "p": "PLAIN"}
+    encodings = {"t": "DELTA_BINARY_PACKED", "x": "PLAIN", "y": "PLAIN", "p": "PLAIN", "signal": "PLAIN"}
     writer: pq.ParquetWriter | None = None
     try:
         chunks = event_chunks.check_chunks(_not_none(chunks, path), f"events to be written to {path}")
         for chunk in event_chunks.regroup(chunks, ROW_GROUP):
-            table = pa.table({name: pa.array(getattr(chunk, name)) for name in EVENT_DTYPES})
+            names = (*EVENT_DTYPES, *(["signal"] if chunk.signal is not None else []))
+            table = pa.table({name: pa.array(getattr(chunk, name)) for name in names})
             if writer is None:
                 width, height = chunk.sensor_size
                 schema = table.schema.with_metadata({"sensor_size": f"{width}x{height}"})

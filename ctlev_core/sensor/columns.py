@@ -51,5 +51,5 @@ def write_columns(exact_us, pixels, polarity, position, begin_us, begin_t_us, wi
         t[row] = begin_t_us + np.int64(exact_us[i] - begin_us + 0.5)
         y[row] = pixels[i] // width
         x[row] = pixels[i] - (pixels[i] // width) * width
-        p[row] = polarity[i]
+        p[row] = polarity[i] & 1
         exact_sorted_us[row] = exact_us[i]

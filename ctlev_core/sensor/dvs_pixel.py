@@ -14,6 +14,8 @@ Each pixel compares its logarithmic, low-passed photocurrent with the level of i
     leak            the reference falls at a constant rate, which a pixel in still light turns into ON events
     shot noise      a Poisson process; its rate falls linearly with intensity; either polarity; the reference stays
     hot pixels      a Poisson process of ON events, added to that
+    signal          what is neither shot noise nor of a hot pixel nor a leak event; and an ON event is one of those if
+                    leak did more than half of the way from the last event to the threshold (`marks`)
 
 Every random number comes from a counter-based generator of the pixel's own, seeded by (seed, pixel). So the events are
 the same bit for bit however the frames are cut into chunks, and a frame between two equal ones changes nothing.
@@ -28,6 +30,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ctlev_core.events.decoding import event_chunks
 from ctlev_core.sensor import columns as sensor_columns
 from ctlev_core.sensor import kernels
 from ctlev_core.sensor.options import PRESETS, PixelMaps, SensorOptions, read_preset, sample_pixel_maps
@@ -64,6 +67,7 @@ class Sensor:
         seed: of this recording: noise and reference levels.
         max_events: budget of the whole recording; None = as many as there are. May be changed at any time.
         maps: the pixels, where they are known already; None = those of `sensor_seed`.
+        marks: say of each event whether it is signal or noise (`Events.signal`).
     """
 
     def __init__(
@@ -75,11 +79,13 @@ class Sensor:
         seed: int | list[int],
         max_events: int | None = None,
         maps: PixelMaps | None = None,
+        marks: bool = False,
     ) -> None:
         self.sensor_size = sensor_size
         self.options = options
         self.maps = sample_pixel_maps(sensor_size, options, sensor_seed) if maps is None else maps
         self.max_events = max_events
+        self.marks = marks
         self.num_events = 0
         """Events sent so far."""
         self.num_frames = 0
@@ -100,6 +106,7 @@ class Sensor:
         )
         self._seed = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
         planes = {name: np.zeros(sensor_size[0] * sensor_size[1]) for name in kernels.PixelState._fields}
+        planes["reference_us"] = planes["reference_us"][: None if marks else 0]
         self._state = kernels.PixelState(**planes | {"random": planes["random"].astype(np.uint64)})
         self._frame = np.zeros(0, np.float32)
         self._first_t_us = self._last_t_us = 0
@@ -236,17 +243,21 @@ class Sensor:
         else:
             position = np.empty(count, np.int64)
             position[np.argsort(np.floor(exact_us - begin_us + 0.5), kind="stable")] = np.arange(count)
-        columns = _empty_columns(count)
+        columns = _empty_columns(count, marks=self.marks)
         sensor_columns.write_columns(
-            exact_us, pixels, polarity, position, begin_us, self._last_t_us, self.sensor_size[0], *columns
+            exact_us, pixels, polarity, position, begin_us, self._last_t_us, self.sensor_size[0], *columns[:5]
         )
+        if self.marks:
+            columns[5][position] = polarity < kernels.NOISE
         self._frame, self._last_t_us = frame.copy(), time_us
         self.num_frames += 1
         return columns
 
     def _join(self, found: list[list[np.ndarray]]) -> tuple[Events, np.ndarray]:
-        t, x, y, p, exact_us = (np.concatenate(column) for column in zip(*(found or [_empty_columns(0)]), strict=True))
-        return check_events(Events(t, x, y, p, self.sensor_size), "sensor"), exact_us
+        found = found or [_empty_columns(0, marks=self.marks)]
+        t, x, y, p, exact_us, *signal = (np.concatenate(column) for column in zip(*found, strict=True))
+        events = Events(t, x, y, p, self.sensor_size, signal=signal[0] if self.marks else None)
+        return check_events(events, "sensor"), exact_us
 
     def _snapshot(self) -> tuple:
         state = kernels.PixelState(*(plane.copy() for plane in self._state))
@@ -297,11 +308,7 @@ def simulate_events(
 
 def join(chunks: list[Events], sensor_size: SensorSize) -> Events:
     """One recording of successive chunks; none give an empty one."""
-    if not chunks:
-        t, x, y, p = (np.empty(0, dtype) for dtype in EVENT_DTYPES.values())
-    else:
-        t, x, y, p = (np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in EVENT_DTYPES)
-    return Events(t, x, y, p, sensor_size)
+    return event_chunks.concatenate(chunks or [event_chunks.empty_events(sensor_size)])
 
 
 def _check_frames(intensity: np.ndarray, t_us: np.ndarray, sensor_size: SensorSize, last_us: int | None) -> np.ndarray:
@@ -329,9 +336,9 @@ def _check_frames(intensity: np.ndarray, t_us: np.ndarray, sensor_size: SensorSi
     return intensity
 
 
-def _empty_columns(count: int) -> list[np.ndarray]:
-    """The columns of `Events`, and that of exact times."""
-    return [np.empty(count, dtype) for dtype in (*EVENT_DTYPES.values(), np.float64)]
+def _empty_columns(count: int, *, marks: bool) -> list[np.ndarray]:
+    """The columns of `Events`, that of exact times, and with `marks` that of signal."""
+    return [np.empty(count, dtype) for dtype in (*EVENT_DTYPES.values(), np.float64, *([np.bool_] if marks else []))]
 
 
 def _enlarged(column: np.ndarray, needed: int) -> np.ndarray:

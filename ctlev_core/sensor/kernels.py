@@ -40,6 +40,8 @@ class PixelState(NamedTuple):
     """uint64, a generator a pixel: no result depends on what other pixels did."""
     due_us: np.ndarray
     """float64: nothing happens earlier to a pixel whose light stays as it is; -inf = nobody knows."""
+    reference_us: np.ndarray
+    """float64: since then the leak has been at work on the way to the next threshold; [0] = events are not marked."""
 
 
 class PixelTraits(NamedTuple):
@@ -54,6 +56,9 @@ class PixelTraits(NamedTuple):
     hot_rate: np.ndarray
     """Per us."""
 
+
+NOISE = 2
+"""Added to the polarity of an event that is noise."""
 
 BLOCK = 16
 """Pixels that are looked at together, whether any of them has something to do."""
@@ -84,10 +89,16 @@ def start(intensity, traits, physics, starts_settled, seed, state):
         state.signal[i] = _log_response(np.float64(intensity[i]), physics.log_floor)
         state.knot_us[i] = state.lag[i] = 0.0
         state.sent_us[i] = state.due_us[i] = -np.inf
+        # Where a pixel starts part of the way to a threshold, nobody knows what took it there: half of it counts as the
+        # leak's, so that it decides nothing.
+        if len(state.reference_us) > 0:
+            state.reference_us[i] = -0.5 * state.difference[i] / traits.leak[i] if traits.leak[i] > 0.0 else 0.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exact_us, pixels, polarity, count):
+def advance(  # noqa: C901 calls that hand on arrays are slow here
+    before, after, begin_us, end_us, traits, physics, state, pixel, exact_us, pixels, polarity, count
+):
     """All pixels, from `pixel` on, from one frame to the next.
 
     Args:
@@ -101,13 +112,14 @@ def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exac
         pixel: where to begin.
         exact_us: [R] the times of the events found, since the first frame.
         pixels: [R] their pixels.
-        polarity: [R] 1 = ON.
+        polarity: [R] 1 = ON; and `NOISE`.
         count: rows that are filled already.
     Returns:
         The pixel to go on with, the rows filled, and the rows needed. When the first is P, all is done. Otherwise there
         was no room: that pixel was left as it is, and wants so many rows at least.
     """
     due_us = state.due_us
+    marks = len(state.reference_us) > 0
     responses = np.empty(BLOCK)
     for first in range(pixel - pixel % BLOCK, len(after), BLOCK):
         last = min(first + BLOCK, len(after))
@@ -125,16 +137,19 @@ def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exac
             light_before, light = np.float64(before[i]), np.float64(after[i])
             if light_before == light and end_us < due_us[i]:
                 continue
-            (knot_us, signal, lag, difference, allowance, sent_us, random, due), end = _advance_pixel(
+            since_us = state.reference_us[i] if marks else 0.0
+            (knot_us, signal, lag, difference, allowance, sent_us, random, due, since_us), end = _advance_pixel(
                 light_before, light, responses[i - first], begin_us, end_us,
                 traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_noise_rate[i],
                 traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i],
-                state.allowance[i], state.sent_us[i], state.random[i], exact_us, polarity, count,
+                state.allowance[i], state.sent_us[i], state.random[i], since_us, exact_us, polarity, count,
             )  # fmt: skip
             if end > len(exact_us):
                 return i, count, end
             state.knot_us[i], state.signal[i], state.lag[i], state.difference[i] = knot_us, signal, lag, difference
             state.allowance[i], state.sent_us[i], state.random[i], due_us[i] = allowance, sent_us, random, due
+            if marks:
+                state.reference_us[i] = since_us
             for row in range(count, end):
                 pixels[row] = i
             count = end
@@ -151,21 +166,25 @@ def advance_chosen(
     the first is K when all is done. Its step stands here once more: shared through an inlined function, `advance` took
     2.5 times as long.
     """
+    marks = len(state.reference_us) > 0
     for k in range(number, len(chosen)):
         i = chosen[k]
         light_before, light = np.float64(before[k]), np.float64(after[k])
         if light_before == light and end_us < state.due_us[i]:
             continue
-        (knot_us, signal, lag, difference, allowance, sent_us, random, due), end = _advance_pixel(
+        since_us = state.reference_us[i] if marks else 0.0
+        (knot_us, signal, lag, difference, allowance, sent_us, random, due, since_us), end = _advance_pixel(
             light_before, light, _log_response(light, physics.log_floor), begin_us, end_us,
             traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_noise_rate[i],
             traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i],
-            state.allowance[i], state.sent_us[i], state.random[i], exact_us, polarity, count,
+            state.allowance[i], state.sent_us[i], state.random[i], since_us, exact_us, polarity, count,
         )  # fmt: skip
         if end > len(exact_us):
             return k, count, end
         state.knot_us[i], state.signal[i], state.lag[i], state.difference[i] = knot_us, signal, lag, difference
         state.allowance[i], state.sent_us[i], state.random[i], state.due_us[i] = allowance, sent_us, random, due
+        if marks:
+            state.reference_us[i] = since_us
         for row in range(count, end):
             pixels[row] = i
         count = end
@@ -175,7 +194,7 @@ def advance_chosen(
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _advance_pixel(
     light_before, light, response, begin_us, end_us, on, off, leak, shot, hot, physics, knot_us, signal, lag,
-    difference, allowance, sent_us, random, exact_us, polarity, count,
+    difference, allowance, sent_us, random, since_us, exact_us, polarity, count,
 ):  # fmt: skip
     """One pixel from one frame to the next: its new `PixelState`, and the rows filled."""
     still_us = begin_us - knot_us
@@ -201,9 +220,9 @@ def _advance_pixel(
     lowest = difference + min(slope * s_end, 0.0) + min(gain, 0.0)
     may_cross = highest >= on or lowest <= -off
     if may_cross or rate * s_end >= allowance:
-        difference, allowance, sent_us, random, end = _follow(
+        difference, allowance, sent_us, random, since_us, end = _follow(
             knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, may_cross,
-            physics.refractory_us, sent_us, random, exact_us, polarity, count,
+            physics.refractory_us, sent_us, random, leak, since_us, exact_us, polarity, count,
         )  # fmt: skip
     # When it is due is worked out once it stands still.
     due_us = -np.inf
@@ -214,13 +233,13 @@ def _advance_pixel(
         lag += gain * arrived
         difference += slope * s_end + gain * arrived
         allowance -= rate * s_end
-    return (knot_us, signal, lag, difference, allowance, sent_us, random, due_us), end
+    return (knot_us, signal, lag, difference, allowance, sent_us, random, due_us, since_us), end
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _follow(
     knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, seeks, refractory_us,
-    sent_us, random, exact_us, polarity, count,
+    sent_us, random, leak, since_us, exact_us, polarity, count,
 ):  # fmt: skip
     """Events of one pixel from s to s_end after its knot; writes as far as there is room, then counts on.
 
@@ -242,8 +261,8 @@ def _follow(
         at = min(crossing_at, noise_at)
         # Far too little room: what is missing is not counted to its end.
         if at > s_end or count > 2 * len(exact_us):
-            return difference, allowance, sent_us, random, count
-        is_on = rises
+            return difference, allowance, sent_us, random, since_us, count
+        is_on, is_noise = rises, True
         if noise_at < crossing_at:
             random, choice = _uniform(random)
             random, more = _exponential(random)
@@ -252,12 +271,15 @@ def _follow(
         else:
             difference -= on if rises else -off
             seeks = True
+            # The rest of the way was light's.
+            is_noise = rises and leak * (knot_us + at - since_us) > 0.5 * on
+            since_us = knot_us + at
         s = at
         if knot_us + at - sent_us >= refractory_us:
             sent_us = knot_us + at
             if count < len(exact_us):
                 exact_us[count] = sent_us
-                polarity[count] = is_on
+                polarity[count] = is_on + NOISE * is_noise
             count += 1
 
 

@@ -14,19 +14,18 @@ from __future__ import annotations
 
 import abc
 import math
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ctlev_core.render.saccades import NMNIST_PATH_PX, NMNIST_PATH_US, path_frames
-from data_contracts.errors import DataError, shortened
+from ctlev_core.video.picture_files import PICTURE_SUFFIXES, list_folder, read_picture
+from data_contracts.errors import DataError
 from data_contracts.events import SensorSize, check_sensor_size
 
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".hdr")
-TIMES_FILE = "timestamps.txt"
 GAMMA = 2.2
 NMNIST_SIDE_PX = 34
 """Side of the sensor on which the path of N-MNIST was measured."""
@@ -68,6 +67,15 @@ class FrameOptions:
                 raise ValueError(str(error)) from None
 
 
+class Shown(NamedTuple):
+    """A frame as the sensor saw it: its time, its number in the source from 0 on, and how far it was moved, px."""
+
+    t_us: int
+    number: int
+    right: float = 0.0
+    down: float = 0.0
+
+
 class Frames(abc.ABC):
     """Frames one after the other, in memory of one; iterating again reads them again.
 
@@ -75,11 +83,19 @@ class Frames(abc.ABC):
         expected: number of frames as the source says; 0 = it does not.
         is_dense: so close together that nothing need be drawn between two.
         num_skipped: frames whose time is not after that of the frame before; counted while iterating.
+        num_stored: frames in the source as it says, of all its time; 0 = it does not.
+        names: of the files, where frames are pictures.
+        num_seen_to_end: frames in the source, once it was read to its end; 0 = it was not.
+        shown: frames given so far; filled while iterating.
     """
 
     expected = 0
     is_dense = False
     num_skipped = 0
+    num_stored = 0
+    num_seen_to_end = 0
+    names: tuple[str, ...] = ()
+    shown: Sequence[Shown] = ()
 
     @abc.abstractmethod
     def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
@@ -88,6 +104,11 @@ class Frames(abc.ABC):
         Raises:
             DataError: a frame that cannot be read, frames of different sizes, or fewer than two of them.
         """
+
+    def stored_size(self) -> SensorSize:
+        """(width, height) px of the frames in the source, which a sensor of another size sees scaled and cut."""
+        _, light = next(iter(self))
+        return light.shape[1], light.shape[0]
 
 
 class _Light:
@@ -132,7 +153,10 @@ class _StoredFrames(Frames):
     def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         options, first_s, last_us, count = self.options, None, -1, 0
         self.num_skipped, light = 0, _Light(self.path, options)
-        for time_s, stored in self._read():
+        self.shown = shown = list[Shown]()
+        self.num_seen_to_end = num_read = 0
+        for number, (time_s, stored) in enumerate(self._read()):
+            num_read = number + 1
             if time_s < options.start_s:
                 continue
             if options.stop_s is not None and time_s > options.stop_s:
@@ -143,10 +167,19 @@ class _StoredFrames(Frames):
                 self.num_skipped += 1
                 continue
             last_us, count = t_us, count + 1
+            shown.append(Shown(t_us, number))
             yield t_us, light.of(stored, count - 1)
+        else:
+            self.num_seen_to_end = num_read
         if count < 2:
             stretch = "" if options.stop_s is None and not options.start_s else " in this stretch"
             raise DataError(f"{self.path}: expected two frames or more at different times{stretch}, got {count}")
+
+    def stored_size(self) -> SensorSize:
+        """See `Frames`; reads one frame."""
+        for _, stored in self._read():
+            return stored.shape[1], stored.shape[0]
+        raise DataError(f"{self.path}: expected two frames or more at different times, got 0")
 
     @abc.abstractmethod
     def _read(self) -> Iterator[tuple[float, np.ndarray]]:
@@ -160,8 +193,8 @@ class _VideoFile(_StoredFrames):
         capture = _open(path)
         expected = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         capture.release()
-        is_whole = options.stop_s is None and math.isfinite(expected) and expected > 0
-        super().__init__(path, options, int(expected) if is_whole else 0)
+        self.num_stored = int(expected) if math.isfinite(expected) and expected > 0 else 0
+        super().__init__(path, options, self.num_stored if options.stop_s is None else 0)
 
     def _read(self) -> Iterator[tuple[float, np.ndarray]]:
         import cv2
@@ -196,12 +229,13 @@ class _VideoFile(_StoredFrames):
 
 class _PictureFolder(_StoredFrames):
     def __init__(self, path: Path, options: FrameOptions) -> None:
-        self._paths, self._times_s = _list_folder(path, options.fps)
+        self._paths, self._times_s = list_folder(path, options.fps)
+        self.names, self.num_stored = tuple(one.name for one in self._paths), len(self._paths)
         super().__init__(path, options, len(self._paths))
 
     def _read(self) -> Iterator[tuple[float, np.ndarray]]:
         for path, time_s in zip(self._paths, self._times_s, strict=True):
-            yield time_s, _read_picture(path)
+            yield time_s, read_picture(path)
 
 
 class _StillPicture(Frames):
@@ -210,7 +244,10 @@ class _StillPicture(Frames):
     is_dense = True
 
     def __init__(self, path: Path, options: FrameOptions, max_displacement_px: float) -> None:
-        self._light = _Light(path, options).of(_read_picture(path), 0)
+        stored = read_picture(path)
+        self._stored_size = stored.shape[1], stored.shape[0]
+        self.names, self.num_stored = (path.name,), 1
+        self._light = _Light(path, options).of(stored, 0)
         scale = min(self._light.shape) / NMNIST_SIDE_PX
         path_px = tuple((scale * x, scale * y) for x, y in NMNIST_PATH_PX)
         self._times_us, self._moved_px = path_frames(NMNIST_PATH_US, path_px, max_displacement_px)
@@ -220,10 +257,16 @@ class _StillPicture(Frames):
         import cv2
 
         size = self._light.shape[::-1]
+        self.shown = shown = list[Shown]()
         for t_us, (right, down) in zip(self._times_us.tolist(), self._moved_px.tolist(), strict=True):
             moved = np.array([[1, 0, right], [0, 1, down]], np.float64)
             light = cv2.warpAffine(self._light, moved, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            shown.append(Shown(t_us, 0, right, down))
             yield t_us, light
+
+    def stored_size(self) -> SensorSize:
+        """See `Frames`."""
+        return self._stored_size
 
 
 def grey_levels(light: np.ndarray) -> np.ndarray:
@@ -259,48 +302,24 @@ def _open(path: Path):
     return capture
 
 
-def _list_folder(path: Path, fps: float | None) -> tuple[list[Path], list[float]]:
-    """Pictures of a folder, or of its folder `imgs`, in the order of their names, and their times in s."""
-    found = _pictures_of(path) or _pictures_of(path / "imgs")
-    if not found:
-        raise DataError(f"{path}: holds no pictures ({', '.join(PICTURE_SUFFIXES)})")
-    if fps:
-        return found, [number / fps for number in range(len(found))]
-    times = next((one for one in (path / TIMES_FILE, path.parent / TIMES_FILE) if one.is_file()), None)
-    if times is None:
-        raise DataError(f"{path}: has no {TIMES_FILE} (seconds, a line for each picture); give fps")
-    lines = [line.split()[-1] for line in times.read_text("utf-8", errors="replace").splitlines() if line.split()]
-    try:
-        seconds = [float(line) for line in lines]
-    except ValueError as error:
-        raise DataError(f"{times}: expected seconds, {shortened(str(error), 100)}") from None
-    if len(seconds) != len(found):
-        raise DataError(f"{times}: expected a time for each of {len(found)} pictures, got {len(seconds)}")
-    if not all(math.isfinite(one) and one >= 0 for one in seconds):
-        raise DataError(f"{times}: expected finite seconds from 0 on")
-    return found, seconds
+class Cover(NamedTuple):
+    """The part of a picture that a sensor sees, px of the picture; it is scaled to the sensor's size."""
+
+    left: int
+    top: int
+    width: int
+    height: int
 
 
-def _pictures_of(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    found = [one for one in folder.iterdir() if one.suffix.lower() in PICTURE_SUFFIXES and one.is_file()]
-    # Numbers count as such: frame 10 comes after frame 9.
-    return sorted(found, key=lambda one: [(int(part) if part.isdigit() else 0, part) for part in _parts(one.name)])
-
-
-def _parts(name: str) -> list[str]:
-    return re.split(r"([0-9]+)", name)
-
-
-def _read_picture(path: Path) -> np.ndarray:
-    import cv2
-
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
-    stored = cv2.imdecode(np.fromfile(path, np.uint8), flags) if path.stat().st_size else None
-    if stored is None:
-        raise DataError(f"{path}: not a picture that OpenCV can read ({path.stat().st_size} bytes)")
-    return stored
+def covering_part(stored: SensorSize, size: SensorSize) -> Cover:
+    """Of a picture that is scaled so that it covers a size, and cut to it about its middle."""
+    width, height = stored
+    if stored == size:
+        return Cover(0, 0, width, height)
+    scale = max(size[0] / width, size[1] / height)
+    # What will be cut is not scaled first: of a wide video that is a third.
+    keep = min(width, math.ceil(size[0] / scale)), min(height, math.ceil(size[1] / scale))
+    return Cover((width - keep[0]) // 2, (height - keep[1]) // 2, *keep)
 
 
 def _cover(stored: np.ndarray, size: SensorSize) -> np.ndarray:
@@ -310,9 +329,7 @@ def _cover(stored: np.ndarray, size: SensorSize) -> np.ndarray:
     height, width = stored.shape[:2]
     if (width, height) == size:
         return stored
-    scale = max(size[0] / width, size[1] / height)
-    # What will be cut is not scaled first: of a wide video that is a third.
-    keep = min(width, math.ceil(size[0] / scale)), min(height, math.ceil(size[1] / scale))
-    left, top = (width - keep[0]) // 2, (height - keep[1]) // 2
-    part = stored[top : top + keep[1], left : left + keep[0]]
-    return cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    left, top, wide, high = covering_part((width, height), size)
+    is_smaller = max(size[0] / width, size[1] / height) < 1
+    part = stored[top : top + high, left : left + wide]
+    return cv2.resize(part, size, interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR)

@@ -30,6 +30,7 @@ class VideoSimulation:
         seed: of the pixels' mismatch and of noise.
         interpolator: what lies between two frames.
         max_displacement_px: the farthest that anything moves between two drawn frames.
+        marks: whether events are marked as signal or noise (`Events.signal`).
         last_light: [H, W] the frame that the latest events follow.
         size, num_frames, num_drawn, num_events, duration_us: what has been seen, known while iterating.
     """
@@ -39,6 +40,7 @@ class VideoSimulation:
     seed: int = 0
     interpolator: Interpolator = field(default_factory=Flow)
     max_displacement_px: float = 1.0
+    marks: bool = False
     size: SensorSize | None = field(default=None, init=False)
     num_frames: int = field(default=0, init=False)
     num_drawn: int = field(default=0, init=False)
@@ -62,7 +64,9 @@ class VideoSimulation:
             for t_us, light in self.frames:
                 if camera is None:
                     self.size = light.shape[1], light.shape[0]
-                    camera = Sensor(self.size, self.sensor, sensor_seed=self.seed, seed=[self.seed, 1])
+                    camera = Sensor(
+                        self.size, self.sensor, sensor_seed=self.seed, seed=[self.seed, 1], marks=self.marks
+                    )
                     self.num_frames = self.num_drawn = self.num_events = 0
                 events = self._seen(camera, t_us, light)
                 self.num_events += len(events)

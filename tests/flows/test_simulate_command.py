@@ -1,5 +1,7 @@
 """`ctlev simulate`: every format, a preview, and refusals that leave nothing behind."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -125,3 +127,74 @@ def test_a_still_picture_and_a_folder(tmp_path):
     assert invoke(folder, tmp_path / "folder.npz")[0] == 2
     assert invoke(folder, tmp_path / "folder.npz", "--fps", 100)[0] == 0
     assert read_events(tmp_path / "folder.npz").t[-1] <= 30_000
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_each_event_is_marked_in_every_format(video, tmp_path, name):
+    """In the file where it can hold the marks, else beside it; the events are those without marks."""
+    output, size = tmp_path / f"a{load('formats', name).SUFFIXES[0]}", (240, 180) if name == "atis" else (346, 260)
+    status, text, errors = invoke(video, output, "--format", name, "--size", f"{size[0]}x{size[1]}", "--marks")
+    assert status == 0, errors
+    made = simulate_video(video, size=size, marks=True)
+    assert made.signal is not None and 0 < made.signal.sum() < len(made)
+    if name == "parquet":
+        signal = read_events(output).signal
+    elif name == "csv":
+        rows = output.read_text().splitlines()[1:]
+        assert rows[0] == "t,x,y,p,signal"
+        signal = np.array([row.endswith(",1") for row in rows[1:]])
+    else:
+        signal = np.load(tmp_path / "a.signal.npy")
+        assert signal.dtype == np.bool_ and f"signal or noise: {tmp_path}/a.signal.npy" in text
+    np.testing.assert_array_equal(signal, made.signal)
+    plain, written = simulate_video(video, size=size), read_events(output)
+    assert plain.signal is None
+    for column in "txyp":
+        np.testing.assert_array_equal(getattr(made, column), getattr(plain, column))
+    np.testing.assert_array_equal(written.t, plain.t)
+    again = invoke(video, output, "--format", name, "--marks")
+    assert again[0] == 2 and "is there already" in again[2]
+
+
+def test_marks_of_no_events_are_written_too(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((20, 20, 3), 90, np.uint8))
+    for suffix in ("parquet", "npz"):
+        status, _, errors = invoke(folder, tmp_path / f"a.{suffix}", "--fps", 30, "--sensor", "ideal", "--marks")
+        assert status == 0, errors
+    assert np.load(tmp_path / "a.signal.npy").shape == (0,)
+    signal = read_events(tmp_path / "a.parquet").signal
+    assert signal is None or len(signal) == 0
+
+
+def test_labels_are_carried_along(video, tmp_path):
+    """The square's box lies where its events are, at every time that is asked for."""
+    rows = [f"{k},1,square,{4 + 3 * k},14,20,20" for k in range(12)]
+    (tmp_path / "in.csv").write_text("frame,instance,category,x,y,width,height\n" + "\n".join(rows))
+    asked = ("--sensor", "ideal", "--size", "32x24", "--labels", tmp_path / "in.csv", "--label-rate", 300)
+    status, text, errors = invoke(video, tmp_path / "a.parquet", *asked)
+    assert status == 0 and f"labels: {tmp_path}/a.labels.json" in text, errors
+    table, events = json.loads((tmp_path / "a.labels.json").read_text()), read_events(tmp_path / "a.parquet")
+    assert len(table["images"]) == len(table["annotations"]) == 111 and table["categories"][0]["name"] == "square"
+    for one in table["annotations"][1:-1]:
+        near = np.abs(events.t - one["t_us"]) < 4000
+        left, top, width, height = one["bbox"]
+        assert (np.abs(events.x[near & (events.p == 1)] + 0.5 - left - width) < 2.5).mean() > 0.9
+        assert (np.abs(events.y[near] + 0.5 - top - height / 2) < height / 2 + 1.5).mean() > 0.95
+    plain = simulate_video(video, sensor="ideal", size=(32, 24))
+    np.testing.assert_array_equal(events.t, plain.t)
+
+
+def test_wrong_labels_leave_nothing(video, tmp_path, monkeypatch):
+    (tmp_path / "in.csv").write_text("frame,instance,x,y,width,height\n12,1,1,2,3,4\n")
+    status, _, errors = invoke(video, tmp_path / "a.parquet", "--labels", tmp_path / "in.csv")
+    assert status == 2 and "in.csv: labels of frame 12, expected frames 0 to 11" in errors
+    # A container may count a frame more than it has, so this one is found at the end alone.
+    monkeypatch.setattr("ctlev_core.video.label_files.check_frames", lambda *_: None)
+    status, _, errors = invoke(video, tmp_path / "a.raw", "--labels", tmp_path / "in.csv", "--marks")
+    assert status == 2 and "in.csv: labels of frame 12, expected frames 0 to 11" in errors
+    status, _, errors = invoke(video, tmp_path / "a.parquet", "--label-rate", 0)
+    assert status == 2 and "label_rate_hz must be above 0" in errors
+    assert [path.name for path in tmp_path.iterdir()] == ["in.csv"]

@@ -22,7 +22,7 @@ def precise_response(light, floor):
 
 
 def precise_pixel(light, t_us, on, off, leak_per_s, options):
-    """Events (time in us after the first frame, polarity) of one pixel without noise.
+    """Events (time in us after the first frame, polarity, whether light or leak made it) of one pixel without noise.
 
     Between two frames the low-passed response obeys f' = (signal - f) / lag with a signal that is linear in time. Its
     solution is evaluated as such, on a grid that no crossing pair can hide in, and each crossing is bisected.
@@ -31,6 +31,7 @@ def precise_pixel(light, t_us, on, off, leak_per_s, options):
     response = [precise_response(value, options.log_floor) for value in light]
     filtered = reference = response[0]
     last, events = -mp.inf, []
+    turned, level = mpf(0), filtered  # when the reference moved last, and the low-passed light then
     for k in range(1, len(t_us)):
         begin, span = mpf(int(t_us[k - 1] - t_us[0])), mpf(int(t_us[k] - t_us[k - 1]))
         slope = (response[k] - response[k - 1]) / span
@@ -63,9 +64,11 @@ def precise_pixel(light, t_us, on, off, leak_per_s, options):
                     left, right = (left, half) if (reached >= target) == (target > 0) else (half, right)
                 reference += target
                 now = begin + right
+                by_light, by_leak = follow(right) - level, leak * (now - turned)
+                turned, level = now, follow(right)
                 if now - last >= options.refractory_us:
                     last = now
-                    events.append((now, int(target > 0)))
+                    events.append((now, int(target > 0), bool(target < 0 or by_light >= by_leak)))
         filtered = follow(span)
     return events
 
@@ -73,7 +76,7 @@ def precise_pixel(light, t_us, on, off, leak_per_s, options):
 def compare(intensity, t_us, options, sensor_seed=3):
     """Counts and polarities equal, times to 1e-9 of themselves; returns the number of events."""
     height, width = intensity.shape[1:]
-    sensor = Sensor((width, height), options, sensor_seed=sensor_seed, seed=0)
+    sensor = Sensor((width, height), options, sensor_seed=sensor_seed, seed=0, marks=True)
     events, exact_us = sensor.push_exact(intensity, t_us)
     maps = sample_pixel_maps((width, height), options, sensor_seed)
     for y, x in np.ndindex(height, width):
@@ -81,8 +84,9 @@ def compare(intensity, t_us, options, sensor_seed=3):
         expected = precise_pixel(
             intensity[:, y, x], t_us, maps.threshold_on[y, x], maps.threshold_off[y, x], maps.leak[y, x], options
         )
-        assert events.p[mine].tolist() == [polarity for _, polarity in expected]
-        np.testing.assert_allclose(exact_us[mine], [float(time) for time, _ in expected], rtol=1e-9, atol=0)
+        assert events.p[mine].tolist() == [polarity for _, polarity, _ in expected]
+        assert events.signal is not None and events.signal[mine].tolist() == [signal for _, _, signal in expected]
+        np.testing.assert_allclose(exact_us[mine], [float(time) for time, _, _ in expected], rtol=1e-9, atol=0)
         rounded = np.floor(exact_us[mine] + 0.5) + t_us[0]
         np.testing.assert_array_equal(events.t[mine], rounded)
     return len(events)
@@ -108,6 +112,17 @@ def test_counts_and_times_of_random_light(cutoff_dark_hz, refractory_us, leak_ra
         starts_settled=False,
     )
     assert compare(intensity, t_us, options) > 30
+
+
+@pytest.mark.parametrize("cutoff_dark_hz", [None, 15.0], ids=["no_lag", "lag"])
+def test_what_leak_and_light_did_together_is_told_apart(cutoff_dark_hz):
+    """Light about as slow as leak: every share of the way to a threshold occurs, and `compare` looks at the marks."""
+    rng = np.random.default_rng(8)
+    intensity = np.exp(np.cumsum(rng.normal(0, 0.08, (40, 2, 3)), axis=0) - 2.0)
+    options = SensorOptions(
+        threshold_sigma=0.03, leak_rate_hz=8.0, cutoff_dark_hz=cutoff_dark_hz, rate_spread=0.5, starts_settled=False
+    )
+    assert compare(intensity, 20_000 * np.arange(40), options) > 30
 
 
 @pytest.mark.parametrize("clock_us", [0, 10**9, 1_700_000_000_000_000])

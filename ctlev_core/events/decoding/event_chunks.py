@@ -22,7 +22,9 @@ def concatenate(chunks: Iterable[Events]) -> Events:
     if len(parts) == 1:
         return parts[0]
     t, x, y, p = (np.concatenate([getattr(part, name) for part in parts]) for name in EVENT_DTYPES)
-    return Events(t, x, y, p, parts[0].sensor_size)
+    marks = [part.signal for part in parts if part.signal is not None]
+    signal = np.concatenate(marks) if len(marks) == len(parts) else None
+    return Events(t, x, y, p, parts[0].sensor_size, signal=signal)
 
 
 def regroup(chunks: Iterable[Events], num_events: int) -> Iterator[Events]:
@@ -37,10 +39,9 @@ def regroup(chunks: Iterable[Events], num_events: int) -> Iterator[Events]:
     waiting: list[Events] = []
     num_waiting = 0
     any_given = False
-    sensor_size = (1, 1)
+    nothing = empty_events((1, 1))
     for chunk in chunks:
-        sensor_size = chunk.sensor_size
-        start = 0
+        nothing, start = chunk.slice(0, 0), 0
         while len(chunk) - start >= num_events - num_waiting:
             stop = start + num_events - num_waiting
             yield concatenate([*waiting, chunk.slice(start, stop)])
@@ -51,7 +52,7 @@ def regroup(chunks: Iterable[Events], num_events: int) -> Iterator[Events]:
     if waiting:
         yield concatenate(waiting)
     elif not any_given:
-        yield empty_events(sensor_size)
+        yield nothing
 
 
 def check_chunks(chunks: Iterable[Events], where: str) -> Iterator[Events]:
@@ -70,9 +71,11 @@ def check_joints(chunks: Iterable[Events], where: str) -> Iterator[Events]:
     """Hand on chunks that were checked one by one, with the promises of `Events` kept across their joints too.
 
     Raises:
-        DataError: a chunk starts before the last one ended, or has another sensor size.
+        DataError: a chunk starts before the last one ended, has another sensor size, or says of its events whether
+            they are signal where another did not.
     """
     num_before = last_t = 0
+    has_signal = False
     sensor_size: SensorSize | None = None
     for chunk in chunks:
         if sensor_size is not None and chunk.sensor_size != sensor_size:
@@ -83,6 +86,9 @@ def check_joints(chunks: Iterable[Events], where: str) -> Iterator[Events]:
         sensor_size = chunk.sensor_size
         _check_joint(chunk, where, num_before, last_t)
         if len(chunk):
+            if num_before and has_signal != (chunk.signal is not None):
+                raise DataError(f"{where}: signal must be known of all events or of none, not so from {num_before} on")
+            has_signal = chunk.signal is not None
             last_t = int(chunk.t[-1])
             num_before += len(chunk)
         yield chunk

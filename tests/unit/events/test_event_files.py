@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -298,3 +299,36 @@ def test_memory_of_a_chunked_read_does_not_grow_with_the_file(name, tmp_path):
     assert total == 8_000_000
     assert in_chunks < 80, f"{in_chunks} MB"
     assert whole > 95, f"{whole} MB: the measurement sees no memory"
+
+
+def test_what_is_signal_survives_a_parquet_file_read_in_any_way(tmp_path):
+    events = make_events(600_000)
+    marked = replace(events, signal=np.random.default_rng(1).random(len(events)) < 0.7)
+    event_files.write_event_chunks(
+        tmp_path / "a.parquet", [marked.slice(0, 1000), marked.slice(1000, 600_000)], "parquet"
+    )
+    whole = event_files.read_events_file(tmp_path / "a.parquet")
+    assert_same(whole, events)
+    chunks = list(event_files.read_event_chunks(tmp_path / "a.parquet", 70_001))
+    stretch = event_files.read_events_range(tmp_path / "a.parquet", 262_100, 300_000)
+    assert marked.signal is not None
+    for got, expected in (
+        (whole, marked.signal),
+        (event_chunks.concatenate(chunks), marked.signal),
+        (stretch, marked.signal[262_100:300_000]),
+    ):
+        assert got.signal is not None and got.signal.dtype == np.bool_
+        np.testing.assert_array_equal(got.signal, expected)
+    event_files.write_events_parquet(tmp_path / "b.parquet", events)
+    assert event_files.read_events_file(tmp_path / "b.parquet").signal is None
+
+
+def test_signal_must_be_known_of_all_events_or_of_none(tmp_path):
+    events = make_events(20)
+    marked = replace(events, signal=np.ones(20, bool))
+    for first, second in ((marked, events), (events, marked)):
+        with pytest.raises(DataError, match="signal must be known of all events or of none, not so from 10 on"):
+            event_files.write_event_chunks_parquet(tmp_path / "a.parquet", [first.slice(0, 10), second.slice(10, 20)])
+    with pytest.raises(DataError, match=r"column signal must be \[20\] bool"):
+        event_files.write_events_parquet(tmp_path / "a.parquet", replace(events, signal=np.ones(19, bool)))
+    assert not list(tmp_path.iterdir())
