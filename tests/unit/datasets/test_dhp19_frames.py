@@ -167,7 +167,7 @@ def test_a_projection_matrix_of_any_scale_and_sign_gives_the_same_camera():
     ("content", "message"),
     [
         (np.zeros((3, 4)), "singular"),
-        (np.zeros((3, 3)), r"\[3, 4\] of finite floats"),
+        (np.zeros((3, 3)), r"\[3, 4\] of finite numbers"),
         (np.full((3, 4), np.nan), "finite"),
     ],
 )
