@@ -7,8 +7,10 @@ Nothing is downloaded, and no pickle is run: `docs/weights.md` says what is read
 from __future__ import annotations
 
 import copy
+import inspect
 import json
 import logging
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from ctlev_core.diffusion.pretrained.model_building import build_model
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, read_base_model_files, read_parts
 from data_contracts.errors import DataError
 
+LIBRARIES = ("diffusers", "transformers")
 logger = logging.getLogger(__name__)
 
 PROMPT_BATCH = 128
@@ -134,6 +137,9 @@ def _load_tokenizer(folder: Path, max_length: int) -> Any:
 def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtype | None = None) -> None:
     """Write an ordinary diffusers pipeline folder, with safetensors weights.
 
+    The code of the patch autoencoder, which is no class of diffusers, goes along: with `trust_remote_code=True` the
+    folder loads without ctlev.
+
     Args:
         base_model: what to write.
         folder: is created.
@@ -145,6 +151,11 @@ def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtyp
     folder.mkdir(parents=True, exist_ok=True)
     scheduler: Any = DDPMScheduler.from_config(base_model.scheduler_config)
     base_model.vae.save_pretrained(folder / "vae", safe_serialization=True)
+    library = _library(base_model.vae)
+    if library not in LIBRARIES:
+        source = Path(inspect.getfile(type(base_model.vae)))
+        shutil.copyfile(source, folder / "vae" / source.name)
+        library = source.stem
     scheduler.save_pretrained(folder / "scheduler")
     base_model.tokenizer.save_pretrained(folder / "tokenizer")
     index: dict[str, Any] = {
@@ -153,7 +164,7 @@ def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtyp
         else "StableDiffusionControlNetPipeline",
         "scheduler": ["diffusers", type(scheduler).__name__],
         "tokenizer": ["transformers", "CLIPTokenizer"],
-        "vae": [_library(base_model.vae), type(base_model.vae).__name__],
+        "vae": [library, type(base_model.vae).__name__],
         "safety_checker": [None, None],
         "feature_extractor": [None, None],
         "requires_safety_checker": False,
@@ -179,7 +190,7 @@ def _library(model: Any) -> str:
     """What `model_index.json` calls the home of a class: a library, or for our own class its module."""
     module = type(model).__module__
     top = module.split(".", 1)[0]
-    return top if top in ("diffusers", "transformers") else module
+    return top if top in LIBRARIES else module
 
 
 def encode_prompts(base_model: PretrainedModel, prompts: list[str]) -> torch.Tensor:

@@ -1,7 +1,10 @@
 """Base models are ordinary diffusers folders: what is written loads again, also in diffusers itself."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -53,7 +56,7 @@ def test_half_precision_is_written_for_networks_but_not_for_the_code(tmp_path):
 
 
 def test_diffusers_loads_the_folder(folder):
-    pipeline = StableDiffusionControlNetPipeline.from_pretrained(folder, vae=load_base_model(folder).vae)
+    pipeline = StableDiffusionControlNetPipeline.from_pretrained(folder, trust_remote_code=True)
     pipeline.set_progress_bar_config(disable=True)
     image = pipeline(
         "a photo of a cup", image=torch.zeros(1, 3, SIDE, SIDE), num_inference_steps=2, output_type="np"
@@ -61,10 +64,39 @@ def test_diffusers_loads_the_folder(folder):
     assert image.shape == (1, SIDE, SIDE, 3) and np.isfinite(image).all()
 
 
+@pytest.mark.parametrize("route", ["ControlNet", "text"])
+def test_diffusers_loads_the_folder_where_there_is_no_ctlev(folder, tmp_path, route):
+    """In an interpreter that cannot import ctlev: the code of the autoencoder lies in the folder."""
+    checkpoint = tmp_path / "checkpoint"
+    save_base_model(load_base_model(folder, with_controlnet=route == "ControlNet"), checkpoint)
+    script = f"""
+import importlib.util, sys
+assert importlib.util.find_spec("ctlev_core") is None
+import torch
+from diffusers import DiffusionPipeline
+pipeline = DiffusionPipeline.from_pretrained({str(checkpoint)!r}, trust_remote_code=True)
+image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+print(float((pipeline.vae.decode(pipeline.vae.encode(image).latent_dist.mode()).sample - image).abs().max()) < 1e-5)
+print(type(pipeline).__name__)
+"""
+    # -P and a folder elsewhere: no path to the repository; an editable install is found by a finder of its own.
+    lines = ["import sys", "sys.meta_path = [one for one in sys.meta_path if 'editable' not in repr(one).lower()]"]
+    run = subprocess.run(
+        [sys.executable, "-P", "-c", "\n".join(lines) + script],
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"HF_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr[-2000:]
+    assert run.stdout.split() == ["True", f"StableDiffusion{'ControlNet' if route == 'ControlNet' else ''}Pipeline"]
+
+
 def test_text_checkpoint_is_a_stable_diffusion_folder(folder, tmp_path):
     save_base_model(load_base_model(folder, with_controlnet=False), tmp_path / "text")
     assert not (tmp_path / "text" / "controlnet").exists()
-    pipeline = StableDiffusionPipeline.from_pretrained(tmp_path / "text", vae=load_base_model(folder).vae)
+    pipeline = StableDiffusionPipeline.from_pretrained(tmp_path / "text", trust_remote_code=True)
     assert pipeline.unet.config.in_channels == 48
 
 
