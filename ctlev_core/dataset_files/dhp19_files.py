@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctlev_core.events.decoding.array_files import read_array_header
 from ctlev_core.safe_files import hdf5_files
 from ctlev_core.safe_files.mat_files import read_struct
 from ctlev_core.safe_files.numpy_files import read_numbers
@@ -192,11 +193,14 @@ def read_projection(path: Path) -> np.ndarray:
     """
     try:
         with path.open("rb") as file:
-            matrix = read_numbers(file, path.stat().st_size, path.name)
+            size = path.stat().st_size
+            dtype = read_array_header(file, path.name, size).dtype
+            file.seek(0)
+            matrix = read_numbers(file, size, path.name)
     except (DataError, FileNotFoundError) as error:
         raise DataError(f"{path}: expected a projection matrix in a .npy file: {error}") from error
-    if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
-        raise DataError(f"{path}: expected a projection matrix [3, 4] of finite numbers, got {list(matrix.shape)}")
+    if matrix.shape != (3, 4) or dtype.kind != "f" or not np.isfinite(matrix).all():
+        raise DataError(f"{path}: expected a projection matrix [3, 4] of finite floats, got {matrix.shape} {dtype}")
     return matrix
 
 

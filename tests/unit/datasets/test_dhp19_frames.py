@@ -167,7 +167,8 @@ def test_a_projection_matrix_of_any_scale_and_sign_gives_the_same_camera():
     ("content", "message"),
     [
         (np.zeros((3, 4)), "singular"),
-        (np.zeros((3, 3)), r"\[3, 4\] of finite numbers"),
+        (np.zeros((3, 3)), r"\[3, 4\] of finite floats"),
+        (np.ones((3, 4), np.int64), r"\[3, 4\] of finite floats, got \(3, 4\) int64"),
         (np.full((3, 4), np.nan), "finite"),
     ],
 )
