@@ -101,21 +101,26 @@ def apply_override(values: dict[str, Any], override: str) -> None:
 
     Args:
         values: options by name, groups as mappings.
-        override: `dotted.name=value`; the value is YAML.
+        override: `dotted.name=value`; the value is YAML. A part `*` of the name stands for each of the groups that are
+            there: `experiments.*.num_synthetic=100`.
     """
     name, separator, text = override.partition("=")
     if not separator or not name:
         raise PluginError(f"--set expects key=value, got {shortened(repr(override), 200)}")
     *parents, last = name.split(".")
-    target = values
+    targets = [values]
     for parent in parents:
-        target = target.setdefault(parent, {})
-        if not isinstance(target, dict):
+        if parent == "*":
+            targets = [group for target in targets for group in target.values()]
+        else:
+            targets = [target.setdefault(parent, {}) for target in targets]
+        if not all(isinstance(target, dict) for target in targets):
             raise PluginError(f"--set {name}: {parent!r} is not a group of options")
-    try:
-        target[last] = load_yaml(text)
-    except yaml.YAMLError as error:
-        raise PluginError(f"--set {name[:100]}: {shortened(repr(text), 100)} is not YAML: {error}") from None
+    for target in targets:
+        try:
+            target[last] = load_yaml(text)
+        except yaml.YAMLError as error:
+            raise PluginError(f"--set {name[:100]}: {shortened(repr(text), 100)} is not YAML: {error}") from None
 
 
 def print_plan(rows: list[PlannedStage]) -> None:

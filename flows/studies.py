@@ -15,6 +15,7 @@ from data_contracts.study import Study
 from flows.command_line import PRESETS, apply_override, load_experiment, read_preset
 from flows.inputs import check_inputs
 from flows.speed_vs_error import speed_vs_error_of
+from flows.stand_ins import make_missing
 from flows.sweeps import find_sweeps, looks_like_sweep, study_of
 
 
@@ -27,11 +28,15 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     that may be missing: it is null where that path is not given. An experiment that says `only_with` some of the paths
     is left out where one of them is not given, and `data_notice` says so.
 
+    `set` beside `experiments` changes single options of them, as `experiments.NAME.key=value`, where `*` as NAME is each
+    of them. `stand_ins` has what `paths` leave open made on the spot, see `flows.stand_ins`.
+
     Of a preset of one experiment, overrides with several values (`flows.sweeps`) make a study of all combinations.
 
     Args:
         preset: as `load_preset` takes it.
-        overrides: likewise; those of a study begin with `experiments.NAME.`, `paths.` or `speed_vs_error.`.
+        overrides: likewise; those of a study begin with `experiments.NAME.`, `paths.`, `speed_vs_error.` or
+            `stand_ins=`.
 
     Raises:
         PluginError: as `load_experiment` and `speed_vs_error_of`.
@@ -49,7 +54,13 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
 
 def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Study:
     """The study that a preset with `experiments` describes; see `load_study`."""
+    early, overrides = ([o for o in overrides if o.startswith("stand_ins=") == is_it] for is_it in (True, False))
+    for override in early:
+        apply_override(values, override)
     parts, paths, groups = values.get("experiments"), values.pop("paths", {}), values.pop("sets", {})
+    changes, stand_ins = values.pop("set", []), values.pop("stand_ins", None)
+    if not _are_texts(changes):
+        raise PluginError(f"{where}: set must be a list of texts key=value, got {shortened(repr(changes), 200)}")
     if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
         raise PluginError(
             f"{where}: experiments must be a mapping of names to options, got {shortened(repr(parts), 200)}"
@@ -67,6 +78,8 @@ def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Stu
         if name not in paths:
             raise PluginError(f"--set paths.{name}: this preset has no such path; it has {', '.join(paths) or 'none'}")
         apply_override(paths, override.removeprefix("paths."))
+    if stand_ins is not None:
+        changes = [*changes, *(f"experiments.*.{o}" for o in make_missing(paths, stand_ins, where))]
     wanted = {name: part.get("only_with", []) for name, part in parts.items()}
     left_out = _leave_out(parts, paths, where)
     if left_out:
@@ -75,6 +88,8 @@ def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Stu
     values["experiments"] = {
         name: _part(deepcopy(part), paths, groups, f"{where}, experiments.{name}") for name, part in parts.items()
     }
+    for change in changes:
+        apply_override(values, change)
     for override in others:
         if name := next((name for name in left_out if override.startswith(f"experiments.{name}.")), None):
             raise PluginError(f"--set {override}: {left_out[name]}")
