@@ -37,7 +37,7 @@ class RunRecord(BaseModel):
         started: when, UTC.
         wall_seconds: how long.
         cpu_seconds: of its process, meanwhile.
-        process_peak_memory_mib: highest of its process so far.
+        process_peak_memory_mib: highest of its process while it ran.
     """
 
     # What a newer version of the code notes beside these is no damage.

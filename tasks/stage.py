@@ -45,6 +45,7 @@ from pydantic import BaseModel
 
 from ctlev_core import plugins
 from ctlev_core.plugin_contracts import PluginWithFiles
+from ctlev_core.processes import begin_memory_peak, memory_peak_mib
 from ctlev_core.progress import Progress, current_report, reporting_to
 from ctlev_core.provenance.raw_file_digests import digest_raw_files
 from data_contracts.arrays import ArrayWriter
@@ -312,6 +313,7 @@ class Stage:
         folder, work = store.temporary_folder(key), store.work_folder(key)
         # We hold the lock of this key: whatever lies here was left by a process that died.
         shutil.rmtree(folder, ignore_errors=True)
+        begin_memory_peak()
         started, wall, cpu = time.time(), time.perf_counter(), _cpu_seconds()
         try:
             folder.mkdir(parents=True)
@@ -329,8 +331,8 @@ class Stage:
                 "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
                 "wall_seconds": round(time.perf_counter() - wall, 3),
                 "cpu_seconds": round(_cpu_seconds() - cpu, 3),
-                # Highest of the process so far, which is what decides whether a machine is large enough.
-                "process_peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+                # While the stage ran, which is what decides whether a machine is large enough.
+                "process_peak_memory_mib": round(memory_peak_mib(), 1),
                 "versions": _versions(),
             }
             return store.publish(self.name, key, folder, record)

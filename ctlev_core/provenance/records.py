@@ -39,7 +39,7 @@ class Record:
         started: when, UTC.
         wall_seconds: how long.
         cpu_seconds: of its process, meanwhile.
-        process_peak_memory_mib: highest of its process so far.
+        process_peak_memory_mib: highest of its process while it ran.
     """
 
     role: str

@@ -73,7 +73,7 @@ class Trainer:
         else:
             self.optimizer = torch.optim.AdamW(self.parameters, fused=device_type in ("cpu", "cuda"), **settings)
         self.scaler = torch.amp.GradScaler(device_type, enabled=options.precision == "float16")  # pyright: ignore[reportPrivateImportUsage]
-        self.average = [parameter.detach().clone() for parameter in self.parameters]
+        self.average = self._new_average()
         self.best: list[Tensor] | None = None
         self.history = TrainingHistory()
         self.step = 0
@@ -117,8 +117,9 @@ class Trainer:
             return False
         # The average forgets its random start quickly: decay rises from 0.1 to its final value.
         ema_decay = min(options.ema_decay, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            torch._foreach_lerp_(self.average, [p.detach() for p in self.parameters], 1 - ema_decay)  # pyright: ignore[reportPrivateImportUsage]
+        if options.ema_decay:
+            with torch.no_grad():
+                torch._foreach_lerp_(self.average, [p.detach() for p in self.parameters], 1 - ema_decay)  # pyright: ignore[reportPrivateImportUsage]
         return True
 
     def count_skipped(self) -> None:
@@ -148,6 +149,9 @@ class Trainer:
     @contextmanager
     def using_average(self) -> Iterator[None]:
         """Within the context the parameters hold their moving average."""
+        if not self.options.ema_decay:
+            yield
+            return
         trained = [parameter.detach().clone() for parameter in self.parameters]
         _copy_into(self.parameters, self.average)
         try:
@@ -168,7 +172,9 @@ class Trainer:
         self.history.kept_step = self.step
         if self.best is not None:
             self.history.kept_step = self.history.validation_step[_lowest(self.history.validation_loss)]
-        _copy_into(self.parameters, self.average if self.best is None else self.best)
+        if self.best is not None or self.options.ema_decay:
+            _copy_into(self.parameters, self.average if self.best is None else self.best)
+        self.optimizer.zero_grad(set_to_none=True)
         return self.history
 
     def save(self, path: Path, *, write: bool = True) -> None:
@@ -208,7 +214,7 @@ class Trainer:
                 f"expected {self.identity}, got {state['identity']}"
             )
         _copy_into(self.parameters, self._parts_of(state["parameters"]))
-        self.average = self._parts_of(state["average"])
+        self.average = self._parts_of(state["average"]) if self.options.ema_decay else self._new_average()
         self.best = None if state.get("best") is None else self._parts_of(state["best"])
         self.optimizer.load_state_dict(part_of_optimizer(state["optimizer"], self.parameters))
         self.scaler.load_state_dict(state.get("scaler", {}))
@@ -216,6 +222,11 @@ class Trainer:
         self.step, self.seconds, self.skipped = state["step"], state["seconds"], state["skipped"]
         self.non_finite = state.get("non_finite", 0)
         self.losses = state["losses"]
+
+    def _new_average(self) -> list[Tensor]:
+        """Copies of the weights; where nothing is averaged the weights themselves, a copy of which is gigabytes."""
+        weights = [parameter.detach() for parameter in self.parameters]
+        return [weight.clone() for weight in weights] if self.options.ema_decay else weights
 
     def _parts_of(self, values: Sequence[Tensor]) -> list[Tensor]:
         return [part_of(value, parameter) for value, parameter in zip(values, self.parameters, strict=True)]
