@@ -34,30 +34,11 @@ import training
 from interleaved import Comparison, describe_machine, matmul_flops, print_comparisons, print_targets
 from torch.utils.flop_counter import FlopCounterMode
 
-from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, choose_device
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
-from ctlev_core.diffusion.pretrained.single_file import CONFIGS
 from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.stand_ins.networks import Size, build_network, stable_diffusion_configs
 
-TINY: dict[str, dict[str, Any]] = {
-    "unet": {"block_out_channels": [32, 32, 64, 64], "cross_attention_dim": 32, "attention_head_dim": 2},
-    "controlnet": {
-        "block_out_channels": [32, 32, 64, 64],
-        "cross_attention_dim": 32,
-        "attention_head_dim": 2,
-        "conditioning_embedding_out_channels": [8, 8, 16, 16],
-    },
-    "vae": {"block_out_channels": [32, 32, 32, 32]},
-    "text_encoder": {
-        "hidden_size": 32,
-        "intermediate_size": 64,
-        "projection_dim": 32,
-        "num_hidden_layers": 2,
-        "num_attention_heads": 2,
-    },
-}
-"""What `--size tiny` changes: every line of this file runs in seconds on a CPU."""
 MATMUL_SIDE = {"cuda": 8192, "cpu": 512}
 
 
@@ -65,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the parts one after the other; exit status 1 where one of them failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="cuda, cuda:1 ..., or cpu, which makes sense with --size tiny")
-    parser.add_argument("--size", choices=("sd", "tiny"), default="sd")
+    parser.add_argument("--size", choices=("full", "tiny"), default="full")
     parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=tuple(PARTS))
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="bfloat16")
     parser.add_argument("--image-size", type=int, default=512, help="px, a multiple of 64")
@@ -116,37 +97,28 @@ def _run_part(name: str, chosen: Any, device: torch.device, limit: float, found:
 
 
 def build_base_model(
-    size: str, image_size: int, *, with_controlnet: bool, dtype: torch.dtype, device: torch.device, seed: int = 0
+    size: Size, image_size: int, *, with_controlnet: bool, dtype: torch.dtype, device: torch.device, seed: int = 0
 ) -> PretrainedModel:
     """Stable Diffusion v1 by its configs, with random weights; the tokenizer, which takes no time, is the bundled one.
 
     Args:
-        size: `sd`, or `tiny` with the changes of `TINY`.
+        size: of the networks.
         image_size: px.
         with_controlnet: a ControlNet, too.
         dtype: of all weights.
         device: where they are made.
         seed: equal seeds give equal weights.
     """
-    from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
-    from diffusers.models.controlnets.controlnet import ControlNetModel
-    from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
-    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+    from transformers import CLIPTokenizer
 
-    configs = read_json(CONFIGS)
-    for name, changes in TINY.items() if size == "tiny" else ():
-        configs[name] = {**configs[name], **changes}
-    configs["unet"]["sample_size"] = image_size // 8
+    configs = stable_diffusion_configs(size, image_size)
     tokenizer = CLIPTokenizer.from_pretrained(str(BUNDLED_BASE_MODEL / "tokenizer"), local_files_only=True)
     tokenizer.model_max_length = configs["text_encoder"]["max_position_embeddings"]
     torch.manual_seed(seed)
+    parts = ("text_encoder", "vae", "unet", *(["controlnet"] if with_controlnet else []))
     with torch.device(device):
-        networks: dict[str, Any] = {
-            "text_encoder": CLIPTextModel(CLIPTextConfig.from_dict(configs["text_encoder"])),
-            "vae": AutoencoderKL.from_config(configs["vae"]),
-            "unet": UNet2DConditionModel.from_config(configs["unet"]),
-            "controlnet": ControlNetModel.from_config(configs["controlnet"]) if with_controlnet else None,
-        }
+        networks: dict[str, Any] = {part: build_network(part, configs[part]) for part in parts}
+    networks.setdefault("controlnet", None)
     for network in networks.values():
         if network is not None:
             network.to(device, dtype).eval().requires_grad_(False)

@@ -1,4 +1,4 @@
-"""Presets that run without downloads: what their `paths` leave open is made, with random weights and made-up recordings.
+"""Presets that need no downloads: what their `paths` leave open is made, of random weights and made-up recordings.
 
 A study says so with `stand_ins: full`, networks of their published sizes, or `tiny`. What is made lies in the home,
 under `stand_ins/`, and is made once.

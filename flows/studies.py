@@ -28,8 +28,8 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
     that may be missing: it is null where that path is not given. An experiment that says `only_with` some of the paths
     is left out where one of them is not given, and `data_notice` says so.
 
-    `set` beside `experiments` changes single options of them, as `experiments.NAME.key=value`, where `*` as NAME is each
-    of them. `stand_ins` has what `paths` leave open made on the spot, see `flows.stand_ins`.
+    `set` beside `experiments` changes single options of them, as `experiments.NAME.key=value`; `*` as NAME stands for
+    every one. `stand_ins` has what `paths` leave open made on the spot, see `flows.stand_ins`.
 
     Of a preset of one experiment, overrides with several values (`flows.sweeps`) make a study of all combinations.
 
@@ -54,32 +54,22 @@ def load_study(preset: str, overrides: list[str]) -> Experiment | Study:
 
 def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Study:
     """The study that a preset with `experiments` describes; see `load_study`."""
-    early, overrides = ([o for o in overrides if o.startswith("stand_ins=") == is_it] for is_it in (True, False))
+    early, overrides = _split(overrides, "stand_ins=")
     for override in early:
         apply_override(values, override)
-    parts, paths, groups = values.get("experiments"), values.pop("paths", {}), values.pop("sets", {})
-    changes, stand_ins = values.pop("set", []), values.pop("stand_ins", None)
-    if not _are_texts(changes):
-        raise PluginError(f"{where}: set must be a list of texts key=value, got {shortened(repr(changes), 200)}")
-    if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
-        raise PluginError(
-            f"{where}: experiments must be a mapping of names to options, got {shortened(repr(parts), 200)}"
-        )
-    if not isinstance(groups, dict) or not all(_are_texts(group) for group in groups.values()):
-        raise PluginError(
-            f"{where}: sets must map names to lists of texts key=value, got {shortened(repr(groups), 200)}"
-        )
+    parts, paths, groups, changes = _read_study(values, where)
     parts = _repeat(parts, where)
     if swept := next((override for override in overrides if looks_like_sweep(override.partition("=")[2])), None):
         raise PluginError(f"--set {swept}: {where} is a study; several values are for presets of one experiment")
-    given, others = ([o for o in overrides if o.startswith("paths.") == is_path] for is_path in (True, False))
+    given, others = _split(overrides, "paths.")
     for override in given:
         name = override.partition("=")[0].removeprefix("paths.")
         if name not in paths:
             raise PluginError(f"--set paths.{name}: this preset has no such path; it has {', '.join(paths) or 'none'}")
         apply_override(paths, override.removeprefix("paths."))
+    stand_ins = values.pop("stand_ins", None)
     if stand_ins is not None:
-        changes = [*changes, *(f"experiments.*.{o}" for o in make_missing(paths, stand_ins, where))]
+        changes = [*changes, *(f"experiments.*.{option}" for option in make_missing(paths, stand_ins, where))]
     wanted = {name: part.get("only_with", []) for name, part in parts.items()}
     left_out = _leave_out(parts, paths, where)
     if left_out:
@@ -99,6 +89,40 @@ def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Stu
     check_inputs(study, thoroughly=any(given is None for path, given in paths.items() if path not in done_without))
     speed_vs_error_of(study)
     return study
+
+
+def _read_study(
+    values: dict[str, Any], where: str
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, list[str]], list[str]]:
+    """Experiments, paths, groups of options and changes of a preset, taken out of it but for the experiments.
+
+    Raises:
+        PluginError: one of them is not of its kind.
+    """
+    parts, paths, groups = values.get("experiments"), values.pop("paths", {}), values.pop("sets", {})
+    changes = values.pop("set", [])
+    if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
+        raise PluginError(
+            f"{where}: experiments must be a mapping of names to options, got {shortened(repr(parts), 200)}"
+        )
+    if not isinstance(groups, dict) or not all(_are_texts(group) for group in groups.values()):
+        raise PluginError(
+            f"{where}: sets must map names to lists of texts key=value, got {shortened(repr(groups), 200)}"
+        )
+    if not _are_texts(changes):
+        raise PluginError(f"{where}: set must be a list of texts key=value, got {shortened(repr(changes), 200)}")
+    starts = tuple(f"experiments.{name}." for name in ("*", *parts))
+    if unknown := [change for change in changes if not change.startswith(starts)]:
+        raise PluginError(
+            f"{where}: set changes options of its experiments, as experiments.NAME.key=value with one of "
+            f"{', '.join(parts)} or *; got {shortened(repr(unknown[0]), 200)}"
+        )
+    return parts, paths, groups, changes
+
+
+def _split(overrides: list[str], start: str) -> tuple[list[str], list[str]]:
+    """Those that begin so, and the others."""
+    return [one for one in overrides if one.startswith(start)], [one for one in overrides if not one.startswith(start)]
 
 
 def _repeat(parts: dict[str, Any], where: str) -> dict[str, Any]:

@@ -114,7 +114,7 @@ def write_event_hpe(root: Path) -> None:
         frame = np.minimum(events.t * EVENT_HPE_RATE_HZ // 1_000_000, EVENT_HPE_FRAMES - 1)
         for i in range(EVENT_HPE_FRAMES + 1):
             joints3d = person.joints[i]
-            small = project(camera, joints3d) + [event_hpe_files.PADDING, 0]
+            small = project(camera, joints3d) + np.array([event_hpe_files.PADDING, 0])
             small *= event_hpe_files.POSE_IMAGE_SIZE / event_hpe_files.PADDED_SIZE
             pose = (
                 person.clip.betas[None], person.clip.pose[i][None], person.clip.transl[i][None], joints3d,
@@ -141,7 +141,11 @@ def write_n_imagenet(root: Path) -> None:
     for kind, wordnet_id in enumerate(N_IMAGENET_NAMES):
         for folder, count in N_IMAGENET_PICTURES.items():
             for number in range(count):
-                name = f"{wordnet_id}_{number}" if folder == "extracted_train" else f"ILSVRC2012_val_{kind:05d}{number:03d}"
+                name = (
+                    f"{wordnet_id}_{number}"
+                    if folder == "extracted_train"
+                    else f"ILSVRC2012_val_{kind:05d}{number:03d}"
+                )
                 path = root / folder / wordnet_id / f"{name}.npz"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 columns = _shaken_outline(kind, n_imagenet.SENSOR_SIZE, THING_EVENTS, 100 * kind + number)

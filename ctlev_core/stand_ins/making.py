@@ -103,7 +103,9 @@ def make_stand_in(name: str, size: Size, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     needed, free = int(1.1e6 * stand_in.megabytes), shutil.disk_usage(folder).free
     if size == "full" and free < needed:
-        raise DataError(f"{folder}: {stand_in.what} of random weights needs {needed / 1e9:.1f} GB, {free / 1e9:.1f} are free")
+        raise DataError(
+            f"{folder}: {stand_in.what} of random weights needs {needed / 1e9:.1f} GB, {free / 1e9:.1f} are free"
+        )
     temporary = Path(tempfile.mkdtemp(prefix=f"{own.name}.", suffix=".part", dir=folder))
     try:
         written = temporary / own.name

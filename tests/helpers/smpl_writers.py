@@ -15,6 +15,9 @@ import numpy as np
 import scipy.sparse
 
 from ctlev_core.geometry.joint_sets import SMPL_PARENTS
+from ctlev_core.stand_ins.dataset_writers import smpl_pickle as pickled
+
+__all__ = ["chumpy_classes", "pickled", "pickled_by_python_2", "smpl_arrays", "sparse"]
 
 
 def smpl_arrays(seed: int = 0, num_vertices: int = 6890, num_faces: int = 13776) -> dict[str, Any]:
@@ -35,16 +38,6 @@ def smpl_arrays(seed: int = 0, num_vertices: int = 6890, num_faces: int = 13776)
         "J_regressor": regressor,
         "kintree_table": np.array([[2**32 - 1, *SMPL_PARENTS[1:]], range(24)], np.uint32),
     }
-
-
-def pickled(tree: dict[str, Any], protocol: int = 2) -> bytes:
-    """The bytes of a pickle; sparse matrices under the module names that scipy had when SMPL was published."""
-    content = pickle.dumps(tree, protocol)
-    if protocol > 2:  # there a length stands before each name
-        return content
-    for form in (b"csc", b"csr", b"coo"):
-        content = content.replace(b"scipy.sparse._" + form, b"scipy.sparse." + form)
-    return content
 
 
 def pickled_by_python_2(tree: dict[str, Any]) -> bytes:

@@ -220,7 +220,7 @@ def test_gpu_benchmark_goes_on_after_a_part_that_failed(benchmarks, capsys, monk
 def test_networks_have_the_size_of_stable_diffusion(benchmarks):
     """Published sizes of v1.4: 859.5 M, ControlNet 361.3 M, autoencoder 83.7 M, text encoder 123.1 M."""
     base_model = benchmarks.gpu.build_base_model(
-        "sd", 512, with_controlnet=True, dtype=torch.float32, device=torch.device("meta")
+        "full", 512, with_controlnet=True, dtype=torch.float32, device=torch.device("meta")
     )
     counts = benchmarks.gpu.count_parameters(base_model)
     assert counts == "unet 859.5 M, controlnet 361.3 M, vae 83.7 M, text_encoder 123.1 M"

@@ -13,6 +13,7 @@ from ctlev_core.dataset_files import cdehp_files
 from ctlev_core.datasets import cdehp
 from ctlev_core.geometry.joint_sets import JOINT_SETS, SMPL_TO_DHP19, joint_indices
 from ctlev_core.plugins import PluginError
+from ctlev_core.stand_ins.dataset_writers import write_cdehp_label
 from data_contracts.config import DatasetChoice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels
@@ -21,9 +22,7 @@ JOINTS = np.stack([np.linspace(100, 1200, 13), np.linspace(50, 700, 13)], axis=1
 
 
 def write_label(path: Path, joints=JOINTS, partner: str = "color_name:000000") -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lines = [f"{x / 1280} {y / 800}" for x, y in joints]
-    path.write_text("\n".join(["13", partner, *lines]) + "\n")
+    write_cdehp_label(path, joints, partner)
 
 
 def write_picture(path: Path, value: int, size=(1280, 800), channels=1) -> None:

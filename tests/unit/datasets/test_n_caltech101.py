@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from pydantic import ValidationError
 
 from ctlev_core import plugins
 from ctlev_core.datasets import n_caltech101
+from ctlev_core.stand_ins.dataset_writers import write_atis
 from data_contracts.config import ConditionChoice, DatasetChoice, EncodingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels
@@ -24,14 +24,6 @@ from tasks.store import Store
 # Table 5 of the paper, as printed.
 TABLE_5 = ["bonsai", "ceiling fan", "ferry", "joshua tree", "minaret", "pagoda", "sunflower", "water lilly",
            "windsor chair", "chandelier"]  # fmt: skip
-
-
-def write_atis(path: Path, t: list[int], x: list[int], y: list[int], p: list[int]) -> Path:
-    """40 bits an event, as the dataset's paper describes them: x, y, polarity and 23 bits of time, high byte first."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    words = [struct.pack(">BBBH", a, b, d << 7 | c >> 16, c & 0xFFFF) for a, b, c, d in zip(x, y, t, p, strict=True)]
-    path.write_bytes(b"".join(words))
-    return path
 
 
 def write_some(path: Path, seed: int = 0, num_events: int = 200) -> Path:

@@ -9,6 +9,7 @@ import pytest
 
 from ctlev_core import plugins
 from ctlev_core.datasets import n_imagenet
+from ctlev_core.stand_ins.dataset_writers import write_n_imagenet_lists
 from data_contracts.config import DatasetChoice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Part, check_labels
@@ -36,14 +37,6 @@ def write_events(path: Path, rows: list[tuple[int, int, int, int]], compressed: 
 ROWS = [(0, 0, 0, 1), (639, 479, 10, 0), (5, 7, 10, 1), (639, 0, 25_000, 0)]
 
 
-def write_lists(root: Path) -> None:
-    """Lists as downloaded: with the paths of the authors' machine."""
-    for folder, name in (("extracted_train", "train_list.txt"), ("extracted_val", "val_list.txt")):
-        files = sorted((root / folder).glob("*/*.npz"))
-        lines = [f"/home/jhkim/Datasets/N_Imagenet/{f.relative_to(root).as_posix()}\n" for f in files]
-        (root / name).write_text("".join(lines))
-
-
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """Three classes with six training and three validation files each."""
@@ -54,7 +47,7 @@ def root(tmp_path: Path) -> Path:
         for number in range(3):
             path = root / "extracted_val" / wordnet_id / f"ILSVRC2012_val_{wordnet_id[-3:]}{number:05d}.npz"
             write_events(path, ROWS, compressed=False)
-    write_lists(root)
+    write_n_imagenet_lists(root)
     (root / "LOC_synset_mapping.txt").write_text(NAMES)
     return root
 
