@@ -23,7 +23,7 @@ def _autoencoder_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     return files_of(learned_autoencoder(options.base_model) or [options.base_model / "vae"])
 
 
-@stage(version=1, schema=tables.LATENTS, raw_files=_autoencoder_files)
+@stage(version=2, schema=tables.LATENTS, raw_files=_autoencoder_files)
 def encode_latents(out: Output, frames: Manifest, *, latents: LatentOptions) -> pa.Table:
     """Means and standard deviations of the latents of every training frame, and of its quarter turns.
 

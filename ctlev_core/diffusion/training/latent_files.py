@@ -32,8 +32,9 @@ logger = logging.getLogger(__name__)
 USUAL_SIZE = (0.4, 4.0)
 """Root mean square of scaled latents, about 1: .7 to 2.5 of the bundled base models' images, black to white; .9 to 1.8
 of photographs and event images in Stable Diffusion's space, where they are 5 to 10 if not scaled, .2 to .3 if twice."""
-ENCODE_BATCH = 32
-"""Images that are encoded at once, unless memory runs out: of 512 px each takes .7 GB in Stable Diffusion's."""
+ENCODE_BATCH, ENCODE_PIXELS = 32, 4 * 512**2
+"""Images and pixels that are encoded at once, unless memory runs out: of 512 px each takes .7 GB in Stable Diffusion's.
+A CPU gains nothing from more of them, and is not told that its memory runs out before the process is killed."""
 FILE_FRAMES = 1024
 """Frames of a file of the stage, whole batches: what a killed run loses at most. 128 MB for 512 px and no turns."""
 CHECK_BYTES = 8 << 20
@@ -64,8 +65,9 @@ def latents_of_run(vae: Any, frames: Images, num_turns: int, folder: Path, distr
     """The same on disk, in the folder of a run, of which each process writes those of a share of the frames."""
     folder.mkdir(parents=True, exist_ok=True)
     # Whole batches: however many processes there are, latents are the same to the last bit.
-    batches = -(-len(frames) // ENCODE_BATCH)
-    cuts = np.linspace(0, batches, min(distributed.count, batches) + 1).round().astype(int) * ENCODE_BATCH
+    size = _batch_size(frames)
+    batches = -(-len(frames) // size)
+    cuts = np.linspace(0, batches, min(distributed.count, batches) + 1).round().astype(int) * size
     shares = _between(np.minimum(cuts, len(frames)).tolist())
     paths = _paths(vae, frames, num_turns, folder, len(shares))
     if distributed.rank < len(shares) and not paths[distributed.rank][MEAN].is_file():
@@ -160,10 +162,14 @@ def _encode(vae: Any, frames: Images, rows: range, num_turns: int) -> Iterator[t
         turned = np.rot90(frames[chosen.start : chosen.stop], turn, axes=(1, 2))
         return encode_posterior(vae, np.ascontiguousarray(turned))
 
-    batches = ShrinkingBatches(ENCODE_BATCH)
+    batches = ShrinkingBatches(_batch_size(frames))
     for turn in range(num_turns):
         for _, (mean, deviation) in batches.map(functools.partial(encode, turn=turn), len(rows)):
             yield mean.cpu().numpy(), None if deviation is None else deviation.cpu().numpy()
+
+
+def _batch_size(frames: Images) -> int:
+    return max(1, min(ENCODE_BATCH, ENCODE_PIXELS // (frames.shape[1] * frames.shape[2])))
 
 
 def _open(paths: Sequence[Mapping[str, Path]], shares: Sequence[range], num_turns: int) -> Latents:
