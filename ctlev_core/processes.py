@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import os
 import resource
 import signal
@@ -13,6 +14,9 @@ from pathlib import Path
 
 CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """Of a Linux container: microseconds of processor time it gets, in so many by the clock; or `max`."""
+
+MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
+"""Of a Linux container: bytes that it gets, or `max`."""
 
 
 def die_with_parent() -> None:
@@ -43,6 +47,20 @@ def num_cores(limit: Path = CPU_LIMIT) -> int:
         return max(1, min(cores, int(quota) // int(period)))
     except (OSError, ValueError):  # no such container, or no limit
         return cores
+
+
+def memory_mib(limit: Path = MEMORY_LIMIT, table: Path = Path("/proc/meminfo")) -> tuple[float, float]:
+    """Memory that this process may use, and how much of it is free, MiB: the machine's, or less in a container."""
+    try:
+        lines = dict(line.split(":") for line in table.read_text().splitlines())
+        whole, free = (int(lines[name].split()[0]) / 1024 for name in ("MemTotal", "MemAvailable"))
+    except (OSError, ValueError, KeyError):
+        return math.inf, math.inf
+    try:
+        allowed = int(limit.read_text()) / 2**20
+    except (OSError, ValueError):  # no such container, or no limit
+        return whole, free
+    return min(whole, allowed), min(free, allowed)
 
 
 def begin_memory_peak() -> None:

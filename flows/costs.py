@@ -23,8 +23,8 @@ PIXELS = 3
 _TERA = 1e12
 # (at 512 px, at 256 px): TFLOP an image.
 _OPERATIONS = {
-    "unet": (0.803, 0.180), "controlnet": (0.283, 0.063), "decoding": (2.515, 0.622), "tune unet": (2.41, 0.537),
-    "tune controlnet": (2.27, 0.493),
+    "unet": (0.803, 0.180), "controlnet": (0.283, 0.063), "encoding": (1.117, 0.273), "decoding": (2.515, 0.622),
+    "tune unet": (2.41, 0.537), "tune controlnet": (2.27, 0.493),
 }  # fmt: skip
 
 
@@ -68,9 +68,8 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
     controlled = experiment.generator.name == "controlnet"
     per_step = options["batch_size"] * options["gradient_accumulation"]
     images = options["num_steps"] * per_step * experiment.num_generators
-    forward = _operations("unet", width, height) + controlled * _operations("controlnet", width, height)
-    tuned = {"unet": "tune unet", "controlnet": "tune controlnet"}.get(options["tune"])
-    backward = 3 * forward if tuned is None else _operations(tuned, width, height)
+    forward = operations("unet", width, height) + controlled * operations("controlnet", width, height)
+    backward = training_operations(options["tune"], width, height)
     # As if guidance were at every step: where steps lie in its interval depends on the checkpoint's schedule.
     evaluations = sampled["num_inference_steps"] * (2 if sampled["guidance_scale"] > 1 else 1)
     samples = experiment.num_synthetic * experiment.num_generators
@@ -80,7 +79,7 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
         num_samples=samples,
         num_steps=sampled["num_inference_steps"],
         sampling_s=samples
-        * (evaluations * forward + _operations("decoding", width, height))
+        * (evaluations * forward + operations("decoding", width, height))
         / FLOPS[sampled["precision"]],
         frames_bytes=samples * width * height * PIXELS,
     )
@@ -91,8 +90,15 @@ def _with_defaults(generator: str, model: str, given: dict[str, Any]) -> dict[st
     return {name: given.get(name, field.default) for name, field in fields.items()}
 
 
-def _operations(what: str, width: int, height: int) -> float:
-    """Operations an image: a power of its area through the two sizes that were counted."""
+def training_operations(tune: str, width: int, height: int) -> float:
+    """Operations of a training step for an image, where the networks that `tune` names learn."""
+    if tune == "both":
+        return 3 * (operations("unet", width, height) + operations("controlnet", width, height))
+    return operations(f"tune {tune}", width, height)
+
+
+def operations(what: str, width: int, height: int) -> float:
+    """Operations an image of a part of `_OPERATIONS`: a power of its area through the two sizes that were counted."""
     large, small = _OPERATIONS[what]
     exponent = math.log(large / small) / math.log(4)
     return _TERA * large * (width * height / 512**2) ** exponent

@@ -1,9 +1,10 @@
 """What the stages of a plan would take: time, memory and disk, from what such stages took before.
 
-Known are the records of the home (`run.json`: time, peak memory) and, where it has none of the kind, those of
-`stage_costs.json`, measured on two cores. Stages are of a kind where they are the same function with the same plug-ins.
-Their time and disk are taken as linear in an amount of work that options tell: steps times batch of a training, frames
-times steps of a sampling, rows elsewhere.
+Known are the records of the home (`run.json`: time, peak memory) and, where it has none of the kind, what
+`network_costs` calculates for networks of Stable Diffusion's size, or else those of `stage_costs.json`, measured on two
+cores. Stages are of a kind where they are the same function with the same plug-ins, for images of the same size. Their
+time and disk are taken as linear in an amount of work that options tell: steps times batch of a training, frames times
+steps of a sampling, rows elsewhere.
 """
 
 from __future__ import annotations
@@ -13,19 +14,21 @@ import functools
 import json
 import math
 import statistics
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from data_contracts.manifest import RUN_FILE
+from flows.amounts_of_work import Amounts, inputs_of
+from flows.network_costs import network_cost
 from tasks.stage import PlannedStage
 
 REFERENCE = Path(__file__).with_name("stage_costs.json")
 MAX_RECORDS = 400
 """Of a stage, the newest; to read more says nothing new."""
-_RECORDINGS = ("num_train_recordings", "num_test_recordings", "num_condition_recordings")
-_ROWS = ("count", "num_images", "num_frames")
+USUAL_SIZE = (64, 64)
+"""px of the images of the bundled base models."""
 
 
 @dataclass(frozen=True)
@@ -56,33 +59,70 @@ class Measured:
 
 def estimate_stages(rows: Sequence[PlannedStage], home: Path) -> dict[str, StageCost | None]:
     """The cost of every stage of a plan by its key; None where nothing like it was measured. Those cached are known."""
-    asked = {row.key: row for row in rows}
-    measured = _by_kind(_measured_in(home))
-    reference = _by_kind(_reference())
-    amounts = _Amounts({row.key: row.arguments for row in rows})
+    records = _records_in(home)
+    made = _rows_made(records)
+    found = predict_stages([row for row in rows if not row.cached], _measured(records), made, of=rows)
+    for row in rows:
+        folder = home / "artefacts" / row.stage / row.key
+        if row.cached:
+            found[row.key] = None if (record := _read(folder)) is None else _cost_of(record, folder)
+    return found
+
+
+def compare_stages(rows: Sequence[PlannedStage], home: Path) -> dict[str, tuple[StageCost, StageCost]]:
+    """What finished stages of a plan took, and what would have been said of them in an empty home, by key."""
+    records = _records_in(home)
+    done = [row for row in rows if row.cached and row.key in records]
+    predicted = predict_stages(done, made=_rows_made(records), of=rows)
+    return {row.key: (_cost_of(*records[row.key]), cost) for row in done if (cost := predicted[row.key]) is not None}
+
+
+def predict_stages(
+    rows: Sequence[PlannedStage],
+    known: Sequence[Measured] = (),
+    made: Mapping[str, int] | None = None,
+    *,
+    of: Sequence[PlannedStage] | None = None,
+) -> dict[str, StageCost | None]:
+    """The cost of stages by their keys, as if none of them had run; None where nothing is known of their kind.
+
+    Args:
+        rows: the stages.
+        known: what ran before.
+        made: rows of tables that are there, by key.
+        of: the whole plan, with what they are made from; None = `rows`.
+    """
+    measured, reference = _by_kind(known), _by_kind(_reference())
+    plan = {row.key: row for row in (rows if of is None else of)}
+    amounts = Amounts(plan, made)
     found: dict[str, StageCost | None] = {}
-    for key, row in asked.items():
-        folder = home / "artefacts" / row.stage / key
-        if row.cached and (record := _read(folder)) is not None:
-            found[key] = _cost_of(record, folder)
+    for key, row in {row.key: row for row in rows}.items():
+        size = amounts.image_size(key)
+        kind = kind_of(row.stage, row.arguments, size)
+        similar, calculated = measured.get(kind), None
+        if not similar:
+            calculated = network_cost(row.stage, row.given, _trained(plan, row), amounts.rows(key).total, size)
+        if calculated is not None:
+            memory = calculated.memory_bytes / 2**20
+            found[key] = StageCost(calculated.seconds(), memory, int(calculated.disk_bytes))
             continue
-        kind = kind_of(row.stage, row.arguments)
-        similar = measured.get(kind) or reference.get(kind) or measured.get(row.stage) or reference.get(row.stage)
+        others = [reference.get(kind)]
+        others += [table.get(name) for name in (_without_plugins(kind), row.stage) for table in (measured, reference)]
+        similar = similar or next(filter(None, others), None)
         found[key] = None if similar is None else _at(similar, amounts.work(key))
     return found
 
 
-def kind_of(stage: str, arguments: Mapping[str, Any]) -> str:
-    """Name of a stage and its plug-ins."""
-    return " ".join([stage, *sorted({str(item["plugin"]) for item in arguments.values() if _is_plugin(item)})])
+def kind_of(stage: str, arguments: Mapping[str, Any], size: tuple[int, int] | None = None) -> str:
+    """Name of a stage, its plug-ins, and the size of its images, (width, height) px."""
+    names = sorted({str(item["plugin"]) for item in arguments.values() if _is_plugin(item)})
+    return " ".join([stage, *names, *([] if size in (None, USUAL_SIZE) else [f"{size[0]}x{size[1]}"])])
 
 
-def inputs_of(arguments: Mapping[str, Any]) -> list[str]:
-    """Keys of a stage's inputs."""
-    values = [value if isinstance(value, list) else [value] for value in arguments.values()]
-    return [
-        item["manifest"] for items in values for item in items if isinstance(item, dict) and set(item) == {"manifest"}
-    ]
+def _trained(plan: Mapping[str, PlannedStage], row: PlannedStage) -> Mapping[str, Any]:
+    """The arguments of the fine-tuning whose checkpoint a stage samples from."""
+    made = [plan[key] for key in inputs_of(row.arguments) if key in plan]
+    return next((one.given for one in made if one.stage == "finetune"), {})
 
 
 def time_left(
@@ -116,7 +156,7 @@ def time_left(
 def reference_records(home: Path) -> list[list[Any]]:
     """What `stage_costs.json` holds, from the runs of a home: kind, work, seconds, MiB, bytes; two of each kind."""
     groups: dict[str, list[Measured]] = {}
-    for one in _measured_in(home, alone=True):
+    for one in _measured(_records_in(home), alone=True):
         groups.setdefault(one.kind, []).append(one)
     rows = []
     for kind, group in sorted(groups.items()):
@@ -127,47 +167,6 @@ def reference_records(home: Path) -> list[list[Any]]:
             cost = by_work[work]
             rows.append([kind, work, cost.seconds, cost.memory_mib, cost.disk_bytes])
     return rows
-
-
-class _Amounts:
-    """Rows and work of stages, from their options and those of what they are made from."""
-
-    def __init__(self, arguments: Mapping[str, Mapping[str, Any]]) -> None:
-        self._arguments = arguments
-        self._rows: dict[str, float] = {}
-
-    def rows(self, key: str) -> float:
-        if key not in self._rows:
-            self._rows[key] = 1.0  # a loop there cannot be, but records are files
-            self._rows[key] = self._count_rows(self._arguments.get(key, {}))
-        return self._rows[key]
-
-    def _count_rows(self, arguments: Mapping[str, Any]) -> float:
-        numbers = dict(_numbers(arguments))
-        asked = next((numbers[name] for name in _ROWS if name in numbers), None)
-        if asked is not None:
-            return asked
-        if any(name in numbers for name in _RECORDINGS):
-            return sum(numbers.get(name, 0.0) for name in _RECORDINGS)
-        before = max(map(self.rows, inputs_of(arguments)), default=1.0)
-        return before * (numbers.get("max_windows", 1.0) if "windows" in arguments else 1.0)
-
-    def work(self, key: str) -> float:
-        numbers = dict(_numbers(self._arguments.get(key, {})))
-        if "num_steps" in numbers:
-            return math.prod(numbers.get(name, 1.0) for name in ("num_steps", "batch_size", "gradient_accumulation"))
-        guided = 2.0 if numbers.get("guidance_scale", 1.0) > 1 else 1.0
-        return self.rows(key) * numbers.get("num_inference_steps", 1.0) * guided
-
-
-def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
-    """Numbers within nested options by their last names; of one name the outermost."""
-    if isinstance(value, Mapping):
-        found = sorted(value.items(), key=lambda item: isinstance(item[1], Mapping), reverse=True)
-        for key, item in found:  # mappings first, so that what is outermost overwrites
-            yield from _numbers(item, str(key))
-    elif isinstance(value, int | float) and not isinstance(value, bool) and value > 0:
-        yield name, float(value)
 
 
 def _is_plugin(item: Any) -> bool:
@@ -195,27 +194,44 @@ def _at(group: Sequence[Measured], work: float) -> StageCost:
 
 
 def _by_kind(measured: Iterable[Measured]) -> dict[str, list[Measured]]:
-    """By kind, and by stage alone."""
+    """By kind, by kind without plug-ins, and by stage alone."""
     found: dict[str, list[Measured]] = {}
     for one in measured:
-        found.setdefault(one.kind, []).append(one)
-        if " " in one.kind:
-            found.setdefault(one.kind.split(" ")[0], []).append(one)
+        for name in {one.kind, _without_plugins(one.kind), one.kind.split(" ")[0]}:
+            found.setdefault(name, []).append(one)
     return found
 
 
-def _measured_in(home: Path, *, alone: bool = False) -> list[Measured]:
-    """Every stage that was run in a home; `alone`: as fast as if nothing else had used the machine."""
+def _without_plugins(kind: str) -> str:
+    return " ".join(word for word in kind.split(" ") if "/" not in word)
+
+
+def _records_in(home: Path) -> dict[str, tuple[dict[str, Any], Path]]:
+    """Records of stages that were run in a home, and their folders, by key."""
     folders = []
     for stage in (home / "artefacts").glob("*"):
         with contextlib.suppress(OSError):
             newest = sorted(stage.glob(f"*/{RUN_FILE}"), key=lambda path: path.stat().st_mtime, reverse=True)
             folders += [path.parent for path in newest[:MAX_RECORDS]]
-    records = {folder.name: (record, folder) for folder in folders if (record := _read(folder)) is not None}
-    amounts = _Amounts({key: record["arguments"] for key, (record, _) in records.items()})
+    return {folder.name: (record, folder) for folder in folders if (record := _read(folder)) is not None}
+
+
+def _rows_made(records: Mapping[str, tuple[dict[str, Any], Path]]) -> dict[str, int]:
+    return {key: record["rows"] for key, (record, _) in records.items() if "rows" in record}
+
+
+def _measured(records: Mapping[str, tuple[dict[str, Any], Path]], *, alone: bool = False) -> list[Measured]:
+    """Every stage of the records; `alone`: as fast as if nothing else had used the machine."""
+    stages = {
+        key: PlannedStage(record["stage"], "", key, cached=True, arguments=record["arguments"])
+        for key, (record, _) in records.items()
+    }
+    amounts = Amounts(stages, _rows_made(records))
     return [
         Measured(
-            kind_of(record["stage"], record["arguments"]), amounts.work(key), _cost_of(record, folder, alone=alone)
+            kind_of(record["stage"], record["arguments"], amounts.image_size(key)),
+            amounts.work(key),
+            _cost_of(record, folder, alone=alone),
         )
         for key, (record, folder) in records.items()
     ]

@@ -78,6 +78,8 @@ class PlannedStage:
     cached: bool
     arguments: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
     """As in the record of the artefact."""
+    given: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
+    """As the stage gets them."""
 
 
 class Watcher(Protocol):
@@ -231,7 +233,7 @@ class Stage:
         plan = _plan.get()
         if plan is not None:
             cached = store.find(self.name, key) is not None
-            plan.rows.append(PlannedStage(self.name, label, key, cached, materials))
+            plan.rows.append(PlannedStage(self.name, label, key, cached, materials, arguments))
             return ManifestRef(key=key, path=store.folder(self.name, key))
         found = self.find(key, arguments) if _in_one_run.get() else None
         return found or run_as_task(self.name, label, functools.partial(self.run, key, arguments))
@@ -328,6 +330,7 @@ class Stage:
                 "key": key,
                 "arguments": self._materials(arguments),
                 "upstream": upstream,
+                "rows": table.num_rows,
                 "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
                 "wall_seconds": round(time.perf_counter() - wall, 3),
                 "cpu_seconds": round(_cpu_seconds() - cpu, 3),

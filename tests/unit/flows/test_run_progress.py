@@ -12,8 +12,9 @@ from rich.console import Console
 from ctlev_core.duration_text import duration_text
 from ctlev_core.progress import Progress
 from flows import run_progress
+from flows.amounts_of_work import inputs_of
 from flows.run_progress import RunProgress
-from flows.stage_costs import Measured, StageCost, _at, inputs_of, time_left
+from flows.stage_costs import Measured, StageCost, _at, time_left
 from tasks.stage import PlannedStage
 
 

@@ -1,0 +1,179 @@
+"""Time, memory and disk of the stages that run networks of Stable Diffusion's size, by calculation.
+
+Operations are those of `flows.costs`; how fast they are done is measured here, by a product of two matrices in the
+precision of the stage. Memory is that of the weights, gradients and moments, and of the activations of a batch.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ctlev_core import plugins
+from ctlev_core.diffusion.pretrained.components import ModelPart
+from ctlev_core.diffusion.pretrained.paths import find_controlnet, read_controlnet, read_parts
+from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.training.latent_files import ENCODE_BATCH, ENCODE_PIXELS
+from ctlev_core.diffusion.training.options import FineTuningOptions, LatentOptions
+from data_contracts.config import Choice
+from data_contracts.errors import DataError
+from flows.costs import operations, training_operations
+
+LARGE = 400e6
+"""Weights of a U-Net from which on the operations counted for Stable Diffusion's are taken."""
+ITEM_BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
+EFFICIENCY = 0.6
+"""Of the rate of a matrix product, what whole networks reach."""
+DISK_BYTES_A_S = 500e6
+LATENT_CHANNELS, LATENT_SCALE = 4, 8
+PROCESS_BYTES = 0.7e9
+"""Of Python with torch, diffusers and transformers."""
+# Bytes of activations for an image of 512 px; as many times more as it has pixels.
+_ENCODING, _DECODING = 0.7e9, 1.2e9
+_TRAINING, _CHECKPOINTED, _FORWARD = 3.0e9, 0.9e9, 0.4e9
+_SQUARE = 512**2
+
+
+@dataclass(frozen=True)
+class NetworkCost:
+    """What a stage takes.
+
+    Attributes:
+        operations: by precision.
+        io_bytes: read and written.
+        memory_bytes: peak of its process.
+        disk_bytes: of its artefact.
+    """
+
+    operations: dict[str, float]
+    io_bytes: float
+    memory_bytes: float
+    disk_bytes: float
+
+    def seconds(self) -> float:
+        """Alone on this machine's GPU, or else its cores."""
+        work = sum(count / (EFFICIENCY * operations_a_second(name)) for name, count in self.operations.items())
+        return work + self.io_bytes / DISK_BYTES_A_S
+
+
+def network_cost(
+    stage: str, given: Mapping[str, Any], trained: Mapping[str, Any], rows: float, size: tuple[int, int] | None
+) -> NetworkCost | None:
+    """The cost of a stage; None where it runs no network of that size, or its files cannot be read.
+
+    Args:
+        stage: its name.
+        given: its arguments.
+        trained: those of the fine-tuning whose checkpoint it samples from.
+        rows: frames that it makes or learns from.
+        size: (width, height) px of the images.
+    """
+    if size is None:
+        return None
+    if stage == "encode_latents":
+        return _encoding(given["latents"], rows, size)
+    options = _options(given.get("generator") if stage == "finetune" else trained.get("generator"))
+    if not isinstance(options, FineTuningOptions) or options.base_model is None:
+        return None
+    weights = _count_weights(options.base_model, getattr(options, "controlnet", None), hasattr(options, "controlnet"))
+    if weights is None or weights["unet"] < LARGE:
+        return None
+    if stage == "finetune":
+        return _fine_tuning(options, weights, size)
+    sampling = _options(given.get("sampling"))
+    if stage == "sample" and isinstance(sampling, SamplingOptions):
+        return _sampling(sampling, weights, rows, size)
+    return None
+
+
+def _encoding(options: LatentOptions, rows: float, size: tuple[int, int]) -> NetworkCost | None:
+    weights = _count_weights(options.base_model, None, False)
+    if weights is None or weights["unet"] < LARGE:
+        return None
+    pixels = size[0] * size[1]
+    batch = min(rows, ENCODE_BATCH, max(1, ENCODE_PIXELS // pixels))
+    latents = 2 * LATENT_CHANNELS * pixels / LATENT_SCALE**2 * 4
+    return NetworkCost(
+        {"float32": rows * options.num_turns * operations("encoding", *size)},
+        4 * weights["vae"],
+        PROCESS_BYTES + 4 * weights["vae"] + batch * _ENCODING * pixels / _SQUARE,
+        rows * options.num_turns * latents,
+    )
+
+
+def _fine_tuning(options: FineTuningOptions, weights: Mapping[str, int], size: tuple[int, int]) -> NetworkCost:
+    tune = getattr(options, "tune", "unet")
+    images = options.num_steps * options.batch_size * options.gradient_accumulation
+    networks = weights["unet"] + weights.get("controlnet", 0)
+    trained = {"unet": weights["unet"], "controlnet": weights.get("controlnet", 0)}.get(tune, networks)
+    each = training_operations(tune, *size) * (4 / 3 if options.gradient_checkpointing else 1)
+    kept = 16 + (4 if options.ema_decay else 0)  # weights, gradients, two moments, averages
+    activations = _CHECKPOINTED if options.gradient_checkpointing else _TRAINING
+    copies = 2 * networks if options.precision != "float32" else 0
+    everything = sum(weights.values())
+    return NetworkCost(
+        {options.precision: images * each},
+        4 * everything + (kept - 4) * trained + 4 * everything,
+        PROCESS_BYTES
+        + 4 * (everything - trained)
+        + kept * trained
+        + copies
+        + options.batch_size * activations * size[0] * size[1] / _SQUARE,
+        4 * everything,
+    )
+
+
+def _sampling(options: SamplingOptions, weights: Mapping[str, int], rows: float, size: tuple[int, int]) -> NetworkCost:
+    forward = operations("unet", *size) + ("controlnet" in weights) * operations("controlnet", *size)
+    evaluations = options.num_inference_steps * (2 if options.guidance_scale > 1 else 1)
+    pixels, item, everything = size[0] * size[1], ITEM_BYTES[options.precision], sum(weights.values())
+    batch = min(rows, options.batch_size)
+    return NetworkCost(
+        {options.precision: rows * (evaluations * forward + operations("decoding", *size))},
+        4 * everything,
+        PROCESS_BYTES + item * everything + batch * max(_DECODING * item / 2, _FORWARD) * pixels / _SQUARE,
+        rows * pixels * 3,
+    )
+
+
+def _options(choice: Any) -> Any:
+    return plugins.load_options(choice).options if isinstance(choice, Choice) else None
+
+
+@functools.cache
+def _count_weights(base_model: Path, controlnet: Path | None, with_controlnet: bool) -> dict[str, int] | None:
+    try:
+        parts = dict(read_parts(base_model).parts)
+        place = find_controlnet(base_model, controlnet) if with_controlnet else None
+        if place is not None:
+            parts["controlnet"] = read_controlnet(place)
+        elif not with_controlnet:
+            parts.pop("controlnet", None)
+    except (DataError, OSError):
+        return None
+    return {name: _weights_of(part) for name, part in parts.items()}
+
+
+def _weights_of(part: ModelPart) -> int:
+    return sum(math.prod(tensor.shape) for tensor in part.tensors.values())
+
+
+@functools.cache
+def operations_a_second(precision: str, side: int = 2048, rounds: int = 3) -> float:
+    """Of a product of two matrices, the fastest of a few, on the GPU if there is one."""
+    import torch
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    matrix = torch.ones(side, side, dtype=getattr(torch, precision), device=device)
+    best = math.inf
+    for _ in range(rounds + 1):
+        started = time.perf_counter()
+        product = matrix @ matrix
+        float(product[0, 0])  # waits for a GPU
+        best = min(best, time.perf_counter() - started)
+    return 2 * side**3 / best
