@@ -67,6 +67,26 @@ def test_resumed_run_ends_in_the_same_weights(tmp_path, monkeypatch, accumulatio
     assert history.loss == again.loss
 
 
+def test_weights_that_are_not_averaged_are_kept_once(tmp_path):
+    """The same weights as of an average that forgets at once, a saved state without them, and resumed alike."""
+    frames, conditions = make_data(40)
+    found, sizes = [], []
+    for ema_decay in (0.0, 1e-12):
+        options = OPTIONS.model_copy(update={"ema_decay": ema_decay, "num_validation": 4, "keep": "best"})
+        base_model = make_base_model()
+        fine_tune(base_model, frames, conditions, options, tune="unet", seed=3, work=tmp_path / str(ema_decay))
+        found.append(weights(base_model))
+        sizes.append((tmp_path / str(ema_decay) / "state.pt").stat().st_size)
+    for name, value in found[0].items():
+        torch.testing.assert_close(value, found[1][name], rtol=1e-5, atol=1e-7)
+    stored = sum(4 * value.numel() for value in make_base_model().unet.parameters())
+    assert sizes[1] - sizes[0] == pytest.approx(stored, rel=0.05)
+    options = OPTIONS.model_copy(update={"ema_decay": 0.0, "num_validation": 4, "keep": "best"})
+    again = make_base_model()
+    fine_tune(again, frames, conditions, options, tune="unet", seed=3, work=tmp_path / "0.0")
+    assert changed_networks(found[0], weights(again)) == set()
+
+
 def test_other_seed_gives_other_weights(tmp_path):
     frames, conditions = make_data()
     one, other = make_base_model(), make_base_model()

@@ -258,6 +258,16 @@ def test_each_process_encodes_its_share_of_the_frames(tmp_path, monkeypatch):
     torch.testing.assert_close(np.asarray(cache.latents.std), whole.latents.std)
 
 
+def test_larger_frames_are_encoded_fewer_at_a_time(monkeypatch):
+    base_model, taken = with_deviations(make_base_model(), monkeypatch), []
+    encode = base_model.vae.encode
+    monkeypatch.setattr(base_model.vae, "encode", lambda images: taken.append(len(images)) or encode(images))
+    for side, limit in ((16, 3 * 16**2), (32, 16**2)):
+        monkeypatch.setattr(latent_files, "ENCODE_PIXELS", limit)
+        latent_files.latents_in_memory(base_model.vae, np.zeros((4, side, side, 3), np.uint8), 1)
+    assert taken == [3, 1, 1, 1, 1, 1]
+
+
 def test_many_prompts_are_embedded_some_at_a_time(monkeypatch):
     base_model, taken = make_base_model(), []
     prompts = [f"a photo of a {word}" for word in ("cup", "ball", "human", "moving")]

@@ -1,10 +1,11 @@
+import math
 import os
 import subprocess
 import sys
 
 import pytest
 
-from ctlev_core.processes import num_cores
+from ctlev_core.processes import memory_mib, num_cores
 
 COUNT = "from ctlev_core.processes import num_cores; print(num_cores())"
 
@@ -35,3 +36,38 @@ def test_a_container_has_the_cores_whose_time_it_gets(monkeypatch, tmp_path, lim
 def test_without_a_limit_all_cores_count(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2}, raising=False)
     assert num_cores(tmp_path / "cpu.max") == 3
+
+
+TABLE = "MemTotal:       20971520 kB\nMemFree:         1048576 kB\nMemAvailable:   15728640 kB\n"
+
+
+@pytest.mark.parametrize(
+    ("limit", "expected"),
+    [("max", (20480, 15360)), ("8589934592", (8192, 8192)), ("17179869184", (16384, 15360)), (None, (20480, 15360))],
+)
+def test_a_container_has_the_memory_that_it_gets(tmp_path, limit, expected):
+    (tmp_path / "meminfo").write_text(TABLE)
+    if limit is not None:
+        (tmp_path / "memory.max").write_text(f"{limit}\n")
+    assert memory_mib(tmp_path / "memory.max", tmp_path / "meminfo") == expected
+
+
+def test_where_nothing_tells_memory_is_not_bounded(tmp_path):
+    assert memory_mib(tmp_path / "none", tmp_path / "none") == (math.inf, math.inf)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel forgets a peak on Linux alone")
+def test_a_peak_of_memory_is_that_since_it_began():
+    code = """
+from ctlev_core.processes import begin_memory_peak, memory_peak_mib
+import numpy as np
+def take(mib):
+    begin_memory_peak()
+    np.ones(mib << 17)
+    return memory_peak_mib()
+before, large, small = take(1), take(400), take(50)
+print(large - before, small - before)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    large, small = map(float, run.stdout.split())
+    assert large == pytest.approx(399, abs=30) and small == pytest.approx(49, abs=30)

@@ -1,0 +1,135 @@
+"""Costs of networks of Stable Diffusion's size: closed forms of their weights, and the rows that plans tell."""
+
+from __future__ import annotations
+
+import pytest
+
+from ctlev_core.diffusion.training.options import LatentOptions
+from ctlev_core.stand_ins.making import make_stand_in
+from data_contracts.config import DatasetChoice, GeneratorChoice, SamplingChoice
+from flows import network_costs
+from flows.amounts_of_work import Amounts, Rows
+from flows.costs import operations
+from flows.network_costs import network_cost
+from tasks.stage import PlannedStage
+
+SIZE = (512, 512)
+WEIGHTS = {"unet": 860_000_000, "vae": 84_000_000, "text_encoder": 123_000_000}
+ALL = sum(WEIGHTS.values())
+
+
+@pytest.fixture
+def base_model(monkeypatch, tmp_path):
+    """A place whose files say that they hold Stable Diffusion."""
+
+    def count(place, controlnet, with_controlnet):
+        return WEIGHTS | ({"controlnet": 361_000_000} if with_controlnet else {})
+
+    monkeypatch.setattr(network_costs, "_count_weights", count)
+    return tmp_path
+
+
+def generator(name, base_model, **options):
+    return GeneratorChoice(
+        name=name, options={"base_model": str(base_model), "num_steps": 3, "batch_size": 2, **options}
+    )
+
+
+def fine_tuning(choice):
+    return network_cost("finetune", {"generator": choice}, {}, 0, SIZE)
+
+
+def test_fine_tuning_a_unet_keeps_its_gradients_and_moments(base_model):
+    plain = fine_tuning(generator("stable_diffusion", base_model, ema_decay=0.0))
+    averaged = fine_tuning(generator("stable_diffusion", base_model, ema_decay=0.9))
+    assert averaged.memory_bytes - plain.memory_bytes == 4 * WEIGHTS["unet"]
+    assert plain.memory_bytes > 16 * WEIGHTS["unet"] + 4 * (WEIGHTS["vae"] + WEIGHTS["text_encoder"])
+    assert plain.disk_bytes == 4 * ALL
+    assert plain.operations == {"float32": 6 * operations("tune unet", *SIZE)}
+
+
+def test_fine_tuning_a_controlnet_takes_less_memory_and_more_disk(base_model):
+    unet = fine_tuning(generator("stable_diffusion", base_model, ema_decay=0.0))
+    controlnet = fine_tuning(generator("controlnet", base_model, tune="controlnet", ema_decay=0.0))
+    difference = 12 * WEIGHTS["unet"] - 16 * 361_000_000
+    assert unet.memory_bytes - controlnet.memory_bytes == difference
+    assert controlnet.disk_bytes - unet.disk_bytes == 4 * 361_000_000
+
+
+def test_less_activations_cost_a_third_more_time(base_model):
+    kept = fine_tuning(generator("stable_diffusion", base_model))
+    anew = fine_tuning(generator("stable_diffusion", base_model, gradient_checkpointing=True))
+    assert anew.memory_bytes < kept.memory_bytes
+    assert anew.operations["float32"] == pytest.approx(4 / 3 * kept.operations["float32"])
+
+
+def test_sampling_is_steps_and_a_decoding_for_each_row(base_model):
+    trained = {"generator": generator("stable_diffusion", base_model)}
+    sampling = SamplingChoice(
+        name="stable_diffusion", options={"num_inference_steps": 10, "precision": "bfloat16", "guidance_scale": 2.0}
+    )
+    cost = network_cost("sample", {"sampling": sampling}, trained, 7, SIZE)
+    assert cost is not None
+    assert cost.operations == {"bfloat16": 7 * (20 * operations("unet", *SIZE) + operations("decoding", *SIZE))}
+    assert cost.memory_bytes > 2 * ALL
+
+
+def test_latents_do_not_take_more_memory_for_more_frames(base_model):
+    options = {"latents": LatentOptions(base_model=base_model)}
+    few, many = (network_cost("encode_latents", options, {}, count, SIZE) for count in (100, 10_000))
+    assert few is not None and many is not None
+    assert few.memory_bytes == many.memory_bytes and many.disk_bytes == 100 * few.disk_bytes
+    assert few.disk_bytes == 100 * 2 * 4 * 64 * 64 * 4
+
+
+def test_small_networks_and_other_stages_are_not_calculated(tmp_path, base_model):
+    assert network_cost("score_model", {}, {}, 5, SIZE) is None
+    assert network_cost("finetune", {"generator": GeneratorChoice(name="event_gan", options={})}, {}, 5, SIZE) is None
+    assert network_cost("encode_latents", {"latents": LatentOptions(base_model=tmp_path)}, {}, 5, None) is None
+
+
+def test_weights_are_counted_in_the_files(tmp_path):
+    place = make_stand_in("stable_diffusion", "tiny", tmp_path)
+    network_costs._count_weights.cache_clear()
+    counted = network_costs._count_weights(place, None, False)
+    assert counted is not None and set(counted) == {"unet", "vae", "text_encoder"}
+    stored = sum(path.stat().st_size for path in place.rglob("*.safetensors"))
+    assert 2 * sum(counted.values()) == pytest.approx(stored, rel=0.05)  # float16
+    assert network_cost("encode_latents", {"latents": LatentOptions(base_model=place)}, {}, 5, SIZE) is None
+    assert network_costs._count_weights(tmp_path / "none", None, False) is None
+
+
+def test_a_product_of_matrices_tells_how_fast_a_machine_is():
+    assert 1e8 < network_costs.operations_a_second("float32", side=256) < 1e16
+
+
+def planned(stage, key, given=None, **arguments):
+    return PlannedStage(stage, stage, key, cached=False, arguments=arguments, given=given or {})
+
+
+def ref(key):
+    return {"manifest": key}
+
+
+def test_rows_follow_from_the_recordings(tmp_path):
+    """DHP19: 4 of 8 subjects to learn from, 2 to test, 2 that give poses alone; two cameras each."""
+    place = make_stand_in("dhp19", "tiny", tmp_path)
+    dataset = DatasetChoice(name="dhp19", options={"root": str(place), "condition_subjects": [11, 12]})
+    stages = [
+        planned("ingest", "a", {"dataset": dataset}),
+        planned("encode", "b", recordings=ref("a"), windows={"max_windows": 3},
+                encoding={"plugin": "encodings/event_histogram", "options": {"image_size": [512, 512]}}),
+        planned("take_recorded", "c", frames=ref("b"), count=10),
+        planned("encode_latents", "d", frames=ref("c")),
+        planned("condition_samples", "e", poses=ref("a"), frames=ref("c"), count=5, windows={"max_windows": 3}),
+        planned("sample", "f", checkpoint=ref("x"), frames=ref("c"), conditions=ref("e"),
+                sampling={"options": {"num_inference_steps": 4}}),
+    ]  # fmt: skip
+    amounts = Amounts({stage.key: stage for stage in stages})
+    assert [amounts.rows(key) for key in "abcde"] == [
+        Rows(8, 12), Rows(24, 36), Rows(10, 22), Rows(10, 10), Rows(5, 5),
+    ]  # fmt: skip
+    assert amounts.work("f") == 20 and amounts.image_size("f") == SIZE and amounts.image_size("a") is None
+    # What is there already is counted and not guessed.
+    known = Amounts({stage.key: stage for stage in stages}, {"b": 18, "d": 6})
+    assert known.rows("b") == Rows(12, 18) and known.rows("c") == Rows(10, 16) and known.rows("d") == Rows(6, 6)
