@@ -1,7 +1,8 @@
 """Time, memory and disk of the stages that run networks of Stable Diffusion's size, by calculation.
 
 Operations are those of `flows.costs`; how fast they are done is measured here, by a product of two matrices in the
-precision of the stage. Memory is that of the weights, gradients and moments, and of the activations of a batch.
+precision of the stage. Memory is that of the process: the weights, gradients and moments, and the activations of a
+batch; where a GPU holds them, what passes through on the way to it.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from flows.costs import operations, training_operations
 LARGE = 400e6
 """Weights of a U-Net from which on the operations counted for Stable Diffusion's are taken."""
 ITEM_BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
-EFFICIENCY = 0.6
-"""Of the rate of a matrix product, what whole networks reach."""
+EFFICIENCY = {"encoding": 0.85, "sampling": 0.7, "training": 0.45}
+"""Of the rate of a matrix product, what whole networks reach: on an AMD EPYC, float32, bfloat16 and bfloat16."""
 DISK_BYTES_A_S = 500e6
 LATENT_CHANNELS, LATENT_SCALE = 4, 8
 PROCESS_BYTES = 0.7e9
@@ -45,20 +46,24 @@ class NetworkCost:
 
     Attributes:
         operations: by precision.
+        efficiency: of the rate of a matrix product.
+        devices: that share the work.
         io_bytes: read and written.
-        memory_bytes: peak of its process.
+        memory_bytes: peak of its processes.
         disk_bytes: of its artefact.
     """
 
     operations: dict[str, float]
+    efficiency: float
+    devices: int
     io_bytes: float
     memory_bytes: float
     disk_bytes: float
 
     def seconds(self) -> float:
         """Alone on this machine's GPU, or else its cores."""
-        work = sum(count / (EFFICIENCY * operations_a_second(name)) for name, count in self.operations.items())
-        return work + self.io_bytes / DISK_BYTES_A_S
+        work = sum(count / operations_a_second(name) for name, count in self.operations.items())
+        return work / (self.efficiency * self.devices) + self.io_bytes / DISK_BYTES_A_S
 
 
 def network_cost(
@@ -100,8 +105,10 @@ def _encoding(options: LatentOptions, rows: float, size: tuple[int, int]) -> Net
     latents = 2 * LATENT_CHANNELS * pixels / LATENT_SCALE**2 * 4
     return NetworkCost(
         {"float32": rows * options.num_turns * operations("encoding", *size)},
+        EFFICIENCY["encoding"],
+        1,
         4 * weights["vae"],
-        PROCESS_BYTES + 4 * weights["vae"] + batch * _ENCODING * pixels / _SQUARE,
+        _memory(4 * weights["vae"], batch * _ENCODING * pixels / _SQUARE, num_gpus(options.device)),
         rows * options.num_turns * latents,
     )
 
@@ -112,18 +119,20 @@ def _fine_tuning(options: FineTuningOptions, weights: Mapping[str, int], size: t
     networks = weights["unet"] + weights.get("controlnet", 0)
     trained = {"unet": weights["unet"], "controlnet": weights.get("controlnet", 0)}.get(tune, networks)
     each = training_operations(tune, *size) * (4 / 3 if options.gradient_checkpointing else 1)
-    kept = 16 + (4 if options.ema_decay else 0)  # weights, gradients, two moments, averages
+    moments, averages = 8 * trained, 4 * trained * bool(options.ema_decay)
     activations = _CHECKPOINTED if options.gradient_checkpointing else _TRAINING
     copies = 2 * networks if options.precision != "float32" else 0
     everything = sum(weights.values())
+    backward = copies + options.batch_size * activations * size[0] * size[1] / _SQUARE
+    processes, gpus = options.num_processes or 1, num_gpus(options.device)
+    # Moments are made by the first step of the optimiser, when activations have gone.
+    peak = moments + (backward if options.num_steps > 1 else 0)
     return NetworkCost(
         {options.precision: images * each},
-        4 * everything + (kept - 4) * trained + 4 * everything,
-        PROCESS_BYTES
-        + 4 * (everything - trained)
-        + kept * trained
-        + copies
-        + options.batch_size * activations * size[0] * size[1] / _SQUARE,
+        EFFICIENCY["training"],
+        min(processes, gpus) or 1,
+        4 * everything + 4 * trained + moments + averages + 4 * everything,
+        processes * _memory(4 * everything, 4 * trained + averages + max(peak, backward), gpus),
         4 * everything,
     )
 
@@ -132,13 +141,27 @@ def _sampling(options: SamplingOptions, weights: Mapping[str, int], rows: float,
     forward = operations("unet", *size) + ("controlnet" in weights) * operations("controlnet", *size)
     evaluations = options.num_inference_steps * (2 if options.guidance_scale > 1 else 1)
     pixels, item, everything = size[0] * size[1], ITEM_BYTES[options.precision], sum(weights.values())
-    batch = min(rows, options.batch_size)
+    batch, gpus = min(rows, options.batch_size), num_gpus(options.device)
     return NetworkCost(
         {options.precision: rows * (evaluations * forward + operations("decoding", *size))},
+        EFFICIENCY["sampling"],
+        max(gpus if options.device == "all" else 1, 1),
         4 * everything,
-        PROCESS_BYTES + item * everything + batch * max(_DECODING * item / 2, _FORWARD) * pixels / _SQUARE,
+        _memory(item * everything, batch * max(_DECODING * item / 2, _FORWARD) * pixels / _SQUARE, gpus),
         rows * pixels * 3,
     )
+
+
+def _memory(weights: float, others: float, gpus: int) -> float:
+    """Of a process, by the bytes of its weights and of all else that lies where they do."""
+    return PROCESS_BYTES + weights + (0 if gpus else others)
+
+
+def num_gpus(device: str) -> int:
+    """GPUs of this machine, 0 where the CPU is asked for."""
+    import torch
+
+    return torch.cuda.device_count() if device != "cpu" and torch.cuda.is_available() else 0
 
 
 def _options(choice: Any) -> Any:
@@ -164,11 +187,12 @@ def _weights_of(part: ModelPart) -> int:
 
 
 @functools.cache
-def operations_a_second(precision: str, side: int = 2048, rounds: int = 3) -> float:
-    """Of a product of two matrices, the fastest of a few, on the GPU if there is one."""
+def operations_a_second(precision: str, side: int | None = None, rounds: int = 3) -> float:
+    """Of a product of two matrices [side, side], the fastest of a few, on the GPU if there is one."""
     import torch
 
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device("cuda" if num_gpus("auto") else "cpu")
+    side = side or {"cuda": 8192, "cpu": 2048}[device.type]
     matrix = torch.ones(side, side, dtype=getattr(torch, precision), device=device)
     best = math.inf
     for _ in range(rounds + 1):

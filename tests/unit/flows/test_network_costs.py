@@ -133,3 +133,17 @@ def test_rows_follow_from_the_recordings(tmp_path):
     # What is there already is counted and not guessed.
     known = Amounts({stage.key: stage for stage in stages}, {"b": 18, "d": 6})
     assert known.rows("b") == Rows(12, 18) and known.rows("c") == Rows(10, 16) and known.rows("d") == Rows(6, 6)
+
+
+def test_gpus_share_the_work_and_hold_what_processes_would(base_model, monkeypatch):
+    choice = generator("controlnet", base_model, tune="controlnet", gradient_accumulation=4, num_processes=4)
+    monkeypatch.setattr(network_costs, "num_gpus", lambda device: 0)
+    on_cpu = fine_tuning(choice)
+    monkeypatch.setattr(network_costs, "num_gpus", lambda device: 4)
+    on_gpus = fine_tuning(choice)
+    assert (on_cpu.devices, on_gpus.devices) == (1, 4)
+    rest = 4 * (on_gpus.memory_bytes / 4 - network_costs.PROCESS_BYTES)
+    assert rest == 4 * 4 * (ALL + 361_000_000) < on_cpu.memory_bytes
+    monkeypatch.setattr(network_costs, "operations_a_second", lambda precision: 1e12)
+    io_seconds = on_cpu.io_bytes / network_costs.DISK_BYTES_A_S
+    assert on_cpu.seconds() - io_seconds == pytest.approx(4 * (on_gpus.seconds() - io_seconds))
