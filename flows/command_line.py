@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from ctlev_core.duration_text import duration_text
 from ctlev_core.plugins import PluginError, validate_options
-from ctlev_core.processes import memory_mib, num_cores
+from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError, TrainingError, shortened
 from data_contracts.experiment import Experiment
 from data_contracts.renamed_options import RENAMED_VALUES, name_hint
@@ -28,14 +27,13 @@ from data_contracts.yaml_text import load_yaml
 from flows import local_server, settings
 from flows.costs import HOW_ESTIMATED, estimate_costs
 from flows.inputs import InputsMissing, check_inputs, check_recordings
+from flows.memory_use import use_memory
 from flows.plan_table import print_plan_with_costs
 from flows.preset_list import PRESETS, preset_names
 from flows.run_progress import shown
 from flows.settings import ScriptFlow
-from flows.stage_costs import estimate_stages
 from tasks.stage import PlannedStage, in_one_run, planning
 from tasks.store import home_folder
-from tasks.workers import num_workers
 
 X = TypeVar("X", bound=Experiment)
 
@@ -267,38 +265,6 @@ def check_home(home: Path) -> None:
     """Raise `PermissionError` where the home folder cannot be written."""
     if not os.access(home, os.W_OK | os.X_OK):
         raise PermissionError(f"{home}: the home folder cannot be written; choose another with --home or CTLEV_HOME")
-
-
-def use_memory(rows: Sequence[PlannedStage], home: Path) -> None:
-    """As many processes as the largest stages fit into memory together, unless CTLEV_WORKERS says how many.
-
-    Raises:
-        DataError: one stage alone needs more memory than the machine has.
-    """
-    if os.environ.get("CTLEV_WORKERS"):
-        return
-    stages = {row.key: row for row in rows if not row.cached}
-    costs = estimate_stages([*rows], home)
-    needs = {key: cost.memory_mib for key in stages if (cost := costs[key]) is not None}
-    largest = sorted(needs, key=lambda key: needs[key], reverse=True)
-    if not largest:
-        return
-    whole, free = memory_mib()
-    if needs[largest[0]] > whole:
-        raise DataError(
-            f"{stages[largest[0]].label}: needs about {needs[largest[0]] / 1024:.1f} GiB of memory, this machine has "
-            f"{whole / 1024:.1f}; generator.options.gradient_checkpointing=true and a smaller batch_size of generator "
-            "and sampling take less; CTLEV_WORKERS=1 tries all the same"
-        )
-    wanted = num_workers()
-    fitting = sum(total <= free for total in itertools.accumulate(needs[key] for key in largest[:wanted]))
-    if fitting < min(wanted, len(largest)):
-        os.environ["CTLEV_WORKERS"] = str(max(fitting, 1))
-        print(
-            f"{max(fitting, 1)} of {wanted} processes: the largest stage needs {needs[largest[0]] / 1024:.1f} GiB of "
-            f"memory, {free / 1024:.1f} are free",
-            file=sys.stderr,
-        )
 
 
 def use_cores(rows: list[PlannedStage]) -> None:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctlev_core.duration_text import duration_text
+from flows.memory_use import fitting_processes
 from flows.stage_costs import StageCost, compare_stages, estimate_stages, time_left
 from flows.tables_of_text import print_table
 from tasks.stage import PlannedStage
-from tasks.workers import num_workers
 
 
 def print_plan_with_costs(rows: Sequence[PlannedStage], home: Path) -> None:
@@ -32,7 +32,7 @@ def print_plan_with_costs(rows: Sequence[PlannedStage], home: Path) -> None:
         if asked:
             print("nothing like the others was run before: no estimate")
         return
-    workers = num_workers()
+    workers = fitting_processes(rows, costs)
     left = time_left(rows, costs, {}, workers)
     print(
         f"the rest: about {duration_text(left)} with {workers} process{'es' * (workers > 1)}, "

@@ -30,6 +30,7 @@ from tasks.runners import ALONE, Runner, WorkerError, asked_cluster, asked_runne
 R = TypeVar("R")
 S = TypeVar("S")
 
+WORKERS = "CTLEV_WORKERS"
 END_TIMEOUT_S = 10.0
 """After being asked to end, a process has so long to clear away what it was writing."""
 MAX_GROUP = 16
@@ -164,7 +165,7 @@ def current_workers() -> Runner | None:
 
 def num_workers() -> int:
     """The variable CTLEV_WORKERS, else one process for each core that we may use."""
-    asked = os.environ.get("CTLEV_WORKERS", "")
+    asked = os.environ.get(WORKERS, "")
     if asked and not (asked.isdecimal() and int(asked) >= 1):
         raise ValueError(f"CTLEV_WORKERS must be a positive number, got {asked!r}")
     return int(asked) if asked else num_cores()

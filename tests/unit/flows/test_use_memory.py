@@ -7,7 +7,7 @@ import os
 import pytest
 
 from data_contracts.errors import DataError
-from flows import command_line
+from flows import memory_use
 from flows.stage_costs import StageCost
 from tasks.stage import PlannedStage
 from tasks.workers import num_workers
@@ -18,10 +18,10 @@ GIB = 1024.0
 def run_with(monkeypatch, tmp_path, needs, *, free, whole=64, cached=()):
     rows = [PlannedStage("stage", f"stage {key}", key, cached=key in cached) for key in needs]
     costs = {key: None if gib is None else StageCost(1.0, gib * GIB, 0) for key, gib in needs.items()}
-    monkeypatch.setattr(command_line, "estimate_stages", lambda rows, home: costs)
-    monkeypatch.setattr(command_line, "memory_mib", lambda: (whole * GIB, free * GIB))
+    monkeypatch.setattr(memory_use, "estimate_stages", lambda rows, home: costs)
+    monkeypatch.setattr(memory_use, "memory_mib", lambda: (whole * GIB, free * GIB))
     monkeypatch.setattr("tasks.workers.num_cores", lambda: 4)
-    command_line.use_memory(rows, tmp_path)
+    memory_use.use_memory(rows, tmp_path)
     return num_workers()
 
 
@@ -43,7 +43,7 @@ def _own_environment(monkeypatch):
 )
 def test_processes_are_as_many_as_fit(monkeypatch, tmp_path, capsys, needs, free, workers):
     assert run_with(monkeypatch, tmp_path, needs, free=free) == workers
-    assert ("processes: the largest stage needs" in capsys.readouterr().err) == (workers < 4)
+    assert ("processes: the largest stages do not fit" in capsys.readouterr().err) == (workers < 4)
 
 
 def test_what_has_been_done_needs_nothing(monkeypatch, tmp_path):
