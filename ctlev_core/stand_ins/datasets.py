@@ -7,6 +7,7 @@ events are those of the datasets, in round numbers.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -187,7 +188,7 @@ def write_smpl(path: Path) -> None:
     import scipy.sparse
 
     with np.load(BUNDLED_BODY) as body:
-        arrays = {name: np.asarray(body[name]).astype(np.float64) for name in body.files}
+        arrays: dict[str, Any] = {name: np.asarray(body[name]).astype(np.float64) for name in body.files}
     arrays["f"] = arrays["f"].astype(np.uint32)
     arrays["kintree_table"] = (arrays["kintree_table"].astype(np.int64) % 2**32).astype(np.uint32)
     arrays["posedirs"] = np.random.default_rng(0).normal(0, 1e-4, (len(arrays["v_template"]), 3, 207))
@@ -216,5 +217,5 @@ def _shaken_outline(
     x = size[0] / 2 + radius * np.cos(angle) + shift * np.cos(direction) + random.normal(0, 1, count)
     y = size[1] / 2 + radius * np.sin(angle) + shift * np.sin(direction) + random.normal(0, 1, count)
     p = (np.cos(angle - direction) + random.normal(0, 0.3, count) > 0).astype(np.int64)
-    places = (np.clip(np.rint(v), 0, limit - 1).astype(np.int64) for v, limit in ((x, size[0]), (y, size[1])))
-    return (t, *places, p)
+    x, y = (np.clip(np.rint(v), 0, limit - 1).astype(np.int64) for v, limit in ((x, size[0]), (y, size[1])))
+    return t, x, y, p
