@@ -123,7 +123,8 @@ class CompressedArrayWriter:
         return _FRAME.pack(_FRAME_MAGIC, _FRAME_DESCRIPTOR, len(raw)) + block + raw
 
     def _write_chunk(self) -> None:
-        rows = self._waiting[0] if len(self._waiting) == 1 else np.concatenate(self._waiting)
+        # Without the type NumPy would give numbers of another byte order in its own.
+        rows = self._waiting[0] if len(self._waiting) == 1 else np.concatenate(self._waiting, dtype=self._row[0])
         self._waiting = []
         stored = np.ascontiguousarray(rows)
         if _has_planes(*self._row):
@@ -226,11 +227,12 @@ class CompressedArray(ArrayRows):
         if sizes[-1].tolist() != [length, 0]:
             raise self._damaged(start, f"checksums of {sizes[-1, 0]} bytes, expected {length}")
         frame = self._pread(start, length, "checksums")
-        name, has_planes = _CHECKS.unpack_from(frame, _SKIPPED.size)
+        skipped, content = frame[: _SKIPPED.size], frame[_SKIPPED.size : -4]
+        name, has_planes = _CHECKS.unpack_from(content)
         own = int.from_bytes(frame[-4:], "little")
-        if name != _CHECKS_NAME or own != zlib.crc32(frame[_SKIPPED.size : -4]):
+        if (skipped, name, own) != (_SKIPPED.pack(_CHECKS_MAGIC, len(content) + 4), _CHECKS_NAME, zlib.crc32(content)):
             raise self._damaged(start, "something else than checksums")
-        return np.frombuffer(frame, "<u4", len(sizes) - 1, _SKIPPED.size + _CHECKS.size), bool(has_planes)
+        return np.frombuffer(content, "<u4", len(sizes) - 1, _CHECKS.size), bool(has_planes)
 
     def _read_header(self, size: int) -> tuple[np.dtype, tuple[int, ...]]:
         if size > _MAX_HEADER_BYTES:
