@@ -20,6 +20,9 @@ HOW_ESTIMATED = (
     "hours or more:"
 )
 PIXELS = 3
+COMPRESSION = 5
+"""Times smaller that samples are stored. `benchmarks/arrays.py`: recorded frames of 512 px become 24 to 190 times smaller;
+those sampled in the preset `smoke`, of 64 px, 15. Sampled frames of 512 px were not measured, so this is cautious."""
 _TERA = 1e12
 # (at 512 px, at 256 px): TFLOP an image.
 _OPERATIONS = {
@@ -82,7 +85,7 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
         sampling_s=samples
         * (evaluations * forward + _operations("decoding", width, height))
         / FLOPS[sampled["precision"]],
-        frames_bytes=samples * width * height * PIXELS,
+        frames_bytes=samples * width * height * PIXELS // COMPRESSION,
     )
 
 
