@@ -51,8 +51,11 @@ class ImageRows(ArrayRows):
 
     def _read(self, rows: np.ndarray) -> np.ndarray:
         part, row = self._part[rows], self._row[rows]
+        numbers = np.unique(part)
+        if len(numbers) == 1:
+            return np.asarray(self._arrays[numbers[0]][row])
         found = np.empty((len(rows), *self.shape[1:]), self.dtype)
-        for number in np.unique(part):
+        for number in numbers:
             members = part == number
             found[members] = self._arrays[number][row[members]]
         return found

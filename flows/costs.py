@@ -21,8 +21,8 @@ HOW_ESTIMATED = (
 )
 PIXELS = 3
 COMPRESSION = 5
-"""Times smaller that samples are stored. `benchmarks/arrays.py`: recorded frames of 512 px become 24 to 190 times smaller;
-those sampled in the preset `smoke`, of 64 px, 15. Sampled frames of 512 px were not measured, so this is cautious."""
+"""How many times smaller samples are stored. Of `benchmarks/arrays.py`, recorded frames of 512 px are 24 to 190 times
+smaller; those sampled in the preset `smoke`, 64 px, 15. Sampled ones of 512 px were not measured: this is cautious."""
 _TERA = 1e12
 # (at 512 px, at 256 px): TFLOP an image.
 _OPERATIONS = {
