@@ -8,8 +8,7 @@ the loops of diffusers' examples (`diffusers_loop.py`), sampling beside `StableD
 plainly, with the same solver and 20 steps, and with 1000 steps of DDPM, the paper's. Wall time. The card's limit is a
 bf16 matrix product of 8192 x 8192, measured here; operations are counted by torch.
 
-Lines marked `as an experiment` change our networks from outside to see what an option would gain; targets are not for
-them. With the defaults, batches of 8 at 512 px, expect some 80 GB for the text route, whose two loops hold weights,
+With the defaults, batches of 8 at 512 px, expect some 80 GB for the text route, whose two loops hold weights,
 gradients, moments and averages of a U-Net in float32 each, and half of that for the others; what it took is printed.
 A part that fails, for want of memory perhaps, is reported, and the others go on.
 """
@@ -37,6 +36,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, choose_device
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
 from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.sampling.sampling import compile_for_sampling
 from ctlev_core.stand_ins.networks import Size, build_network, stable_diffusion_configs
 
 MATMUL_SIDE = {"cuda": 8192, "cpu": 512}
@@ -137,32 +137,11 @@ def count_parameters(base_model: PretrainedModel) -> str:
     return ", ".join(counts)
 
 
-def use_channels_last(base_model: PretrainedModel) -> PretrainedModel:
-    """The same networks; convolutions then take images as tensor cores like them."""
-    for network in (base_model.unet, base_model.controlnet, base_model.vae):
-        if network is not None:
-            network.to(memory_format=torch.channels_last)
-    return base_model
-
-
-def compile_networks(base_model: PretrainedModel) -> PretrainedModel:
-    """The same networks, compiled when they are first called, with images as tensor cores like them."""
-    for network in (use_channels_last(base_model).unet, base_model.controlnet):
-        if network is not None:
-            network.compile()
-    return base_model
-
-
 # Parts ----------------------------------------------------------------------------------------------------------------
 
 
-Change = Callable[[PretrainedModel], PretrainedModel]
-
-
-def measure_sampling(
-    change: Change | None, chosen: Any, device: torch.device, limit: float, found: list[Comparison]
-) -> None:
-    """The ControlNet route with few steps; with unchanged networks beside the paper's thousand, too."""
+def measure_sampling(compiled: bool, chosen: Any, device: torch.device, limit: float, found: list[Comparison]) -> None:
+    """The ControlNet route with few steps; uncompiled, beside the paper's thousand, too."""
     base_model = build_base_model(
         chosen.size, chosen.image_size, with_controlnet=True, dtype=getattr(torch, chosen.precision), device=device
     )
@@ -174,13 +153,13 @@ def measure_sampling(
         sampling.sample_ours(base_model, conditions, options)
     flops = counter.get_total_flops()
     compare = partial(sampling.compare, base_model, options, count=chosen.batch_size, rounds=chosen.rounds)
-    if change is None:
-        of_part = compare("sampling", paper_steps=chosen.ddpm_steps, in_full=True)
+    if compiled:
+        copies = {part: copy.deepcopy(getattr(base_model, part)) for part in ("unet", "controlnet")}
+        ours = dataclasses.replace(base_model, **copies)
+        compile_for_sampling(ours)
+        of_part = compare("sampling, compile_networks=true", ours=ours, paper_steps=0)
     else:
-        copies = {part: copy.deepcopy(getattr(base_model, part)) for part in ("unet", "controlnet", "vae")}
-        of_part = compare(
-            f"sampling, {EXPERIMENTS[change]}", ours=change(dataclasses.replace(base_model, **copies)), paper_steps=0
-        )
+        of_part = compare("sampling", paper_steps=chosen.ddpm_steps, in_full=True)
     found += of_part
     rate = flops / statistics.median(of_part[0].ours)
     print(f"  {flops / 1e12:.3g} TFLOP, {rate / 1e12:.3g} TFLOP/s, {rate / limit:.0%} of the matrix product")
@@ -189,13 +168,12 @@ def measure_sampling(
 def measure_training(
     route: training.Route,
     changed: Sequence[str],
-    change: Change | None,
     chosen: Any,
     device: torch.device,
     _limit: float,
     found: list[Comparison],
 ) -> None:
-    """One route with options of ours, or with networks changed from outside."""
+    """One route with options of ours."""
     build = partial(
         build_base_model,
         chosen.size,
@@ -206,28 +184,18 @@ def measure_training(
     )
     base_model, same = build(), build()
     print(f"  {count_parameters(base_model)}")
-    if change is not None:
-        base_model = change(base_model)
     options = training.make_options(chosen.batch_size, chosen.precision, [f"device={chosen.device}", *changed])
-    name = ", ".join([f"training, {route}", *changed, *([EXPERIMENTS[change]] if change else [])])
-    comparison = training.compare(base_model, same, options, route, chosen.rounds, chosen.steps, name)
-    if change is not None:
-        comparison.wanted = None
-    found.append(comparison)
+    name = ", ".join([f"training, {route}", *changed])
+    found.append(training.compare(base_model, same, options, route, chosen.rounds, chosen.steps, name))
 
 
-EXPERIMENTS: dict[Change, str] = {
-    use_channels_last: "channels_last, as an experiment",
-    compile_networks: "channels_last and compiled, as an experiment",
-}
 PARTS: dict[str, Callable[[Any, torch.device, float, list[Comparison]], None]] = {
-    "sampling": partial(measure_sampling, None),
-    "sampling_channels_last": partial(measure_sampling, use_channels_last),
-    "sampling_compiled": partial(measure_sampling, compile_networks),
-    "controlnet": partial(measure_training, "controlnet", (), None),
-    "controlnet_channels_last": partial(measure_training, "controlnet", (), use_channels_last),
-    "controlnet_compiled": partial(measure_training, "controlnet", ("compile_networks=true",), None),
-    "text": partial(measure_training, "text", (), None),
+    "sampling": partial(measure_sampling, False),
+    "sampling_compiled": partial(measure_sampling, True),
+    "controlnet": partial(measure_training, "controlnet", ()),
+    "controlnet_compiled": partial(measure_training, "controlnet", ("compile_networks=true",)),
+    "text": partial(measure_training, "text", ()),
+    "text_compiled": partial(measure_training, "text", ("compile_networks=true",)),
 }
 
 if __name__ == "__main__":

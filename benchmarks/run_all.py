@@ -48,6 +48,7 @@ ALL = (
     Benchmark("training"),
     Benchmark("training_compiled", ("--set", "compile_networks=true"), script="training"),
     Benchmark("sampling"),
+    Benchmark("arrays"),
     Benchmark("operations"),
     Benchmark("gpu", needs_gpu=True),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,10 +50,17 @@ class TrainedGenerator:
         folder: of the checkpoint; of diffusion models an ordinary diffusers folder.
         name: of the plug-in in `ctlev_core/generators` that made it.
         decoder: draws the pixel values of what is sampled, where the run had one.
+        defaults: options of sampling that the run had; none where only a folder is known.
     """
 
-    def __init__(self, folder: Path, name: str, decoder: DecoderChoice | None = None) -> None:
-        self.folder, self.name, self.decoder = folder, name, decoder
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        decoder: DecoderChoice | None = None,
+        defaults: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.folder, self.name, self.decoder, self.defaults = folder, name, decoder, dict(defaults or {})
 
     def __repr__(self) -> str:
         return f"TrainedGenerator({self.name!r}, {str(self.folder)!r})"
@@ -73,7 +80,8 @@ class TrainedGenerator:
             images: [N, H, W, 3] uint8 condition images, such as those of `skeleton_map` and `normal_map`, or one
                 [H, W, 3]; for generators that are asked by pictures.
             seed: row i has the i-th seed that follows from it.
-            options: the generator's `SampleOptions`, such as `num_inference_steps`; `ctlev options NAME` lists them.
+            options: the generator's `SampleOptions`, such as `num_inference_steps`, in place of those the run had;
+                `ctlev options NAME` lists them.
         Returns:
             [N, H, W, 3] uint8.
         Raises:
@@ -83,8 +91,12 @@ class TrainedGenerator:
         """
         asked = _conditions(prompts, images)
         module: Any = plugins.load("generators", self.name)
+        defaults = dict(self.defaults)
+        if "scheduler" in options:
+            defaults.pop("timestep_spacing", None)  # each solver has its own
         if self.decoder is not None:
-            options = {"black_threshold": 0} | options
+            defaults["black_threshold"] = 0
+        options = defaults | options
         chosen = validate_options(module.SampleOptions, options, f"generators {self.name!r}")
         seeds = sample_seeds(seed, len(asked))
         with tempfile.TemporaryDirectory(prefix="ctlev_sample_") as work:
@@ -126,7 +138,11 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
     if own is None:
         raise DataError(f"{report}: no generator was trained in this run")
     decoded = next((one for one in records if one.role == "frames of synthetic" and one.stage == "decode_pixels"), None)
-    return _of_folder(_in_store(state, own.stage, own.key), None if decoded is None else _decoder_of(state, decoded))
+    sampled = (one.arguments for one in records if one.stage == "sample")
+    defaults = next((one["sampling"]["options"] for one in sampled if one["checkpoint"]["manifest"] == own.key), None)
+    return _of_folder(
+        _in_store(state, own.stage, own.key), None if decoded is None else _decoder_of(state, decoded), defaults
+    )
 
 
 def _in_store(state: Path, stage: str, key: str) -> Path:
@@ -144,7 +160,9 @@ def _decoder_of(state: Path, decoded: Record) -> DecoderChoice:
     return DecoderChoice(folder / DECODER_FOLDER, asked["options"], encoding)
 
 
-def _of_folder(folder: Path, decoder: DecoderChoice | None = None) -> TrainedGenerator:
+def _of_folder(
+    folder: Path, decoder: DecoderChoice | None = None, defaults: Mapping[str, Any] | None = None
+) -> TrainedGenerator:
     """The generator of an artefact, or of the checkpoint alone."""
     if not (folder / RUN_FILE).is_file() and (folder.parent / RUN_FILE).is_file() and folder.name == CHECKPOINT:
         folder = folder.parent
@@ -153,7 +171,7 @@ def _of_folder(folder: Path, decoder: DecoderChoice | None = None) -> TrainedGen
             plugin = json.loads((folder / RUN_FILE).read_text())["arguments"]["generator"]["plugin"]
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{folder}: is no artefact of the stage finetune") from error
-        return TrainedGenerator(folder / CHECKPOINT, plugin.rpartition("/")[2], decoder)
+        return TrainedGenerator(folder / CHECKPOINT, plugin.rpartition("/")[2], decoder, defaults)
     if not (folder / "model_index.json").is_file():
         raise DataError(
             f"{folder}: expected an artefact of the stage finetune or a diffusers folder; no model_index.json"

@@ -1,4 +1,4 @@
-"""Arrays that are written row by row, because all rows together may not fit into memory."""
+"""Arrays of files, plain (.npy) or compressed (.npy.zst), whose rows together may not fit into memory."""
 
 from __future__ import annotations
 
@@ -9,11 +9,31 @@ from typing import IO
 import numpy as np
 from numpy.lib import format as npy
 
+from data_contracts.array_rows import Images
+from data_contracts.compressed_arrays import SUFFIX, CompressedArray, CompressedArrayWriter
 from data_contracts.errors import DataError
 
 
+def load_array(path: Path) -> Images:
+    """An array whose rows stay on disk until they are indexed: compressed, or of another name mapped into memory."""
+    if path.name.endswith(SUFFIX):
+        return CompressedArray(path)
+    return np.load(path, mmap_mode="r", allow_pickle=False)
+
+
+def save_compressed(path: Path, array: np.ndarray) -> None:
+    """Write the rows of an array [N, ...], compressed."""
+    with CompressedArrayWriter(path) as written:
+        written.append(array)
+
+
+def times_file(images_file: str) -> str:
+    """The file with the times of a recording's pictures, plain: it lies beside theirs."""
+    return f"{images_file.removesuffix('.zst').removesuffix('.npy')}.t_us.npy"
+
+
 class ArrayWriter:
-    """Append rows to a .npy file; the file is complete when the `with` block ends."""
+    """Append rows to a plain .npy file, which is complete when the `with` block ends."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -8,21 +8,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import numpy as np
 
-CHUNK_BYTES = 64 << 20
+from data_contracts.array_rows import ArrayRows, Images, image_chunks
+from data_contracts.arrays import load_array
+from data_contracts.compressed_arrays import CompressedArray
+
 _NOTE_FILE = "arrays.json"
 
 
-class ImageRows:
+class ImageRows(ArrayRows):
     """Image i is row `row[i]` of array `part[i]`.
 
     Args:
-        arrays: one or more [M, ...], usually memory-mapped, of one dtype and row shape.
+        arrays: one or more [M, ...], usually on disk, of one dtype and row shape.
         part: [N] int, which array.
         row: [N] int, which row of it.
         identity: names the content of the arrays, such as the digests of their artefacts; with `part` and `row` it
@@ -31,54 +33,32 @@ class ImageRows:
         ValueError: there is no array, or they are not alike.
     """
 
-    def __init__(self, arrays: Sequence[np.ndarray], part: np.ndarray, row: np.ndarray, identity: str = "") -> None:
+    def __init__(self, arrays: Sequence[Images], part: np.ndarray, row: np.ndarray, identity: str = "") -> None:
         shapes = {(array.dtype, array.shape[1:]) for array in arrays}
         if len(shapes) != 1:
             found = ", ".join(sorted(f"{list(shape)} {dtype}" for dtype, shape in shapes)) or "no array"
             raise ValueError(f"rows of several arrays must be alike, got {found}")
         (self.dtype, row_shape) = shapes.pop()
-        self.shape: tuple[int, ...] = (len(row), *row_shape)
+        self.shape = (len(row), *row_shape)
         self._arrays, self._part, self._row, self._identity = list(arrays), part, row, identity
 
     @classmethod
-    def of(cls, parts: Sequence[tuple[np.ndarray, np.ndarray]], identity: str = "") -> ImageRows:
+    def of(cls, parts: Sequence[tuple[Images, np.ndarray]], identity: str = "") -> ImageRows:
         """The chosen rows [K] of each array, one array after another."""
         rows = [np.asarray(rows, np.int64) for _, rows in parts]
         part = np.repeat(np.arange(len(parts)), [len(chosen) for chosen in rows])
         return cls([array for array, _ in parts], part, np.concatenate([*rows, np.zeros(0, np.int64)]), identity)
 
-    @property
-    def ndim(self) -> int:
-        """Axes, as of an array."""
-        return len(self.shape)
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, index: Any) -> np.ndarray:
-        """Rows as an array: of an integer, a slice, a mask or an array of integers; further axes may be indexed too."""
-        chosen, *further = index if isinstance(index, tuple) else (index,)
-        if chosen is Ellipsis:
-            chosen, further = slice(None), [Ellipsis, *further]
-        rows = np.arange(len(self))[chosen]
-        images = self._read(np.atleast_1d(rows))
-        return images[(slice(None) if rows.ndim else 0, *further)]
-
     def _read(self, rows: np.ndarray) -> np.ndarray:
         part, row = self._part[rows], self._row[rows]
+        numbers = np.unique(part)
+        if len(numbers) == 1:
+            return np.asarray(self._arrays[numbers[0]][row])
         found = np.empty((len(rows), *self.shape[1:]), self.dtype)
-        for number in np.unique(part):
+        for number in numbers:
             members = part == number
             found[members] = self._arrays[number][row[members]]
         return found
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        images = self[:]
-        return images if dtype is None else images.astype(dtype, copy=False)
-
-    def __iter__(self) -> Iterator[np.ndarray]:
-        for images in image_chunks(self):
-            yield from images
 
     def take(self, chosen: np.ndarray) -> ImageRows:
         """The images of `chosen` [K] int, still on disk."""
@@ -98,12 +78,12 @@ class ImageRows:
     def save(self, folder: Path) -> None:
         """Note arrays and rows in a folder, from which `load_image_rows` opens them in another process.
 
-        An array that is not a whole .npy file is written there.
+        An array that is not a whole file is written there.
         """
         folder.mkdir(parents=True, exist_ok=True)
         paths = []
         for number, array in enumerate(self._arrays):
-            path = _npy_file(array)
+            path = _file_of(array)
             if path is None:
                 path = folder / f"array_{number}.npy"
                 np.save(path, array, allow_pickle=False)
@@ -113,20 +93,18 @@ class ImageRows:
         (folder / _NOTE_FILE).write_text(json.dumps({"identity": self._identity, "paths": paths}), encoding="utf-8")
 
 
-Images: TypeAlias = np.ndarray | ImageRows
-"""What has `shape`, `dtype` and `len`, and gives arrays of rows when indexed."""
-
-
 def load_image_rows(folder: Path) -> ImageRows:
-    """What `ImageRows.save` noted, memory-mapped."""
+    """What `ImageRows.save` noted, still on disk."""
     noted = json.loads((folder / _NOTE_FILE).read_text(encoding="utf-8"))
-    arrays = [np.load(path, mmap_mode="r", allow_pickle=False) for path in noted["paths"]]
+    arrays = [load_array(Path(path)) for path in noted["paths"]]
     part, row = (np.load(folder / name, allow_pickle=False) for name in ("part.npy", "row.npy"))
     return ImageRows(arrays, part, row, noted["identity"])
 
 
-def _npy_file(array: np.ndarray) -> Path | None:
-    """The .npy file whose whole content an array is mapped from."""
+def _file_of(array: Images) -> Path | None:
+    """The file whose whole content an array is read from."""
+    if isinstance(array, CompressedArray):
+        return array.path
     if not isinstance(array, np.memmap) or array.filename is None or Path(array.filename).suffix != ".npy":
         return None
     whole = np.load(array.filename, mmap_mode="r", allow_pickle=False)
@@ -137,11 +115,3 @@ def _npy_file(array: np.ndarray) -> Path | None:
 def as_image_rows(images: Images) -> ImageRows:
     """Images of an array as rows that `take` and `save` leave where they are."""
     return images if isinstance(images, ImageRows) else ImageRows.of([(images, np.arange(len(images)))])
-
-
-def image_chunks(images: Images, chunk_bytes: int = CHUNK_BYTES) -> Iterator[np.ndarray]:
-    """All rows in order, as arrays of at most `chunk_bytes`, one row at least."""
-    row_bytes = images.dtype.itemsize * int(np.prod(images.shape[1:]))
-    step = max(chunk_bytes // max(row_bytes, 1), 1)
-    for start in range(0, len(images), step):
-        yield images[start : start + step]

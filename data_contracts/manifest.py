@@ -2,8 +2,8 @@
 
 An artefact is a folder. `manifest.parquet` holds its rows and, in the Parquet metadata, size and SHA-256 of every other
 file of the folder, so the digest of the manifest vouches for the whole artefact. More than some thousands of files are
-listed in a table of their own, `file_list.parquet`, whose digest is in the metadata. Arrays lie beside it as .npy files
-and are memory-mapped; row i of an array belongs to row i of the table.
+listed in a table of their own, `file_list.parquet`, whose digest is in the metadata. Arrays lie beside it,
+compressed (`data_contracts.compressed_arrays`) or as .npy files; row i of an array belongs to row i of the table.
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from data_contracts.array_rows import Images
+from data_contracts.arrays import load_array
+from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.errors import DataError, TableVersionError
 from data_contracts.file_lists import (
@@ -115,12 +118,24 @@ class Manifest:
             raise DataError(f"{self.ref.path}: holds no file {name!r}; it has {known[:200]}")
         return self.ref.path / name
 
-    def array(self, name: str) -> np.ndarray:
-        """The array `<name>.npy`, memory-mapped read-only."""
-        return np.load(self.path(f"{name}.npy"), mmap_mode="r", allow_pickle=False)
+    def array(self, name: str) -> Images:
+        """An array of the artefact, whose rows stay on disk until they are indexed."""
+        return load_array(self.array_path(name))
+
+    def array_path(self, name: str) -> Path:
+        """Its file."""
+        return self.path(self._array_file(name))
+
+    def has_array(self, name: str) -> bool:
+        """Does the artefact hold an array of this name?"""
+        return self._array_file(name) in self.files
+
+    def _array_file(self, name: str) -> str:
+        """`<name>.npy.zst`, or `<name>.npy`, which earlier versions wrote and which holds what does not compress."""
+        return f"{name}.npy" if f"{name}.npy" in self.files else f"{name}{SUFFIX}"
 
     def images(self, rows: np.ndarray, name: str = "frames") -> ImageRows:
-        """The given rows of the array `<name>.npy`, which stay on disk until they are indexed."""
+        """The given rows of an array, which stay on disk until they are indexed."""
         return image_rows([(self, rows)], name)
 
     def attached(self, schema: TableSchema) -> pa.Table:
@@ -146,7 +161,7 @@ class Manifest:
 
 
 def image_rows(parts: Sequence[tuple[Manifest, np.ndarray]], name: str = "frames") -> ImageRows:
-    """The given rows of the array `<name>.npy` of several artefacts, one after another, left on disk."""
+    """The given rows of an array of several artefacts, one after another, left on disk."""
     arrays = [(manifest.array(name), rows) for manifest, rows in parts]
     return ImageRows.of(arrays, " ".join([name, *(manifest.ref.digest for manifest, _ in parts)]))
 
@@ -312,10 +327,10 @@ def matching_rows(frames: Manifest, conditions: Manifest) -> np.ndarray:
 
 def conditions_of(manifest: Manifest) -> Conditions:
     """The conditions of a manifest of conditions; row i is row i of its table."""
-    images = manifest.array("images") if "images.npy" in manifest.files else None
+    images = manifest.array("images") if manifest.has_array("images") else None
     arrays = {name: f"{_MOTION_PREFIX}{name}" for name in _MOTION_ARRAYS}
     motions = None
-    if all(f"{array}.npy" in manifest.files for array in arrays.values()):
+    if all(map(manifest.has_array, arrays.values())):
         motions = BodyMotions(**{name: np.asarray(manifest.array(array)) for name, array in arrays.items()})
     names = tuple(manifest.column("class_name"))
     return Conditions(tuple(manifest.column("prompt")), images, motions, names, _condition_choice(manifest))

@@ -22,6 +22,8 @@ import pyarrow.parquet as pq
 from ctlev_core.plugins import PluginError
 from ctlev_core.provenance.records import read_provenance
 from ctlev_core.report.page.report_files import MARKDOWN, PAGE, PROVENANCE, read_verdict
+from data_contracts.arrays import load_array
+from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.experiment import Experiment
 from data_contracts.study import Study
 
@@ -102,10 +104,10 @@ def tracked_run(folder: Path, experiment: Experiment, home: Path, name: str) -> 
 def _frames(folder: Path, home: Path) -> np.ndarray:
     """Some of the experiment's own synthetic frames, where the store still has them."""
     made = next(record for record in read_provenance(folder / PROVENANCE) if record.role == "frames of synthetic")
-    path = home / "artefacts" / made.stage / made.key / "frames.npy"
+    path = home / "artefacts" / made.stage / made.key / f"frames{SUFFIX}"
     if not path.is_file():
         return np.zeros((0, 1, 1, 3), np.uint8)
-    frames = np.load(path, mmap_mode="r", allow_pickle=False)
+    frames = load_array(path)
     return np.asarray(frames[np.linspace(0, len(frames) - 1, min(NUM_IMAGES, len(frames))).round().astype(int)])
 
 

@@ -15,7 +15,7 @@ from ctlev_core.plugins import Plugin
 from ctlev_core.realism.two_sample import choose_rows
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
-from data_contracts.arrays import ArrayWriter
+from data_contracts.compressed_arrays import CompressedArrayWriter
 from data_contracts.config import ConditionChoice, EncodingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.experiment import LabelOrder, View
@@ -28,7 +28,7 @@ BLOCK_ROWS = 256
 """Rows rendered at a time; pictures of 512 x 512 px take 0.2 GiB."""
 
 
-@stage(version=5, schema=tables.CONDITIONS, raw_files=input_files_of("condition"), optional=("part",))
+@stage(version=6, schema=tables.CONDITIONS, raw_files=input_files_of("condition"), optional=("part",))
 def condition_frames(
     out: Output,
     recordings: Manifest,
@@ -45,7 +45,7 @@ def condition_frames(
     return _render(out, rows.source_ids, rows, condition, recordings, frames, encoding, seed)
 
 
-@stage(version=1, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
+@stage(version=2, schema=tables.CONDITIONS, raw_files=input_files_of("condition"))
 def condition_some_frames(
     out: Output,
     recordings: Manifest,
@@ -69,7 +69,7 @@ def condition_some_frames(
     return _render(out, chosen.source_ids, chosen, condition, recordings, frames, encoding, seed)
 
 
-@stage(version=8, schema=tables.CONDITIONS, raw_files=input_files_of("condition"), optional=("part",))
+@stage(version=9, schema=tables.CONDITIONS, raw_files=input_files_of("condition"), optional=("part",))
 def condition_samples(
     out: Output,
     poses: Manifest,
@@ -132,7 +132,7 @@ def _render(
     motions = read_motions(rows, recordings, frames, encoding) if needs == "motion" else None
     prompts: list[str] = []
     with ExitStack() as opened:
-        written: dict[str, ArrayWriter] = {}
+        written: dict[str, CompressedArrayWriter] = {}
         for start in range(0, max(len(labels), 1), BLOCK_ROWS):
             some = np.arange(start, min(start + BLOCK_ROWS, len(labels)))
             further: list[np.ndarray | BodyMotions] = []

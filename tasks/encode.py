@@ -16,6 +16,8 @@ from ctlev_core.events.image_grid import ImageFit
 from ctlev_core.progress import ProgressBar
 from ctlev_core.recordings.encoding import EncodedWindows, RecordingPart, RecordingSource, encode_recording
 from data_contracts import tables
+from data_contracts.arrays import load_array, save_compressed
+from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
@@ -31,7 +33,7 @@ MAX_GROUP = 4
 logger = logging.getLogger(__name__)
 
 
-@stage(version=5, schema=tables.FRAMES)
+@stage(version=6, schema=tables.FRAMES)
 def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windows: Windows) -> pa.Table:
     """Cut every recording into windows and encode each: arrays `histograms` (counts) and `frames` (8-bit RGB).
 
@@ -151,16 +153,16 @@ class _PutAway(NamedTuple):
     frames: Path
 
     def take_back(self) -> EncodedWindows:
-        histograms, frames = (np.load(path, allow_pickle=False) for path in (self.histograms, self.frames))
+        histograms, frames = (load_array(path)[:] for path in (self.histograms, self.frames))
         self.histograms.unlink()
         self.frames.unlink()
         return self.others._replace(histograms=histograms, frames=frames)
 
 
 def _put_away(cut: EncodedWindows, path: Path) -> _PutAway:
-    paths = path.with_suffix(".histograms.npy"), path.with_suffix(".frames.npy")
+    paths = path.with_suffix(f".histograms{SUFFIX}"), path.with_suffix(f".frames{SUFFIX}")
     for images, file in zip((cut.histograms, cut.frames), paths, strict=True):
-        np.save(file, images, allow_pickle=False)
+        save_compressed(file, images)
     return _PutAway(cut._replace(histograms=cut.histograms[:0], frames=cut.frames[:0]), *paths)
 
 

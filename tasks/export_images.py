@@ -167,7 +167,7 @@ def _write_files(opened: Mapping[str, Manifest], rows: np.ndarray, partial: Path
     columns["file_name"] = pa.array(names_in(IMAGES_FOLDER))
     images = frames.array("frames")
     _write_shards(partial, names_in(IMAGES_FOLDER), lambda n, path: _write_png(path, images[rows[n]]))
-    if "images.npy" in conditions.files:
+    if conditions.has_array("images"):
         pictures, asked = conditions.array("images"), _rows_of(conditions, table["condition_id"])
         columns["condition_file_name"] = pa.array(names_in(CONDITIONS_FOLDER))
         _write_shards(partial, names_in(CONDITIONS_FOLDER), lambda n, path: _write_png(path, pictures[asked[n]]))

@@ -86,7 +86,7 @@ def _shows_counts(frames: Manifest, rows: np.ndarray) -> bool:
     return counts.shape[-2:] == images.shape[1:3] and all(np.array(frames.column("num_events"))[rows])
 
 
-@stage(version=1, schema=tables.SYNTHETIC)
+@stage(version=2, schema=tables.SYNTHETIC)
 def decode_pixels(
     out: Output,
     decoder: Manifest,

@@ -31,6 +31,8 @@ from ctlev_core.postprocessing.stochastic_rounding import round_frames, training
 from ctlev_core.progress import ProgressBar
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
+from data_contracts.arrays import load_array, save_compressed
+from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.config import EncodingChoice, SamplingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
@@ -50,7 +52,7 @@ MAX_FILTER_FRAMES = 2_000
 """Training frames the quality filter is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
-@stage(version=3, schema=tables.SYNTHETIC, optional=("part",))
+@stage(version=4, schema=tables.SYNTHETIC, optional=("part",))
 def sample(
     out: Output,
     checkpoint: Manifest,
@@ -125,7 +127,7 @@ def quality_filter_of(frames: Manifest) -> QualityFilter:
     return fit_quality_filter(real, polarity=not real[..., 1].any())
 
 
-@stage(version=2, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"), optional=("part",))
+@stage(version=3, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"), optional=("part",))
 def simulate(
     out: Output,
     recordings: Manifest,
@@ -165,7 +167,7 @@ def simulate(
         ProgressBar(total=count, desc=plugin.name, unit="frame") as progress,
     ):
         for path in paths:
-            made = np.load(path, allow_pickle=False)
+            made = load_array(path)[:]
             written.append(made)
             causes += find_causes(made, quality_filter)
             progress.update(len(made))
@@ -222,7 +224,7 @@ class _Shard(NamedTuple):
 
 def _simulate_shard(asked: _Simulation, shard: _Shard) -> Path:
     """The file of the frames of some rows, made unless an interrupted run has left it."""
-    path = asked.work / f"frames_{shard.start:07d}.npy"
+    path = asked.work / f"frames_{shard.start:07d}{SUFFIX}"
     if path.exists():
         return path
     plugin, encoder = plugins.load_options(asked.sampling), plugins.load_options(asked.encoding)
@@ -233,8 +235,7 @@ def _simulate_shard(asked: _Simulation, shard: _Shard) -> Path:
     moments_us = None if part.motions is None else part.motions.moment_us
     frames = _encode(simulated, moments_us, durations_us[rows], asked.windows, encoder)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        np.save(file, frames, allow_pickle=False)
+    save_compressed(temporary, frames)
     temporary.replace(path)
     return path
 

@@ -59,7 +59,7 @@ def speed_report(
         for setting, manifest in zip(settings, shown, strict=True)
     }
     asked = None
-    if "images.npy" in conditions.files:
+    if conditions.has_array("images"):
         row_of = {name: row for row, name in enumerate(conditions.column("sample_id"))}
         asked = conditions.array("images")[[row_of[name] for name in reference.column("condition_id")]]
     page = SpeedPage(

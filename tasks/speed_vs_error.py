@@ -40,7 +40,7 @@ from data_contracts.speed_vs_error import ExactScoreOptions, PrecisionOptions, S
 from tasks.stage import Output, stage
 
 
-@stage(version=1, schema=tables.TIMED_SAMPLES)
+@stage(version=2, schema=tables.TIMED_SAMPLES)
 def sample_timed(
     out: Output, checkpoint: Manifest, conditions: Manifest, *, sampling: SamplingChoice, num_images: int, seed: int
 ) -> pa.Table:

@@ -48,7 +48,8 @@ from ctlev_core.plugin_contracts import PluginWithFiles
 from ctlev_core.processes import begin_memory_peak, memory_peak_mib
 from ctlev_core.progress import Progress, current_report, reporting_to
 from ctlev_core.provenance.raw_file_digests import digest_raw_files
-from data_contracts.arrays import ArrayWriter
+from data_contracts.arrays import save_compressed
+from data_contracts.compressed_arrays import SUFFIX, CompressedArrayWriter
 from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
@@ -177,12 +178,12 @@ class Output:
         self.work = work
 
     def write_array(self, name: str, array: np.ndarray) -> None:
-        """Attach the array `<name>.npy`; row i belongs to row i of the manifest."""
-        np.save(self.folder / f"{name}.npy", array, allow_pickle=False)
+        """Attach an array, compressed; row i belongs to row i of the manifest."""
+        save_compressed(self.folder / f"{name}{SUFFIX}", array)
 
-    def open_array(self, name: str) -> ArrayWriter:
-        """The array `<name>.npy`, to be written row by row within a `with` block."""
-        return ArrayWriter(self.folder / f"{name}.npy")
+    def open_array(self, name: str) -> CompressedArrayWriter:
+        """The same, to be written row by row within a `with` block."""
+        return CompressedArrayWriter(self.folder / f"{name}{SUFFIX}")
 
     def write_table(self, table: pa.Table, schema: TableSchema) -> None:
         """Attach a second table beside the manifest."""

@@ -19,7 +19,7 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 
-@stage(version=1, schema=tables.FRAMES)
+@stage(version=2, schema=tables.FRAMES)
 def take_recorded(out: Output, frames: Manifest, *, count: int, seed: int) -> pa.Table:
     """`count` training frames, spread evenly over subjects and classes and their recordings; all other splits whole.
 
@@ -41,13 +41,13 @@ def take_recorded(out: Output, frames: Manifest, *, count: int, seed: int) -> pa
     return frames.table.take(rows)
 
 
-@stage(version=1, schema=tables.SYNTHETIC)
+@stage(version=2, schema=tables.SYNTHETIC)
 def take_share(out: Output, synthetic: Manifest, *, share: float) -> pa.Table:
     """The first rows, one at least: classes and recordings took turns when the labels were chosen."""
     return _take(out, synthetic, np.arange(max(round(share * len(synthetic)), 1)))
 
 
-@stage(version=2, schema=tables.SYNTHETIC)
+@stage(version=3, schema=tables.SYNTHETIC)
 def take_label_consistent(
     out: Output,
     model: Manifest,

@@ -41,6 +41,8 @@ from torch.utils.data import Dataset
 from ctlev_core.events import files as event_files
 from ctlev_core.provenance.records import read_records
 from data_contracts import tables
+from data_contracts.array_rows import Images
+from data_contracts.arrays import load_array
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.image_folder import read_image_table
@@ -153,16 +155,16 @@ class EventDataset(Dataset[Sample]):
 
 
 class _Array:
-    """Images of an array of the store, mapped into memory by each process for itself; `rows`: that of each sample."""
+    """Images of an array of the store, opened by each process for itself; `rows`: that of each sample."""
 
     def __init__(self, path: Path, rows: np.ndarray | None = None) -> None:
         self.path, self.rows = path, rows
-        self._images: np.ndarray | None = None
+        self._images: Images | None = None
 
     def read(self, row: int) -> np.ndarray:
         images = self._images
         if images is None:
-            images = self._images = np.load(self.path, mmap_mode="r", allow_pickle=False)
+            images = self._images = load_array(self.path)
         return images[row if self.rows is None else self.rows[row]]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -217,7 +219,7 @@ def _open_artefact(ref: ManifestRef, conditions: bool) -> tuple[pa.Table, _Image
         raise DataError(f"{folder}: frames must be [{len(manifest)}, H, W, 3] uint8, got {images.shape} {images.dtype}")
     if conditions and manifest.schema is tables.SYNTHETIC:
         asked = _conditions_of(manifest)
-    return manifest.table, _Array(manifest.path("frames.npy")), asked
+    return manifest.table, _Array(manifest.array_path("frames")), asked
 
 
 def _reference(folder: Path) -> ManifestRef:
@@ -233,14 +235,14 @@ def _conditions_of(generated: Manifest) -> _Array | None:
         conditions = read_manifest(_reference(folder.parent.parent / record.stage / record.key))
     except (DataError, StopIteration) as error:
         raise DataError(f"{folder}: its conditions are not in the store; set conditions=False ({error})") from error
-    if "images.npy" not in conditions.files:
+    if not conditions.has_array("images"):
         return None
     numbers = {sample_id: number for number, sample_id in enumerate(conditions.column("sample_id"))}
     unknown = [name for name in generated.column("condition_id") if name not in numbers]
     if unknown:
         raise DataError(f"{folder}: condition {unknown[0]!r} is not in {conditions.ref.path}; set conditions=False")
     rows = np.array([numbers[name] for name in generated.column("condition_id")], np.int64)
-    return _Array(conditions.path("images.npy"), rows)
+    return _Array(conditions.array_path("images"), rows)
 
 
 def _class_names(table: pa.Table, given: Sequence[str] | None, place: Path) -> tuple[str, ...]:

@@ -15,14 +15,15 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.pictures.image_moves import Moves, move_image
-from data_contracts.arrays import ArrayWriter
+from data_contracts.arrays import load_array
+from data_contracts.compressed_arrays import SUFFIX, CompressedArrayWriter
 from data_contracts.config import Frozen
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images, image_chunks
 from data_contracts.labels import Conditions, History
 
-VERSION = 1
-FRAMES_NAME, CLASSES_NAME = "frames.npy", "classes.json"
+VERSION = 2
+FRAMES_NAME, CLASSES_NAME = f"frames{SUFFIX}", "classes.json"
 
 
 class Options(Frozen):
@@ -60,7 +61,7 @@ def train(frames: Images, conditions: Conditions, options: Options, *, seed: int
     if not len(frames):
         raise DataError("generator 'augmentation' needs at least one frame, got none")
     out.mkdir(parents=True, exist_ok=True)
-    with ArrayWriter(out / FRAMES_NAME) as written:
+    with CompressedArrayWriter(out / FRAMES_NAME) as written:
         for chunk in image_chunks(frames):
             written.append(chunk)
     (out / CLASSES_NAME).write_text(json.dumps(_classes(conditions)) + "\n", encoding="utf-8")
@@ -75,7 +76,7 @@ def sample(
     Raises:
         DataError: no training frame is of a class that is asked for.
     """
-    frames = np.load(checkpoint / FRAMES_NAME, mmap_mode="r", allow_pickle=False)
+    frames = load_array(checkpoint / FRAMES_NAME)
     rows_of: dict[str, list[int]] = {}
     for number, name in enumerate(json.loads((checkpoint / CLASSES_NAME).read_text(encoding="utf-8"))):
         rows_of.setdefault(name, []).append(number)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from data_contracts.array_rows import Images
 from data_contracts.errors import DataError
 from data_contracts.labels import BodyMotions, Labels
 
@@ -51,7 +52,7 @@ def picture_difference(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def equally_different_window(
-    images: np.ndarray, track_us: np.ndarray, moment_us: int, reach_us: int, wanted: float, where: str
+    images: Images, track_us: np.ndarray, moment_us: int, reach_us: int, wanted: float, where: str
 ) -> tuple[int, int]:
     """The shortest window around a moment over which the pictures change as much as `wanted`.
 

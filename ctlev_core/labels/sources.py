@@ -12,6 +12,8 @@ from ctlev_core.events.image_resampling import resample_images
 from ctlev_core.labels import label_windows
 from ctlev_core.labels.labelling import scale_and_offset
 from data_contracts import tables
+from data_contracts.array_rows import Images
+from data_contracts.arrays import load_array, times_file
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
 from data_contracts.events import SensorSize
@@ -143,14 +145,14 @@ def read_motions(rows: LabelledRows, recordings: Manifest, frames: Manifest, enc
     return replace(motions, intrinsics=on_sensor.astype(np.float32))
 
 
-def _tracks(rows: LabelledRows) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+def _tracks(rows: LabelledRows) -> Iterator[tuple[str, np.ndarray, Images, np.ndarray]]:
     """Of each recording: its name, the rows that are of it, its grey pictures and their times."""
     files = dict(zip(rows.recordings.column("recording_id"), rows.recordings.column("intensity_file"), strict=True))
     for name, members in _by_name(rows.recording_ids).items():
         if not files[name]:
             raise DataError(f"{rows.recordings.ref.path}: {name} has no intensity frames, which this condition needs")
-        array = files[name].removesuffix(".npy")
-        yield name, members, rows.recordings.array(array), np.asarray(rows.recordings.array(array + ".t_us"))
+        images, times = (rows.recordings.path(file) for file in (files[name], times_file(files[name])))
+        yield name, members, load_array(images), np.asarray(load_array(times))
 
 
 def _nearest(rows: LabelledRows, members: np.ndarray, t_us: np.ndarray, name: str) -> np.ndarray:

@@ -15,6 +15,7 @@ from ctlev_core.events.windows import cut_at_labels, cut_chunks, spread
 from ctlev_core.labels.interpolation import interpolate_labels, is_between_labels
 from ctlev_core.labels.labelling import has_label, labels_at_windows, labels_in_image
 from ctlev_core.plugins import Plugin
+from data_contracts.arrays import load_array, times_file
 from data_contracts.config import Windows
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
@@ -164,8 +165,7 @@ def _encode_images(source: RecordingSource, plugin: Plugin, windows: Windows) ->
         )
     if len(source.parts) != 1:
         raise DataError(f"{name}: finished event images cannot be split in time")
-    images = np.load(source.file, mmap_mode="r", allow_pickle=False)
-    t_us = np.load(source.file.with_suffix(".t_us.npy"), mmap_mode="r", allow_pickle=False)
+    images, t_us = load_array(source.file), np.asarray(load_array(Path(times_file(str(source.file)))))
     known = np.arange(len(images))
     if windows.labels == "interpolated":
         known = np.flatnonzero(is_between_labels(source.track, t_us))
@@ -175,7 +175,7 @@ def _encode_images(source: RecordingSource, plugin: Plugin, windows: Windows) ->
         rows = chosen[first : first + at_once]
         grey = np.asarray(images[rows])[:, None]
         frames = plugin.module.render_levels(grey, plugin.options)
-        times = np.asarray(t_us[rows])
+        times = t_us[rows]
         image_size = (frames.shape[2], frames.shape[1])
         labels = _to_image(_label(source.track, times, times, windows), source.sensor_size, plugin, image_size)
         numbers = np.arange(first, first + len(rows))

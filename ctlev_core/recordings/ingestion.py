@@ -13,6 +13,8 @@ from ctlev_core.events import files as event_files
 from ctlev_core.plugin_contracts import DatasetWithChunks, DatasetWithWindowLabels, DatasetWithWindows
 from ctlev_core.plugins import Plugin
 from ctlev_core.progress import ProgressBar
+from data_contracts.arrays import save_compressed, times_file
+from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 from data_contracts.labels import Labels, Recording, check_image_track, check_labels
@@ -68,7 +70,7 @@ def ingest_recording(plugin: Plugin, recording: Recording, folder: Path, work: P
     Args:
         plugin: the dataset.
         recording: one of `list_recordings`.
-        folder: to write to: `events/<id>.parquet`, `event_images/<id>.npy`, `intensity/<id>.npy`.
+        folder: to write to: `events/<id>.parquet`, `event_images/<id>.npy.zst`, `intensity/<id>.npy.zst`.
         work: keeps what is finished when a run is interrupted.
     Raises:
         DataError: the recording cannot be read or breaks the contract.
@@ -134,13 +136,13 @@ def _ingest_events(plugin: Plugin, recording: Recording, folder: Path, work: Pat
 
 def _ingest_images(plugin: Plugin, recording: Recording, folder: Path, kind: str, where: str) -> dict[str, Any]:
     """Event images or intensity frames as arrays: pictures, and their times beside them."""
-    name = f"{kind}/{recording.recording_id}.npy"
+    name = f"{kind}/{recording.recording_id}{SUFFIX}"
     read = plugin.module.read_event_images if kind == "event_images" else plugin.module.read_intensity_frames
     track = check_image_track(read(recording, plugin.options), f"{where}, {kind.replace('_', ' ')}")
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, track.images, allow_pickle=False)
-    np.save(path.with_suffix(".t_us.npy"), track.t_us, allow_pickle=False)
+    save_compressed(path, track.images)
+    np.save(folder / times_file(name), track.t_us, allow_pickle=False)
     if kind == "intensity":
         return {"intensity_file": name}
     _, height, width = track.images.shape

@@ -41,7 +41,7 @@ def stage_page(made: Manifest, label: str) -> str:
 
 def _images(made: Manifest, label: str) -> list[str]:
     """A contact sheet of rows that are evenly spread."""
-    name = next((name for name in ("frames", "images") if f"{name}.npy" in made.files), None)
+    name = next((name for name in ("frames", "images") if made.has_array(name)), None)
     if name is None or not len(made):
         return []
     array = made.array(name)

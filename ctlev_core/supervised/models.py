@@ -13,9 +13,10 @@ import torch
 from torch import nn
 
 from ctlev_core.supervised.options import SupervisedOptions
+from data_contracts.array_rows import ArrayRows, Images
 from data_contracts.errors import DataError
 from data_contracts.file_lists import file_digest
-from data_contracts.image_rows import ImageRows, Images
+from data_contracts.image_rows import as_image_rows
 
 MODEL_NAME = "model.safetensors"
 CONFIG_NAME = "config.json"
@@ -38,8 +39,8 @@ def digest(*parts: Any) -> str:
     """SHA-256 of arrays and JSON-ready values: two training runs with the same digest are the same run."""
     total = hashlib.sha256()
     for part in parts:
-        if isinstance(part, ImageRows):
-            total.update(part.digest().encode())
+        if isinstance(part, ArrayRows):
+            total.update(as_image_rows(part).digest().encode())
         elif isinstance(part, np.ndarray):
             total.update(f"{part.dtype}{part.shape}".encode())
             total.update(np.ascontiguousarray(part).data)

@@ -129,7 +129,7 @@ def test_other_schema_version_is_refused(artefact, monkeypatch):
 
 
 def test_unlisted_file_is_not_read(artefact):
-    with pytest.raises(DataError, match=r"holds no file 'secret\.npy'"):
+    with pytest.raises(DataError, match=r"holds no file 'secret\.npy\.zst'"):
         read_manifest(artefact).array("secret")
 
 

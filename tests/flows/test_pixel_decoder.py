@@ -47,9 +47,8 @@ def test_sampled_frames_become_renderings_of_whole_counts(tmp_path):
     roles = [("checkpoint of synthetic", tuned.ref.path), ("frames of synthetic", drawn.ref.path)]
     (tmp_path / "reports" / "mine").mkdir(parents=True)
     write_provenance(tmp_path / "reports" / "mine" / "provenance.json", read_records(roles))
-    again = load_generator("mine", home=tmp_path).sample(
-        asked.column("prompt"), images=asked.array("images"), num_inference_steps=2, palette="grey"
-    )
+    # Sampled and drawn with the run's own options.
+    again = load_generator("mine", home=tmp_path).sample(asked.column("prompt"), images=asked.array("images"))
     assert drawn.column("seed") == sample_seeds(0, len(drawn)), "none was sampled again"
     np.testing.assert_array_equal(again, frames)
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from ctlev_core.diffusion.pretrained.checks import complete_schedule
@@ -259,4 +260,4 @@ def conditions_to_tensor(images: Any) -> torch.Tensor:
 
     Red first: a ControlNet that was trained on blue first says so in its config and exchanges them itself.
     """
-    return torch.from_numpy(images.astype("float32")).permute(0, 3, 1, 2).contiguous() / 255
+    return torch.from_numpy(np.asarray(images).astype("float32")).permute(0, 3, 1, 2).contiguous() / 255

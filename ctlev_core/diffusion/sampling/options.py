@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from ctlev_core.diffusion.compilation import Compile
 from data_contracts.config import RUN_SETTING, Frozen
 
 Scheduler = Literal["unipc", "dpmpp_2m", "dpmpp_3m", "dpmpp_sde", "deis", "sa_solver", "ddim", "ddpm"]
@@ -84,6 +85,12 @@ class SamplingOptions(Frozen):
         gt=0,
         json_schema_extra=RUN_SETTING,
         description="images in memory at a time; halved where memory runs out",
+    )
+    compile_networks: Compile = Field(
+        default="auto",
+        json_schema_extra=RUN_SETTING,
+        description="torch.compile; takes minutes before the first image. auto = on a GPU, from 5,000 batches times "
+        "steps",
     )
     device: str = Field(
         default="auto",

@@ -12,6 +12,7 @@ import functools
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core.diffusion.compilation import SAMPLING_PASSES, compiler_works, pays
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
@@ -36,7 +38,7 @@ from ctlev_core.diffusion.sampling.devices import device_names, run_on_devices, 
 from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from ctlev_core.diffusion.sampling.schedulers import make_scheduler as make_scheduler
-from ctlev_core.diffusion.sampling.shards import Shard, plan_shards
+from ctlev_core.diffusion.sampling.shards import SHARD, Shard, plan_shards
 from ctlev_core.diffusion.sampling.value_table import draw_values, nearest_values, read_value_table
 from ctlev_core.progress import ProgressBar
 from data_contracts.config import cache_material
@@ -202,6 +204,7 @@ def sample_shards(
     shards: list[Shard],
     options: SamplingOptions,
     report: Callable[[int], None],
+    compiled_rows: int = 0,
 ) -> None:
     """Sample shards and write them.
 
@@ -211,6 +214,7 @@ def sample_shards(
         shards: what is to be done.
         options: solver, steps, guidance, output levels.
         report: is called with the number of frames done since.
+        compiled_rows: size of a whole batch, where the networks are compiled for it.
     """
     if not shards:
         return
@@ -220,12 +224,23 @@ def sample_shards(
     for shard in shards:
         embeddings = table[[prompts.index(prompt) for prompt in shard.conditions.prompts]]
         sample = functools.partial(_sample_rows, base_model, shard, embeddings, table[-1:], options)
+        if compiled_rows:
+            sample = functools.partial(_compiled_if_whole, sample, batches, compiled_rows)
         parts = []
         for rows, latents in batches.map(sample, len(shard)):
             decode = functools.partial(_decode_rows, base_model, latents, options, shard.seeds[rows])
             parts += [frames for _, frames in decoded.map(decode, len(latents))]
             report(rows.stop - rows.start)
         shard.write(np.concatenate(parts))
+
+
+def _compiled_if_whole(
+    sample: Callable[[slice], Tensor], batches: ShrinkingBatches, compiled_rows: int, rows: slice
+) -> Tensor:
+    """Batches of other sizes, such as the last one, run uncompiled: to compile for each takes minutes."""
+    whole = rows.stop - rows.start == min(batches.size, compiled_rows)
+    with torch.compiler.set_stance("default" if whole else "force_eager"):
+        return sample(rows)
 
 
 def _sample_rows(
@@ -270,7 +285,9 @@ def sample_checkpoint(
     _check_seeds(conditions, seeds)
     shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
     with _progress(shards) as (missing, report):
-        function = functools.partial(_sample_share, checkpoint, options, with_controlnet, _prompts(conditions))
+        function = functools.partial(
+            _sample_share, checkpoint, options, with_controlnet, _prompts(conditions), len(conditions)
+        )
         num_threads = torch.get_num_threads()
         if len(devices) == 1:
             devices = spread_over_cores(devices[0], checkpoint, _num_whole(missing) // SHARDS_A_PROCESS)
@@ -297,17 +314,34 @@ def _sample_share(
     options: SamplingOptions,
     with_controlnet: bool,
     prompts: list[str],
+    num_rows: int,
     device: str,
     shards: list[Shard],
     report: Callable[[int], None],
 ) -> None:
-    """What the process of one device does."""
+    """What the process of one device does; `num_rows` are those of all shards, of other runs and processes too."""
     if not shards:
         return
     base_model = load_for_sampling(checkpoint, options, device, with_controlnet)
     for shard in shards:
         _check_conditions(base_model, shard.conditions, shard.seeds)
-    sample_shards(base_model, prompts, shards, options, report)
+    place, whole = base_model.unet.device, min(options.batch_size, SHARD, num_rows)
+    num_passes = math.ceil(num_rows / whole) * options.num_inference_steps
+    compiled = pays(options.compile_networks, place, num_passes, SAMPLING_PASSES) and compiler_works(place)
+    if compiled:
+        compile_for_sampling(base_model)
+    sample_shards(base_model, prompts, shards, options, report, whole if compiled else 0)
+
+
+def compile_for_sampling(base_model: PretrainedModel) -> None:
+    """Compile U-Net and ControlNet in place when they are first called; on a GPU with channels last.
+
+    Convolutions of half precision are faster so, and compiled networks leave out the copies that it costs elsewhere.
+    """
+    for network in filter(None, (base_model.unet, base_model.controlnet)):
+        if network.device.type == "cuda":
+            network.to(memory_format=torch.channels_last)
+        network.compile(dynamic=False)
 
 
 def load_for_sampling(

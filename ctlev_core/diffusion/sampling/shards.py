@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from data_contracts.arrays import load_array, save_compressed
+from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.labels import Conditions
 
 SHARD = 128
@@ -38,13 +40,12 @@ class Shard:
 
     def read(self) -> np.ndarray:
         """The frames [n, H, W, 3] uint8."""
-        return np.load(self.path, allow_pickle=False)
+        return load_array(self.path)[:]
 
     def write(self, frames: np.ndarray) -> None:
         """Write the frames so that the file is there whole or not at all."""
         temporary = self.path.with_suffix(f".{os.getpid()}.tmp")
-        with temporary.open("wb") as file:
-            np.save(file, frames, allow_pickle=False)
+        save_compressed(temporary, frames)
         os.replace(temporary, self.path)
 
 
@@ -62,7 +63,7 @@ def plan_shards(conditions: Conditions, seeds: Sequence[int], settings: str, wor
     for start in range(0, len(conditions), SHARD):
         rows = slice(start, start + SHARD)
         part, own = conditions.take(rows), [int(seed) for seed in seeds[rows]]
-        shards.append(Shard(work / f"shard_{_digest(settings, part, own)}.npy", part, own))
+        shards.append(Shard(work / f"shard_{_digest(settings, part, own)}{SUFFIX}", part, own))
     return shards
 
 

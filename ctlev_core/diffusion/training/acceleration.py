@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 import torch
 
+from ctlev_core.diffusion.compilation import TRAINING_PASSES, compiler_works, pays
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.training.options import TrainingOptions
-
-logger = logging.getLogger(__name__)
 
 
 def check_precision(options: TrainingOptions, device: torch.device) -> None:
@@ -36,7 +34,8 @@ def accelerated(denoiser: Denoiser, options: TrainingOptions, device: torch.devi
     names, so that saved states and checkpoints are those of plain networks.
     """
     networks = [network for network in (denoiser.unet, denoiser.controlnet) if network is not None]
-    compiled = options.compile_networks and compiler_works(device)
+    passes = options.num_steps * options.gradient_accumulation
+    compiled = pays(options.compile_networks, device, passes, TRAINING_PASSES) and compiler_works(device)
     attention = [network.attn_processors for network in networks]
     if options.precision == "bfloat16" and device.type == "cpu":
         from ctlev_core.diffusion.training.float32_attention import use_float32_attention
@@ -56,13 +55,3 @@ def accelerated(denoiser: Denoiser, options: TrainingOptions, device: torch.devi
             if options.gradient_checkpointing:
                 network.disable_gradient_checkpointing()
             network._compiled_call_impl = None
-
-
-def compiler_works(device: torch.device) -> bool:
-    """Compile one addition: cheaper than to find out within a training that there is no compiler."""
-    try:
-        torch.compile(lambda x: x + 1)(torch.zeros(4, device=device))
-    except Exception as error:  # whatever a missing or broken compiler raises, training can do without
-        logger.warning("torch.compile does not work here, training goes on uncompiled: %s", error)
-        return False
-    return True

@@ -77,6 +77,8 @@ def train_checkpoint(
     launched_so = os.environ.get("ACCELERATE_USE_FSDP", "false").lower() == "true"
     job["fsdp"] = count > 1 and (launched_so if options.fsdp is None else options.fsdp)
     if job["fsdp"]:
+        if options.compile_networks == "auto":
+            options = options.model_copy(update={"compile_networks": False})
         check_sharding(options)
     if count == 1:
         return _train(frames, conditions, options, job, SINGLE_PROCESS, choose_device(options.device), latents)

@@ -7,6 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from ctlev_core.diffusion.compilation import Compile
 from ctlev_core.pictures.image_moves import Moves
 from ctlev_core.pictures.labelled_pictures import PictureOptions
 from data_contracts.config import RUN_SETTING, Frozen
@@ -67,11 +68,11 @@ class TrainingOptions(Frozen):
         json_schema_extra=RUN_SETTING,
         description="compute activations again for the gradients in place of keeping them: less memory, a third slower",
     )
-    compile_networks: bool = Field(
-        default=False,
+    compile_networks: Compile = Field(
+        default="auto",
         json_schema_extra=RUN_SETTING,
         description="torch.compile; takes minutes before the first step, and a compiler: without one training goes on "
-        "uncompiled and says so",
+        "uncompiled and says so. auto = on a GPU, from 3,000 batches",
     )
     tensorboard: Path | None = Field(
         default=None,

@@ -99,13 +99,13 @@ def _training_section(frames: Manifest, conditions: Manifest) -> Section:
     chosen = _in_turns(conditions.column("class_name"))
     members = [rows[conditions.column("sample_id")[row]] for row in chosen]
     names = [frames.column("class_name")[row] or frames.column("subject")[row] for row in members]
-    images = np.asarray(conditions.array("images")[chosen]) if "images.npy" in conditions.files else None
+    images = np.asarray(conditions.array("images")[chosen]) if conditions.has_array("images") else None
     return training_grid(np.asarray(frames.array("frames")[members]), images, frames.labels.take(members), names)
 
 
 def _sampling_section(conditions: Manifest) -> Section:
     classes = conditions.column("class_name")
-    if "images.npy" not in conditions.files:
+    if not conditions.has_array("images"):
         prompts = sorted(set(zip(classes, conditions.column("prompt"), strict=True)))
         rows = [list(pair) for pair in prompts[:MAX_PROMPTS]]
         more = f" The first {MAX_PROMPTS} of {len(prompts)}." if len(prompts) > MAX_PROMPTS else ""

@@ -88,7 +88,7 @@ def colours_in_words(image: np.ndarray) -> str:
 
 
 def _condition(conditions: Manifest, row: int) -> np.ndarray | str:
-    if "images.npy" in conditions.files:
+    if conditions.has_array("images"):
         return np.asarray(conditions.array("images")[row])
     return f"“{conditions.column('prompt')[row]}”"
 
@@ -139,7 +139,7 @@ def sample_grid(
     names = synthetic.column("class_name")
     chosen = rows_of[evenly_by_class([names[row] for row in rows_of], GRID_COLUMNS)]
     rows: list[tuple[str, list[np.ndarray]]] = []
-    if "images.npy" in conditions.files:
+    if conditions.has_array("images"):
         asked = {name: row for row, name in enumerate(conditions.column("sample_id"))}
         members = [asked[synthetic.column("condition_id")[row]] for row in chosen]
         rows.append(("condition", [np.asarray(conditions.array("images")[row]) for row in members]))
@@ -149,7 +149,7 @@ def sample_grid(
         blank = np.full_like(synthetic.array("frames")[0], 128)
         caption += " Grey: no recorded frame shows that moment." if any(match is None for match in found) else ""
         rows.append(("recorded, same moment", [blank if match is None else match for match in found]))
-    elif "images.npy" not in conditions.files:
+    elif not conditions.has_array("images"):
         rows += _same_classes([names[row] for row in chosen], real)
     for name, frames in generated.items():
         rows.append((set_name(name), [np.asarray(frames.array("frames")[row]) for row in chosen if row < len(frames)]))
@@ -233,7 +233,7 @@ def real_grid(frames: Manifest, target: Manifest | None = None) -> ImageGrid:
 
 def motion(conditions: Manifest, synthetic: Manifest) -> list[Animation]:
     """Conditions beside the frames sampled for them, as they follow in time, where they do."""
-    if "images.npy" not in conditions.files:
+    if not conditions.has_array("images"):
         return []
     found = [run for run in runs(synthetic.column("source_id")) if len(run[1]) >= FEWEST_MOVING][:MAX_CLIPS]
     if not found:

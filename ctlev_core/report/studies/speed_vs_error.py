@@ -37,6 +37,7 @@ from ctlev_core.statistics.sampling_errors import (
     REFERENCE,
     WALL,
 )
+from data_contracts.array_rows import Images
 
 QUICK = (5, 10)
 """Evaluations of the network in which a quick setting is looked for."""
@@ -103,8 +104,8 @@ class SpeedPage:
     """
 
     rows: Sequence[Row]
-    pictures: Mapping[Point, np.ndarray]
-    reference_pictures: np.ndarray
+    pictures: Mapping[Point, Images]
+    reference_pictures: Images
     condition_pictures: np.ndarray | None
     reference_name: str
     converged_name: str

@@ -203,7 +203,7 @@ def test_gpu_benchmark_in_small(benchmarks, capsys):
         assert f"== {part}\n" in printed
     assert "sampling, 2 steps beside DDPM-4" in printed
     assert "training, controlnet, compile_networks=true" in printed
-    assert "sampling, channels_last and compiled, as an experiment, 2 steps" in printed
+    assert "sampling, compile_networks=true, 2 steps" in printed
 
 
 def test_gpu_benchmark_goes_on_after_a_part_that_failed(benchmarks, capsys, monkeypatch):

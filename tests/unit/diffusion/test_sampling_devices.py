@@ -81,7 +81,7 @@ def test_two_processes_make_the_frames_of_one(tmp_path, monkeypatch):
         )
 
     one = sample("cpu", "one")
-    shards = sorted(path.name for path in (tmp_path / "one").glob("shard_*.npy"))
+    shards = sorted(path.name for path in (tmp_path / "one").glob("shard_*.npy.zst"))
     assert len(shards) == 4
     # An earlier run with one device got as far as this; how many there were is no part of a shard's name.
     (tmp_path / "two").mkdir()

@@ -152,9 +152,9 @@ def test_shards_of_shared_noise_are_named_by_the_seed_that_counts(tmp_path):
     conditions, options = make_data(4, seed=4)[1], options_of(noise="shared")
     first = sample_frames(shared_base_model(), conditions, options, seeds=[3, 1, 4, 1], work=tmp_path)
     again = sample_frames(shared_base_model(), conditions, options, seeds=[3, 5, 9, 2], work=tmp_path)
-    assert np.array_equal(first, again) and len(list(tmp_path.glob("shard_*.npy"))) == 1
+    assert np.array_equal(first, again) and len(list(tmp_path.glob("shard_*.npy.zst"))) == 1
     other = sample_frames(shared_base_model(), conditions, options, seeds=[5, 1, 4, 1], work=tmp_path)
-    assert not np.array_equal(first, other) and len(list(tmp_path.glob("shard_*.npy"))) == 2
+    assert not np.array_equal(first, other) and len(list(tmp_path.glob("shard_*.npy.zst"))) == 2
 
 
 def event_images(side=64):

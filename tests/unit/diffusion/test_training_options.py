@@ -332,7 +332,7 @@ def test_training_goes_on_without_a_compiler(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(torch, "compile", no_compiler)
     with caplog.at_level(logging.WARNING):
         base_model, _ = tuned(tmp_path / "asked", OPTIONS.model_copy(update={"compile_networks": True}))
-    assert "training goes on uncompiled: no C++ compiler was found" in caplog.text
+    assert "networks run uncompiled: no C++ compiler was found" in caplog.text
     assert same(weights(plain), weights(base_model))
 
 

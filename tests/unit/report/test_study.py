@@ -433,7 +433,7 @@ def test_costs_are_those_of_the_operations():
     assert pose.training_s == pytest.approx(11719 * 512 * 2.27 / 790)
     assert text.sampling_s == pytest.approx(650_000 * (1000 * 0.803 + 2.515) / 790)
     assert pose.sampling_s == pytest.approx(5000 * (1000 * (0.803 + 0.283) + 2.515) / 790)
-    assert pose.frames_bytes == 5000 * 512 * 512 * 3
+    assert pose.frames_bytes == 5000 * 512 * 512 * 3 // 5
     assert estimate_costs(load_experiment("pose", [])) is None
 
 

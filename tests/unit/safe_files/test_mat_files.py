@@ -69,6 +69,7 @@ def test_large_ends_and_what_is_no_array_of_numbers(tmp_path):
         (written({"s": {"a": np.ones((4, 4))}})[:-20], "damaged: an element of"),
         (written({"s": {"a": np.ones((4, 4))}}, True)[:-9], "damaged: "),
     ],
+    ids=["empty", "HDF5", "an array", "another variable", "cut", "cut, compressed"],
 )
 def test_what_is_no_such_file_is_named(tmp_path, content, message):
     path = tmp_path / "a.mat"

@@ -127,7 +127,8 @@ def test_classes_that_take_turns_are_all_seen(num_classes):
 
 def test_frames_of_words_stand_beside_real_ones_of_their_class(experiment):
     class Words:
-        files = ()
+        def has_array(self, name):
+            return False
 
         def column(self, name):
             return {"class_name": ["x", "y", "x"], "source_id": ["w:0"] * 3, "split": ["test"] * 3}[name]
@@ -165,7 +166,8 @@ def test_moments_that_no_real_frame_shows_are_grey():
     }  # fmt: skip
 
     class Frames:
-        files = ()
+        def has_array(self, name):
+            return False
 
         def column(self, name):
             return columns[name]

@@ -16,6 +16,7 @@ from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.postprocessing.quality_filter import find_causes, fit_quality_filter, seed_of_attempt
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
+from data_contracts.arrays import save_compressed
 from data_contracts.config import SamplingChoice
 from data_contracts.file_lists import file_digest
 from data_contracts.labels import Conditions, Labels
@@ -169,8 +170,8 @@ def test_frames_written_block_by_block_are_those_written_at_once(tmp_path, input
     blocks = run(tmp_path, inputs, "blocks")
     assert max(whole.column("num_attempts")) > 1
     assert blocks.ref.digest == whole.ref.digest, "the table, and through it the array, byte by byte"
-    np.save(tmp_path / "saved.npy", np.asarray(whole.array("frames")))
-    assert file_digest(tmp_path / "saved.npy") == whole.files["frames.npy"]["sha256"], "as NumPy writes it"
+    save_compressed(tmp_path / "saved.npy.zst", np.asarray(whole.array("frames")))
+    assert file_digest(tmp_path / "saved.npy.zst") == whole.files["frames.npy.zst"]["sha256"], "as if written at once"
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, inputs, monkeypatch):

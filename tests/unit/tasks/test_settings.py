@@ -14,6 +14,7 @@ from ctlev_core.encodings import event_histogram
 from ctlev_core.plugins import PluginError
 from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
 from data_contracts import tables
+from data_contracts.compressed_arrays import CompressedArray
 from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
@@ -145,7 +146,7 @@ def test_a_share_is_the_first_rows(tmp_path):
         folder.mkdir()
         table = take_share.function(Output(folder, folder), synthetic, share=share)
         assert table.equals(synthetic.table[:expected])
-        np.testing.assert_array_equal(np.load(folder / "frames.npy"), synthetic.frames[:expected])
+        np.testing.assert_array_equal(CompressedArray(folder / "frames.npy.zst")[:], synthetic.frames[:expected])
 
 
 def recorded_frames(counts):
@@ -193,7 +194,7 @@ def test_recorded_frames_are_spread_over_subjects_classes_and_recordings(tmp_pat
     rows = np.array([int(name[1:]) for name in table["sample_id"].to_pylist()])
     assert (np.diff(rows) > 0).all()
     for name, array in arrays.items():
-        np.testing.assert_array_equal(np.load(tmp_path / f"{name}.npy"), array[rows])
+        np.testing.assert_array_equal(CompressedArray(tmp_path / f"{name}.npy.zst")[:], array[rows])
     again = take_recorded.function(Output(tmp_path, tmp_path), frames, count=count, seed=1)
     assert again.equals(table)
     other = take_recorded.function(Output(tmp_path, tmp_path), frames, count=count, seed=2)

@@ -147,7 +147,7 @@ def test_planning_computes_nothing_and_knows_every_key():
 
 DAMAGE = {
     "removed": shutil.rmtree,
-    "a file cut short": lambda folder: os.truncate(folder / "frames.npy", 10),
+    "a file cut short": lambda folder: os.truncate(folder / "frames.npy.zst", 10),
     "another manifest": lambda folder: os.truncate(folder / "manifest.parquet", 10),
 }
 
@@ -224,7 +224,7 @@ def test_who_waits_for_an_artefact_takes_no_process_from_others():
 
 def test_damaged_artefact_is_set_aside_and_made_anew(home):
     ref, _ = run(first, windows=Windows())
-    (ref.path / "frames.npy").write_bytes(b"short")
+    (ref.path / "frames.npy.zst").write_bytes(b"short")
     again, cached = run(first, windows=Windows())
     assert not cached and again.digest == ref.digest
     assert len(list((home / "damaged" / "first").iterdir())) == 1

@@ -63,7 +63,7 @@ def test_without_descriptors_nothing_is_set_aside(home):
     assert not (home / "damaged").exists() and run(first, windows=Windows()) == (ref, True)
 
 
-@pytest.mark.parametrize("name", ["run.json", "manifest.parquet", "frames.npy"])
+@pytest.mark.parametrize("name", ["run.json", "manifest.parquet", "frames.npy.zst"])
 @pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.ENOMEM, errno.EMFILE])
 def test_errors_that_pass_are_raised_and_nothing_moves(home, monkeypatch, capsys, name, number):
     ref, _ = run(first, windows=Windows())
@@ -89,7 +89,7 @@ def test_errors_that_pass_are_raised_and_nothing_moves(home, monkeypatch, capsys
 
 def test_planning_moves_nothing_and_the_run_makes_room(home):
     ref, _ = run(first, windows=Windows())
-    os.truncate(ref.path / "frames.npy", 10)
+    os.truncate(ref.path / "frames.npy.zst", 10)
     assert plan() == [False, False] and ref.path.exists() and not (home / "damaged").exists()
     again, cached = run(first, windows=Windows())
     assert not cached and again.digest == ref.digest and len(list((home / "damaged" / "first").iterdir())) == 1
@@ -103,7 +103,7 @@ def test_what_another_process_made_meanwhile_is_not_set_aside(home, monkeypatch)
     def find_damaged_first(self, *arguments, **options):
         seen.append(options.get("make_room", False))
         if len(seen) == 1:
-            frames = ref.path / "frames.npy"
+            frames = ref.path / "frames.npy.zst"
             whole = frames.read_bytes()
             frames.write_bytes(b"")
             try:
