@@ -189,7 +189,10 @@ def together(calls: Sequence[Callable[[], R]]) -> list[R]:
         errors = [error for future in done if (error := future.exception()) is not None]
         if errors:
             workers.close()
-            # One that only missed its process says less than the one that made it miss it.
+            # One that only missed its process says less than the one that made it miss it, which may take longer to
+            # arrive: calls within calls hand it on.
+            done, _ = wait(futures)
+            errors = [error for future in done if (error := future.exception()) is not None]
             raise min(errors, key=lambda error: isinstance(error, WorkerError))
         return [future.result() for future in futures]
 

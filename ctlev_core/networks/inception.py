@@ -102,7 +102,11 @@ class InceptionFeatures(nn.Module):
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Features [B, 2048]."""
-        x = _run(self, self.stem, (resize_as_tensorflow(images, INPUT_SIZE) - 128) / 128)
+        return self.of_resized(resize_as_tensorflow(images, INPUT_SIZE))
+
+    def of_resized(self, images: torch.Tensor) -> torch.Tensor:
+        """Features of images that have `INPUT_SIZE`."""
+        x = _run(self, self.stem, (images - 128) / 128)
         for name in _BLOCKS:
             x = self.get_submodule(name)(x)
         return x.mean(dim=(2, 3))
@@ -163,19 +167,19 @@ def _run(module: nn.Module, layers: Branch, x: torch.Tensor) -> torch.Tensor:
 
 def resize_as_tensorflow(images: torch.Tensor, size: int) -> torch.Tensor:
     """Images [B, C, H, W] to [B, C, size, size]: bilinear, output pixel i at i times input size / output size."""
-    rows, columns = (_weights(length, size, images) for length in images.shape[-2:])
+    rows, columns = (resize_weights(length, size).to(images) for length in images.shape[-2:])
     return rows @ images @ columns.T
 
 
-def _weights(inputs: int, outputs: int, like: torch.Tensor) -> torch.Tensor:
-    """[outputs, inputs]; each row has one number other than 0, or two that sum to 1."""
+def resize_weights(inputs: int, outputs: int) -> torch.Tensor:
+    """[outputs, inputs] float64; each row has one number other than 0, or two that sum to 1."""
     place = torch.arange(outputs, dtype=torch.float64) * (inputs / outputs)
     low = place.floor().long()
     share, row = place - low, torch.arange(outputs)
     weights = torch.zeros(outputs, inputs, dtype=torch.float64)
     weights[row, low] += 1 - share
     weights[row, (low + 1).clamp(max=inputs - 1)] += share
-    return weights.to(like)
+    return weights
 
 
 def load_inception(path: Path) -> InceptionFeatures:

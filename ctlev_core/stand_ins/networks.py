@@ -112,12 +112,10 @@ def write_inception(path: Path, size: Size, seed: int = 0) -> None:
 
     It was traced, and takes images of `IMAGE_SIZE` alone. The size `tiny` has two layers and 64 features.
     """
-    from ctlev_core.networks.inception import InceptionFeatures
-
     torch.manual_seed(seed)
-    network = InceptionFeatures() if size == "full" else _SmallFeatures()
-    network.eval().requires_grad_(False)
     side = IMAGE_SIZE[size]
+    network = _FixedSizeInception(side) if size == "full" else _SmallFeatures()
+    network.eval().requires_grad_(False)
     path.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # shapes are constant in what was traced, as they may be; and tracing is old
@@ -144,6 +142,20 @@ def _save(network: Any, folder: Path) -> None:
 
     network.config.save_pretrained(folder)  # without the progress bar of transformers' save_pretrained
     save_file(network.state_dict(), folder / WEIGHTS_NAME, metadata={"format": "pt"})
+
+
+class _FixedSizeInception(torch.nn.Module):
+    """Resizes by a weight matrix that it holds: one that is made while tracing would stay on the CPU for good."""
+
+    def __init__(self, side: int) -> None:
+        from ctlev_core.networks.inception import INPUT_SIZE, InceptionFeatures, resize_weights
+
+        super().__init__()
+        self.network = InceptionFeatures()
+        self.register_buffer("resize", resize_weights(side, INPUT_SIZE).float())
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return self.network.of_resized(self.resize @ images @ self.resize.T)
 
 
 class _SmallFeatures(torch.nn.Module):

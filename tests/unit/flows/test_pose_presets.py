@@ -98,7 +98,7 @@ def test_a_preset_prepares_its_dataset(write, preset, counts, num_joints, sample
     assert pictures.shape == (sum(counts.values()), 64, 64, 3) and all(picture.any() for picture in pictures)
     assert table.labels.joints2d is not None and table.labels.joints2d.shape[1:] == (num_joints, 2)
     assert np.isfinite(table.labels.joints2d).all()
-    assert of_frames.array("images").shape == (counts["train"], 64, 64, 3) and of_frames.array("images").any()
+    assert of_frames.array("images").shape == (counts["train"], 64, 64, 3) and of_frames.array("images")[:].any()
     assert set(of_samples.column("subject")) == sampled_from and len(of_samples) == 4
 
 
