@@ -13,11 +13,13 @@ from typing import Any
 from ctlev_core import plugins
 from data_contracts.experiment import Experiment
 
-FLOPS = {"bfloat16": 790e12, "float16": 790e12, "float32": 50e12}
-"""Operations a second by precision: what one H200 reaches at best; in float32 its tensor cores stand idle."""
+TRAINING_RATE = {"bfloat16": 168e12, "float16": 168e12, "float32": 50e12}
+SAMPLING_RATE = {"bfloat16": 230e12, "float16": 230e12, "float32": 50e12}
+"""Operations a second by precision: in bfloat16 as measured on one H200, 512 px, batches of 8, networks compiled
+(`benchmarks/RESULTS.md`); in float32, which was not measured, what it reaches at best."""
 HOW_ESTIMATED = (
-    "by calculation, at 790 TFLOP/s in bfloat16 and 50 in float32, what one H200 reaches at best; expect twice as many "
-    "hours or more:"
+    "by calculation, at the rates measured on one H200 in bfloat16: 168 TFLOP/s for training and 230 for sampling; in "
+    "float32 50, which is the best that can be:"
 )
 PIXELS = 3
 COMPRESSION = 5
@@ -37,10 +39,10 @@ class Costs:
 
     Attributes:
         images_trained: that training sees, repeated ones too.
-        training_s: seconds on one GPU at `FLOPS`.
+        training_s: seconds on one GPU at `TRAINING_RATE`.
         num_samples: frames.
         num_steps: of the sampler.
-        sampling_s: as `training_s`.
+        sampling_s: the same, at `SAMPLING_RATE`.
         frames_bytes: of the samples, as stored.
     """
 
@@ -78,12 +80,12 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
     samples = experiment.num_synthetic * experiment.num_generators
     return Costs(
         images_trained=images,
-        training_s=images * backward / FLOPS[options["precision"]],
+        training_s=images * backward / TRAINING_RATE[options["precision"]],
         num_samples=samples,
         num_steps=sampled["num_inference_steps"],
         sampling_s=samples
         * (evaluations * forward + operations("decoding", width, height))
-        / FLOPS[sampled["precision"]],
+        / SAMPLING_RATE[sampled["precision"]],
         frames_bytes=samples * width * height * PIXELS // COMPRESSION,
     )
 

@@ -29,7 +29,9 @@ LARGE = 400e6
 """Weights of a U-Net from which on the operations counted for Stable Diffusion's are taken."""
 ITEM_BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 EFFICIENCY = {"encoding": 0.85, "sampling": 0.7, "training": 0.45}
-"""Of the rate of a matrix product, what whole networks reach: on an AMD EPYC, float32, bfloat16 and bfloat16."""
+GPU_EFFICIENCY = {"encoding": 0.85, "sampling": 0.3, "training": 0.22}
+"""Of the rate of a matrix product, what whole networks reach: on an AMD EPYC in float32, bfloat16 and bfloat16, on an
+H200 in bfloat16 (`benchmarks/RESULTS.md`), where encoding was not measured."""
 DISK_BYTES_A_S = 500e6
 LATENT_CHANNELS, LATENT_SCALE = 4, 8
 PROCESS_BYTES = 0.7e9
@@ -105,7 +107,7 @@ def _encoding(options: LatentOptions, rows: float, size: tuple[int, int]) -> Net
     latents = 2 * LATENT_CHANNELS * pixels / LATENT_SCALE**2 * 4
     return NetworkCost(
         {"float32": rows * options.num_turns * operations("encoding", *size)},
-        EFFICIENCY["encoding"],
+        _efficiency("encoding", num_gpus(options.device)),
         1,
         4 * weights["vae"],
         _memory(4 * weights["vae"], batch * _ENCODING * pixels / _SQUARE, num_gpus(options.device)),
@@ -129,7 +131,7 @@ def _fine_tuning(options: FineTuningOptions, weights: Mapping[str, int], size: t
     peak = moments + (backward if options.num_steps > 1 else 0)
     return NetworkCost(
         {options.precision: images * each},
-        EFFICIENCY["training"],
+        _efficiency("training", gpus),
         min(processes, gpus) or 1,
         4 * everything + 4 * trained + moments + averages + 4 * everything,
         processes * _memory(4 * everything, 4 * trained + averages + max(peak, backward), gpus),
@@ -144,12 +146,16 @@ def _sampling(options: SamplingOptions, weights: Mapping[str, int], rows: float,
     batch, gpus = min(rows, options.batch_size), num_gpus(options.device)
     return NetworkCost(
         {options.precision: rows * (evaluations * forward + operations("decoding", *size))},
-        EFFICIENCY["sampling"],
+        _efficiency("sampling", gpus),
         max(gpus if options.device == "all" else 1, 1),
         4 * everything,
         _memory(item * everything, batch * max(_DECODING * item / 2, _FORWARD) * pixels / _SQUARE, gpus),
         rows * pixels * 3,
     )
+
+
+def _efficiency(work: str, gpus: int) -> float:
+    return (GPU_EFFICIENCY if gpus else EFFICIENCY)[work]
 
 
 def _memory(weights: float, others: float, gpus: int) -> float:
