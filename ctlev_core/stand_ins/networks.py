@@ -147,6 +147,8 @@ def _save(network: Any, folder: Path) -> None:
 class _FixedSizeInception(torch.nn.Module):
     """Resizes by a weight matrix that it holds: one that is made while tracing would stay on the CPU for good."""
 
+    resize: torch.Tensor
+
     def __init__(self, side: int) -> None:
         from ctlev_core.networks.inception import INPUT_SIZE, InceptionFeatures, resize_weights
 
