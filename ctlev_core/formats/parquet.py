@@ -47,7 +47,9 @@ def read(path: Path) -> Events:
         DataError: a cut or corrupt file, other columns, nulls, no sensor size, or events that break `check_events`.
     """
     with _open(path) as (file, sensor_size):
-        return check_events(_to_events(file.read(), sensor_size, path), str(path))
+        table = file.read()
+        _check_count(len(table), file.metadata.num_rows, path)
+        return check_events(_to_events(table, sensor_size, path), str(path))
 
 
 def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
@@ -64,11 +66,7 @@ def read_chunks(path: Path, num_events: int) -> Iterator[Events]:
             for batch in file.iter_batches(min(num_events, _BATCH), use_threads=False):
                 num_read += len(batch)
                 yield _to_events(batch, sensor_size, path)
-            # A column that is damaged ends the batches early and says nothing.
-            if num_read != file.metadata.num_rows:
-                raise DataError(
-                    f"{path}: not a complete Parquet file: {num_read} rows, expected {file.metadata.num_rows}"
-                )
+            _check_count(num_read, file.metadata.num_rows, path)
 
         yield from event_chunks.regroup(event_chunks.check_chunks(chunks(), str(path)), num_events)
 
@@ -88,7 +86,9 @@ def read_range(path: Path, start: int, stop: int) -> Events:
         if start == stop:
             return event_chunks.empty_events(sensor_size)
         first = int(ends[groups[0] - 1]) if groups[0] else 0
-        events = _to_events(file.read_row_groups(list(groups), use_threads=False), sensor_size, path)
+        table = file.read_row_groups(list(groups), use_threads=False)
+        _check_count(len(table), int(ends[groups[-1]]) - first, path)
+        events = _to_events(table, sensor_size, path)
         where = f"{path} (events counted from event {first})"
         return check_events(events, where).slice(start - first, stop - first)
 
@@ -112,11 +112,20 @@ def _open(path: Path) -> Iterator[tuple[pq.ParquetFile, SensorSize]]:
             sensor_size = parse_sensor_size(text)
             if sensor_size is None:
                 raise DataError(f"{path}: expected the metadata sensor_size as WIDTHxHEIGHT, got {text!r}")
+            metadata = file.metadata
+            in_groups = sum(metadata.row_group(group).num_rows for group in range(metadata.num_row_groups))
+            _check_count(in_groups, metadata.num_rows, path)
             yield file, sensor_size
     except DataError:
         raise
     except (pa.ArrowException, OSError, ValueError, OverflowError) as error:
         raise DataError(f"{path}: not a complete Parquet file: {error}") from error
+
+
+def _check_count(num_read: int, expected: int, path: Path) -> None:
+    """Raise `DataError` where rows are missing: a damaged column ends what is read early and says nothing."""
+    if num_read != expected:
+        raise DataError(f"{path}: not a complete Parquet file: {num_read} rows, expected {expected}")
 
 
 def _to_events(table: pa.Table | pa.RecordBatch, sensor_size: SensorSize, path: Path) -> Events:

@@ -231,6 +231,30 @@ def test_a_cut_parquet_file_is_an_error(tmp_path):
         event_files.read_events_file(path)
 
 
+def test_a_parquet_file_that_promises_more_rows_than_it_has(tmp_path):
+    # As found by fuzzing: Arrow reads what there is and says nothing.
+    path = tmp_path / "a.parquet"
+    parquet = plugins.load("formats", "parquet")
+    parquet.write(path, make_events([(t, 2, 3, t % 2) for t in range(5)]))
+    content = path.read_bytes()
+    footer = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+    stated = bytes([0x16, 2 * 5])  # Thrift's compact protocol: an i64 field, and the number in zigzag
+    places = [place for place in range(footer, len(content)) if content.startswith(stated, place)]
+    assert len(places) == 6  # of the file, of its row group, of its four columns
+    refused = 0
+    for place in places:
+        path.write_bytes(content[: place + 1] + bytes([2 * 34]) + content[place + 2 :])
+        metadata = pq.ParquetFile(path).metadata
+        if {metadata.num_rows, metadata.row_group(0).num_rows} == {5}:
+            continue  # a column's number is not looked at
+        reads = (lambda: parquet.read(path), lambda: list(parquet.read_chunks(path, 3)))
+        for read in (*reads, lambda: parquet.read_range(path, 0, 2)):
+            with pytest.raises(DataError, match=r"a\.parquet: not a complete Parquet file: .* rows, expected"):
+                read()
+        refused += 1
+    assert refused == 2
+
+
 def test_parquet_in_a_folder_named_like_a_partition_has_no_extra_column(tmp_path):
     path = tmp_path / "class=person" / "a.parquet"
     path.parent.mkdir()
