@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("--contents", type=int, default=1_000, help="recordings that differ")
     parser.add_argument("--folder", type=Path, help="where the files are made; without, where temporary files are")
     parser.add_argument("--no-kill", action="store_true", help="ingest in one go")
+    parser.add_argument("--json", action="store_true", help="all that was found, as the last line")
     parser.add_argument("--step", choices=STEPS, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.step:
@@ -72,16 +73,19 @@ def main() -> None:
         )
         print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, CTLEV_WORKERS={os.environ.get('CTLEV_WORKERS')}")
         print(f"{'':8}{'clock s':>9}{'CPU s':>9}{'us each':>9}{'peak MiB':>10}")
+        all_found: dict[str, dict[str, Any]] = {}
         for step in STEPS:
             if step == "killed" and chosen.no_kill:
                 continue
-            found = in_process(step, folder, chosen.recordings)
+            found = all_found[step] = in_process(step, folder, chosen.recordings)
             each = 1e6 * found["cpu_s"] / (RANDOM_READS if step == "random" else chosen.recordings)
             print(
                 f"{step:8}{found['wall_s']:9.1f}{found['cpu_s']:9.1f}{each:9.0f}{found['peak_mib']:10.0f}  "
                 + found.get("note", ""),
                 flush=True,
             )
+        if chosen.json:
+            print(json.dumps(all_found))
 
 
 def write_recordings(root: Path, count: int, num_events: int, num_contents: int) -> None:
@@ -186,7 +190,7 @@ def do_killed(folder: Path) -> dict[str, Any]:
 
 def do_ingest(folder: Path) -> dict[str, Any]:
     """Ingest, and count what there is then."""
-    return {"note": keep(folder, "recordings", run_stage(ingest, dataset=dataset_of(folder)))}
+    return keep(folder, "recordings", run_stage(ingest, dataset=dataset_of(folder)))
 
 
 def do_encode(folder: Path) -> dict[str, Any]:
@@ -194,7 +198,7 @@ def do_encode(folder: Path) -> dict[str, Any]:
     encoding = EncodingChoice(name="event_histogram", options={"image_size": (64, 64), "resampling": "events"})
     recordings = kept(folder, "recordings")
     made = run_stage(encode, recordings=recordings, encoding=encoding, windows=Windows(method="whole"))
-    return {"note": keep(folder, "frames", made)}
+    return keep(folder, "frames", made)
 
 
 def do_verify(folder: Path) -> dict[str, Any]:
@@ -215,12 +219,13 @@ def do_random(folder: Path) -> dict[str, Any]:
     return {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
 
 
-def keep(folder: Path, name: str, made: ManifestRef) -> str:
+def keep(folder: Path, name: str, made: ManifestRef) -> dict[str, Any]:
     """Remember an artefact for the next step; what it takes on the disk."""
     (folder / f"{name}.json").write_text(made.model_dump_json(), encoding="utf-8")
     files = [path for path in made.path.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files)
-    return f"{made.rows} rows, {len(files)} files, {size / 1e6:.1f} MB"
+    note = f"{made.rows} rows, {len(files)} files, {size / 1e6:.1f} MB"
+    return {"note": note, "rows": made.rows, "files": len(files), "bytes": size, "digest": made.digest}
 
 
 def kept(folder: Path, name: str) -> ManifestRef:

@@ -36,7 +36,7 @@ HELD_BYTES = 1 << 23
 MAX_GROUP = 4
 """Recordings that travel together; up to two such groups a worker wait, so that 16 workers hold 1 GiB at most."""
 BLOCK, NUM_BLOCKS = 256, 4
-"""Recordings that are looked up at a time, and how many such blocks are kept: those that wait, and those that travel."""
+"""Recordings that are looked up at a time, and how many such blocks are kept."""
 TABLE_ROWS = 1 << 13
 """Rows that wait as Python's records."""
 
