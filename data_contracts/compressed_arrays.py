@@ -22,6 +22,7 @@ import struct
 import threading
 import weakref
 import zlib
+from array import array
 from collections import OrderedDict
 from pathlib import Path
 from types import TracebackType
@@ -71,8 +72,8 @@ class CompressedArrayWriter:
         self._step = 1
         self._waiting: list[np.ndarray] = []
         """Rows of the chunk that is not full yet."""
-        self._sizes: list[tuple[int, int]] = []
-        self._checks: list[int] = []
+        # Of 32 bits: an array of millions of rows has as many chunks.
+        self._sizes, self._checks = array("I"), array("I")
         self.rows = 0
 
     def append(self, rows: np.ndarray) -> None:
@@ -136,7 +137,7 @@ class CompressedArrayWriter:
     def _write(self, frame: bytes, size: int) -> None:
         assert self._file is not None
         self._file.write(frame)
-        self._sizes.append((len(frame), size))
+        self._sizes.extend((len(frame), size))
         self._checks.append(zlib.crc32(frame))
 
     def _finish(self) -> None:
@@ -144,12 +145,13 @@ class CompressedArrayWriter:
         if self._waiting:
             self._write_chunk()
         header = self._header()
-        self._sizes[0], self._checks[0] = (len(header), len(header) - _FRAME.size - 3), zlib.crc32(header)
+        self._sizes[0], self._sizes[1] = len(header), len(header) - _FRAME.size - 3
+        self._checks[0] = zlib.crc32(header)
         checks = _CHECKS.pack(_CHECKS_NAME, _has_planes(*self._row)) + np.array(self._checks, "<u4").tobytes()
         checks += zlib.crc32(checks).to_bytes(4, "little")
         self._write(_SKIPPED.pack(_CHECKS_MAGIC, len(checks)) + checks, 0)
         table = np.array(self._sizes, "<u4").tobytes()
-        table += _TABLE_END.pack(len(self._sizes), 0, _SEEKABLE_MAGIC)
+        table += _TABLE_END.pack(len(self._checks), 0, _SEEKABLE_MAGIC)
         self._file.write(_SKIPPED.pack(_TABLE_MAGIC, len(table)) + table)
         self._file.seek(0)
         self._file.write(header)

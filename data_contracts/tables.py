@@ -74,7 +74,7 @@ _LABELS = (
 
 RECORDINGS = TableSchema(
     "recordings",
-    2,
+    3,
     "recording_id",
     (
         _RECORDING,
@@ -92,7 +92,14 @@ RECORDINGS = TableSchema(
         Column(
             "num_windows", pa.int64(), "windows its authors cut; missing where that is left to the user", nullable=True
         ),
-        Column("events_file", pa.string(), "Parquet file of the events; empty without events"),
+        Column("events_file", pa.string(), "file of the events; empty without events"),
+        Column(
+            "events_batch",
+            pa.int32(),
+            "its record batch in a file that recordings share; missing where it has its own",
+            minimum=0,
+            nullable=True,
+        ),
         Column("event_images_file", pa.string(), "array of released event images; empty without"),
         Column("intensity_file", pa.string(), "array of grey pictures; empty without. Times lie beside: NAME.t_us.npy"),
     ),

@@ -1,27 +1,33 @@
 """Events to windows, windows to event histograms and images, label tracks to one label a window."""
 
+# pyarrow.compute makes its functions when it is imported, where a type checker cannot see them.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from ctlev_core import plugins
 from ctlev_core.events.image_grid import ImageFit
 from ctlev_core.progress import ProgressBar
 from ctlev_core.recordings.encoding import EncodedWindows, RecordingPart, RecordingSource, encode_recording
+from ctlev_core.recordings.stored_events import stored_events
 from data_contracts import tables
 from data_contracts.arrays import load_array, save_compressed
 from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
-from data_contracts.manifest import Manifest, by_recording, concat_labels, label_columns, labels_of
+from data_contracts.manifest import LabelKinds, Manifest, concat_labels, label_columns, labels_of, rows_by_recording
+from data_contracts.tables import TableSchema
 from tasks.stage import Output, stage
 from tasks.workers import is_spread, map_shards
 
@@ -29,6 +35,10 @@ HELD_BYTES = 1 << 23
 """Images of a recording that wait in memory until their turn comes; four frames of 512 x 512 px fit."""
 MAX_GROUP = 4
 """Recordings that travel together; up to two such groups a worker wait, so that 16 workers hold 1 GiB at most."""
+BLOCK, NUM_BLOCKS = 256, 4
+"""Recordings that are looked up at a time, and how many such blocks are kept."""
+TABLE_ROWS = 1 << 13
+"""Rows that wait as Python's records."""
 
 logger = logging.getLogger(__name__)
 
@@ -41,10 +51,9 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
     in the upper left corner of an array that is as large as the largest, with zeros beyond. Of event images that come
     finished every one is a window, and its grey values stand for counts.
     """
-    sources = _sources(recordings, windows)
+    sources = _Sources(recordings, windows)
     canvas = _canvas(sources, encoding)
-    rows: list[dict[str, Any]] = []
-    labels: list[Labels] = []
+    made = _FrameTable()
     with out.open_array("histograms") as histograms, out.open_array("frames") as frames:
         encoded = _encode_spread if is_spread(len(sources)) else _encode_in_turn
         for source, cut in encoded(sources, encoding, windows, out.work):
@@ -57,42 +66,66 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
                     f"encode: sensors differ in size, {source.recording_id} does; set encoding.options.image_size "
                     f"({error})"
                 ) from error
-            rows += _rows(source, cut)
-            labels.append(cut.labels)
+            made.append(source, cut)
+    table = made.finish()
+    splits = set(pc.unique(table["split"]).to_pylist()) if len(table) else set()
     for split in ("train", "test"):
-        if not any(row["split"] == split for row in rows):
+        if split not in splits:
             raise DataError(f"encode: no window in split {split!r}; the recordings are too short for {windows!r}")
-    stacked = concat_labels(labels)
-    _check_classes(sources, rows, stacked.class_names, windows)
-    table = pa.Table.from_pylist(rows).append_column("class_name", pa.array(stacked.class_names, pa.string()))
-    for name, column in label_columns(stacked).items():
-        table = table.append_column(name, column)
+    _check_classes(recordings, table, windows)
     return table
 
 
-def _rows(source: RecordingSource, cut: EncodedWindows) -> list[dict[str, Any]]:
-    times = (array.tolist() for array in (cut.numbers, cut.t_start_us, cut.t_end_us, cut.num_events))
-    return [
-        {
-            "sample_id": f"{source.recording_id}:{cut.split}:{number:05d}",
-            "recording_id": source.recording_id,
-            "subject": source.subject,
-            "split": cut.split,
-            "t_start_us": start_us,
-            "t_end_us": end_us,
-            "num_events": count,
-        }
-        for number, start_us, end_us, count in zip(*times, strict=True)
-    ]
+class _FrameTable:
+    """The table of frames, gathered window by window: as Arrow's columns, which take a tenth of Python's records."""
+
+    def __init__(self) -> None:
+        self._tables: list[pa.Table] = []
+        self._rows: list[dict[str, Any]] = []
+        self._labels: list[Labels] = []
+        self._kinds = LabelKinds()
+
+    def append(self, source: RecordingSource, cut: EncodedWindows) -> None:
+        """Rows of some windows of a recording."""
+        times = (array.tolist() for array in (cut.numbers, cut.t_start_us, cut.t_end_us, cut.num_events))
+        self._rows += [
+            {
+                "sample_id": f"{source.recording_id}:{cut.split}:{number:05d}",
+                "recording_id": source.recording_id,
+                "subject": source.subject,
+                "split": cut.split,
+                "t_start_us": start_us,
+                "t_end_us": end_us,
+                "num_events": count,
+            }
+            for number, start_us, end_us, count in zip(*times, strict=True)
+        ]
+        self._labels.append(cut.labels)
+        if len(self._rows) >= TABLE_ROWS:
+            self._flush()
+
+    def _flush(self) -> None:
+        stacked = concat_labels(self._labels)
+        table = pa.Table.from_pylist(self._rows).append_column("class_name", pa.array(stacked.class_names, pa.string()))
+        for name, column in label_columns(stacked).items():
+            table = table.append_column(name, column)
+        self._tables.append(self._kinds.check(table))
+        self._rows, self._labels = [], []
+
+    def finish(self) -> pa.Table:
+        """All rows; without any, a table of no windows."""
+        if self._rows:
+            self._flush()
+        return pa.concat_tables(self._tables) if self._tables else tables.FRAMES.arrow().empty_table()
 
 
-def _canvas(sources: list[RecordingSource], encoding: EncodingChoice) -> tuple[int, int] | None:
+def _canvas(sources: _Sources, encoding: EncodingChoice) -> tuple[int, int] | None:
     """(height, width) px that the counts of every sensor fit into; None where counts have the size of the image."""
     options = plugins.load_options(encoding).options
-    if not isinstance(options, ImageFit) or options.resampling != "area":
+    if not isinstance(options, ImageFit) or options.resampling != "area" or not len(sources):
         return None
-    sizes = [source.sensor_size for source in sources]
-    return (max(height for _, height in sizes), max(width for width, _ in sizes)) if sizes else None
+    height, width = (pc.max(sources.table[f"sensor_{side}_px"]).as_py() for side in ("height", "width"))
+    return height, width
 
 
 def _on_canvas(histograms: np.ndarray, canvas: tuple[int, int] | None) -> Iterator[np.ndarray]:
@@ -106,16 +139,14 @@ def _on_canvas(histograms: np.ndarray, canvas: tuple[int, int] | None) -> Iterat
         yield np.pad(histograms[row : row + 1], beyond)
 
 
-def _check_classes(
-    sources: list[RecordingSource], rows: list[dict[str, Any]], class_names: Sequence[str], windows: Windows
-) -> None:
+def _check_classes(recordings: Manifest, table: pa.Table, windows: Windows) -> None:
     """Say where a class was recorded and none of it is left: what follows does not know that there is such a class."""
-    left = {(row["split"], name) for row, name in zip(rows, class_names, strict=True)}
+    left = {(row["split"], row["class_name"]) for row in _different(table.select(["split", "class_name"]))}
     recorded = {
-        (part.split, source.class_name)
-        for source in sources
-        for part in source.parts
-        if source.class_name and part.split in ("train", "test")
+        (split, row["class_name"])
+        for row in _different(_visible(recordings).select(["splits", "class_name"]))
+        for split in row["splits"].split("+")
+        if row["class_name"] and split in ("train", "test")
     }
     for split, name in sorted(recorded - left):
         logger.warning(
@@ -124,8 +155,13 @@ def _check_classes(
         )  # fmt: skip
 
 
+def _different(table: pa.Table) -> list[dict[str, Any]]:
+    """The rows of a table, each once."""
+    return table.group_by(table.column_names).aggregate([]).to_pylist()
+
+
 def _encode_in_turn(
-    sources: list[RecordingSource], encoding: EncodingChoice, windows: Windows, work: Path
+    sources: _Sources, encoding: EncodingChoice, windows: Windows, work: Path
 ) -> Iterator[tuple[RecordingSource, EncodedWindows]]:
     """Some windows at a time, each handed on before the next are read."""
     plugin = plugins.load_options(encoding)
@@ -135,10 +171,10 @@ def _encode_in_turn(
 
 
 def _encode_spread(
-    sources: list[RecordingSource], encoding: EncodingChoice, windows: Windows, work: Path
+    sources: _Sources, encoding: EncodingChoice, windows: Windows, work: Path
 ) -> Iterator[tuple[RecordingSource, EncodedWindows]]:
     """The same, several recordings at a time."""
-    found = map_shards(partial(_encode_shard, encoding, windows, work), list(enumerate(sources)), max_group=MAX_GROUP)
+    found = map_shards(partial(_encode_shard, encoding, windows, work), _Numbered(sources), max_group=MAX_GROUP)
     found = ProgressBar(found, "encode", len(sources), unit="recording")
     for source, chunks in zip(sources, found, strict=True):
         for cut in chunks:
@@ -179,42 +215,119 @@ def _encode_shard(
     return chunks
 
 
-def _sources(recordings: Manifest, windows: Windows) -> list[RecordingSource]:
-    """Every recording that something can be seen of, with its rows of the attached tables."""
-    parts = by_recording(recordings.attached(tables.PARTS))
-    tracks = by_recording(recordings.attached(tables.LABELS))
-    own = windows.method == "dataset"
-    ranges = by_recording(recordings.attached(tables.WINDOWS)) if own else {}
-    window_labels = by_recording(recordings.attached(tables.WINDOW_LABELS)) if own else {}
-    found = []
-    for row in recordings.table.to_pylist():
-        name = row["recording_id"]
-        if not row["events_file"] and not row["event_images_file"]:
-            continue
-        dataset_windows = None
-        if own and row["events_file"]:
-            if row["num_windows"] is None:
+def _visible(recordings: Manifest) -> pa.Table:
+    """The rows of recordings that something can be seen of."""
+    table = recordings.table
+    return table.filter(pc.or_(pc.not_equal(table["events_file"], ""), pc.not_equal(table["event_images_file"], "")))
+
+
+class _Sources(Sequence[RecordingSource]):
+    """Every recording that something can be seen of, with its rows of the attached tables.
+
+    They are put together when they are asked for, `BLOCK` at a time: a million would take gigabytes.
+
+    Attributes:
+        table: a row for each.
+    """
+
+    def __init__(self, recordings: Manifest, windows: Windows) -> None:
+        own = windows.method == "dataset"
+        self.table = _visible(recordings)
+        self._recordings, self._own_windows = recordings, own
+        schemas = (tables.PARTS, tables.LABELS, *((tables.WINDOWS, tables.WINDOW_LABELS) if own else ()))
+        self._attached = {schema.name: recordings.attached(schema) for schema in schemas}
+        names = self.table["recording_id"]
+        self._ranges = {name: rows_by_recording(table, names) for name, table in self._attached.items()}
+        self._block = lru_cache(maxsize=NUM_BLOCKS)(self._make_block)
+        if own:
+            missing = pc.and_(pc.not_equal(self.table["events_file"], ""), pc.is_null(self.table["num_windows"]))
+            first = pc.index(missing, True).as_py()
+            if first >= 0:
                 raise DataError(
-                    f"windows.method 'dataset': {name} comes without windows of its own; "
+                    f"windows.method 'dataset': {names[first].as_py()} comes without windows of its own; "
                     "choose count, duration or whole"
                 )
-            table = ranges.get(name, tables.WINDOWS.arrow().empty_table())
-            dataset_windows = np.stack([table["event_start"].to_numpy(), table["event_stop"].to_numpy()], axis=1)
-        found.append(
-            RecordingSource(
-                recording_id=name,
-                subject=row["subject"],
-                class_name=row["class_name"],
-                sensor_size=(row["sensor_width_px"], row["sensor_height_px"]),
-                file=recordings.path(row["events_file"] or row["event_images_file"]),
-                has_events=bool(row["events_file"]),
-                parts=tuple(
-                    RecordingPart(part["split"], part["event_start"], part["event_stop"])
-                    for part in parts[name].to_pylist()
-                ),
-                track=labels_of(tracks[name]),
-                windows=dataset_windows,
-                window_labels=labels_of(window_labels[name]) if name in window_labels else None,
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @overload
+    def __getitem__(self, index: int) -> RecordingSource: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[RecordingSource]: ...
+
+    def __getitem__(self, index: int | slice) -> RecordingSource | list[RecordingSource]:
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        number = range(len(self))[index]  # which raises where there is none, as iteration expects
+        return self._block(number // BLOCK)[number % BLOCK]
+
+    def _make_block(self, block: int) -> list[RecordingSource]:
+        start = block * BLOCK
+        parts, first_part = self._rows(tables.PARTS, start)
+        tracks, first_label = self._rows(tables.LABELS, start)
+        parts, tracks = parts.to_pylist(), labels_of(tracks)
+        windows, window_labels, first_window, first_window_label = np.zeros((0, 2), np.int64), None, 0, 0
+        if self._own_windows:
+            cut, first_window = self._rows(tables.WINDOWS, start)
+            windows = np.stack([cut["event_start"].to_numpy(), cut["event_stop"].to_numpy()], axis=1)
+            labels, first_window_label = self._rows(tables.WINDOW_LABELS, start)
+            window_labels = labels_of(labels) if len(labels) else None
+
+        found = []
+        for number, row in enumerate(self.table.slice(start, BLOCK).to_pylist(), start):
+            a, b = self._range(tables.PARTS, number, first_part)
+            own = self._own_windows and bool(row["events_file"])
+            c, d = self._range(tables.WINDOWS, number, first_window) if own else (0, 0)
+            e, f = self._range(tables.WINDOW_LABELS, number, first_window_label) if self._own_windows else (0, 0)
+            has_events = bool(row["events_file"])
+            found.append(
+                RecordingSource(
+                    recording_id=row["recording_id"],
+                    subject=row["subject"],
+                    class_name=row["class_name"],
+                    sensor_size=(row["sensor_width_px"], row["sensor_height_px"]),
+                    events=stored_events(self._recordings, row) if has_events else None,
+                    event_images=None if has_events else self._recordings.path(row["event_images_file"]),
+                    parts=tuple(
+                        RecordingPart(part["split"], part["event_start"], part["event_stop"]) for part in parts[a:b]
+                    ),
+                    track=tracks.take(np.arange(*self._range(tables.LABELS, number, first_label))),
+                    windows=windows[c:d] if own else None,
+                    window_labels=window_labels.take(np.arange(e, f)) if window_labels is not None and f > e else None,
+                )
             )
-        )
-    return found
+        return found
+
+    def _rows(self, schema: TableSchema, start: int) -> tuple[pa.Table, int]:
+        """The rows of an attached table that are of the recordings of a block, and the number of the first."""
+        ranges = self._ranges[schema.name][start : start + BLOCK]
+        ranges = ranges[ranges[:, 1] > ranges[:, 0]]
+        first, last = (int(ranges[:, 0].min()), int(ranges[:, 1].max())) if len(ranges) else (0, 0)
+        return self._attached[schema.name].slice(first, last - first), first
+
+    def _range(self, schema: TableSchema, number: int, first: int) -> tuple[int, int]:
+        start, stop = self._ranges[schema.name][number].tolist()
+        return (start - first, stop - first) if stop > start else (0, 0)
+
+
+class _Numbered(Sequence[tuple[int, RecordingSource]]):
+    """The recordings with their numbers, as `enumerate` without a list of all."""
+
+    def __init__(self, sources: _Sources) -> None:
+        self._sources = sources
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    @overload
+    def __getitem__(self, index: int) -> tuple[int, RecordingSource]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[tuple[int, RecordingSource]]: ...
+
+    def __getitem__(self, index: int | slice) -> tuple[int, RecordingSource] | list[tuple[int, RecordingSource]]:
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        return index, self._sources[index]

@@ -20,6 +20,7 @@ from ctlev_core.plugin_contracts import FormatWithWriter
 from ctlev_core.postprocessing.event_streams import TimeModel, fit_times, sample_streams
 from ctlev_core.postprocessing.image_counts import CountModel, estimate_counts, fit_counts
 from ctlev_core.progress import ProgressBar
+from ctlev_core.recordings.stored_events import StoredEvents, stored_events
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
@@ -122,32 +123,33 @@ def _in_image(events: Events, options: Any) -> Events:
 
 def _windows(rows: list[dict[str, Any]], recordings: Manifest) -> Iterator[Events]:
     """The events of each row; at its ends also those others that have the same time stamp."""
-    files = dict(zip(recordings.column("recording_id"), recordings.column("events_file"), strict=True))
+    wanted = {row["recording_id"] for row in rows}
+    known = {row["recording_id"]: row for row in recordings.table.to_pylist() if row["recording_id"] in wanted}
     parts = recordings.attached(tables.PARTS).to_pylist()
     for row in rows:
-        path = recordings.path(files[row["recording_id"]])
+        stored = stored_events(recordings, known[row["recording_id"]])
         start_us, end_us = row["t_start_us"], row["t_end_us"]
         found = []
         for part in parts:
             if part["recording_id"] == row["recording_id"] and part["split"] == row["split"]:
-                found += _events_between(path, part["event_start"], part["event_stop"], start_us, end_us)
+                found += _events_between(stored, part["event_start"], part["event_stop"], start_us, end_us)
         if found:
             yield event_chunks.concatenate(found)
 
 
-def _events_between(path: Path, start: int, stop: int, start_us: int, end_us: int) -> list[Events]:
-    """Events of a stretch of a file from one time to another, both included, in chunks."""
+def _events_between(stored: StoredEvents, start: int, stop: int, start_us: int, end_us: int) -> list[Events]:
+    """Events of a stretch of a recording from one time to another, both included, in chunks."""
     # By halves, so that a window of a long recording costs a few reads of single events.
     low, high = start, stop
     while low < high:
         middle = (low + high) // 2
-        if event_files.read_events_range(path, middle, middle + 1).t[0] < start_us:
+        if stored.read(middle, middle + 1).t[0] < start_us:
             low = middle + 1
         else:
             high = middle
     found = []
     while low < stop:
-        chunk = event_files.read_events_range(path, low, min(low + READ_EVENTS, stop))
+        chunk = stored.read(low, min(low + READ_EVENTS, stop))
         last = int(np.searchsorted(chunk.t, end_us, "right"))
         found.append(chunk.slice(0, last))
         if last < len(chunk):

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.plugin_contracts import DatasetWithSynonyms
 from ctlev_core.progress import ProgressBar
-from ctlev_core.recordings.ingestion import IngestedRecording, ingest_recording, list_recordings
+from ctlev_core.recordings.ingestion import list_recordings
+from ctlev_core.recordings.recording_groups import (
+    TABLES,
+    group_files,
+    ingest_group,
+    read_group_table,
+    recording_groups,
+)
 from data_contracts import tables
 from data_contracts.config import DatasetChoice
-from data_contracts.labels import Labels, Recording
-from data_contracts.manifest import concat_labels, label_columns
+from data_contracts.labels import Recording
+from data_contracts.manifest import LabelKinds
 from tasks.stage import Output, stage
 from tasks.workers import map_shards
 
@@ -32,49 +41,38 @@ def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     return [(f"{named[r.recording_id]}:{path.name}", path) for r in recordings for path in r.files]
 
 
-@stage(version=5, schema=tables.RECORDINGS, raw_files=_raw_files, readers=("formats", "motions"))
+@stage(version=6, schema=tables.RECORDINGS, raw_files=_raw_files, readers=("formats", "motions"))
 def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     """Read every recording once, check it, and keep events and labels in the project's own form."""
     plugin = plugins.load_options(dataset)
-    recordings = list_recordings(plugin)
+    groups = recording_groups(list_recordings(plugin))
     # Readers and the simulator release the interpreter lock, so that threads serve.
-    results = map_shards(partial(_ingest_one, dataset, out.folder, out.work), recordings)
-    ingested = list(ProgressBar(results, "ingest", len(recordings), unit="recording"))
-    out.write_table(pa.Table.from_pylist([p for i in ingested for p in i.parts], tables.PARTS.arrow()), tables.PARTS)
-    out.write_table(_window_table(recordings, ingested), tables.WINDOWS)
+    finished = map_shards(partial(_ingest_group, dataset, out.work), groups)
+    rows: list[pa.Table] = []
+    with contextlib.ExitStack() as stack:
+        written = {schema: stack.enter_context(out.open_table(schema)) for schema in TABLES[:-1]}
+        kinds = {schema: LabelKinds() for schema in (tables.LABELS, tables.WINDOW_LABELS)}
+        bar = stack.enter_context(ProgressBar(desc="ingest", total=sum(len(g) for _, g in groups), unit="recording"))
+        for folder in finished:
+            rows.append(read_group_table(folder, tables.RECORDINGS))
+            _link_files(rows[-1], folder, out.folder)
+            for schema, writer in written.items():
+                table = read_group_table(folder, schema)
+                writer.append(kinds[schema].check(table) if schema in kinds else table)
+            bar.update(len(rows[-1]))
     named_further = isinstance(plugin.module, DatasetWithSynonyms)
     synonyms = plugin.module.read_synonyms(plugin.options) if named_further else {}
     named = [{"class_name": name, "names": list(names)} for name, names in sorted(synonyms.items())]
     out.write_table(pa.Table.from_pylist(named, tables.SYNONYMS.arrow()), tables.SYNONYMS)
-    out.write_table(_label_table(recordings, [i.labels for i in ingested]), tables.LABELS)
-    of_windows = [(r, i.window_labels) for r, i in zip(recordings, ingested, strict=True) if i.window_labels]
-    out.write_table(
-        _label_table([r for r, _ in of_windows], [labels for _, labels in of_windows]), tables.WINDOW_LABELS
-    )
-    return pa.Table.from_pylist([i.row for i in ingested], schema=tables.RECORDINGS.arrow())
+    return pa.concat_tables(rows)
 
 
-def _ingest_one(dataset: DatasetChoice, folder: Path, work: Path, recording: Recording) -> IngestedRecording:
-    return ingest_recording(plugins.load_options(dataset), recording, folder, work)
+def _ingest_group(dataset: DatasetChoice, work: Path, numbered: tuple[int, Sequence[Recording]]) -> Path:
+    return ingest_group(plugins.load_options(dataset), work, numbered)
 
 
-def _window_table(recordings: list[Recording], ingested: list[IngestedRecording]) -> pa.Table:
-    named = [(r.recording_id, i.windows) for r, i in zip(recordings, ingested, strict=True) if i.windows is not None]
-    ranges = np.concatenate([np.zeros((0, 2), np.int64), *(windows for _, windows in named)])
-    names = [name for name, windows in named for _ in range(len(windows))]
-    columns = [pa.array(names, pa.string()), ranges[:, 0], ranges[:, 1]]
-    return pa.table(columns, names=[column.name for column in tables.WINDOWS.columns])
-
-
-def _label_table(recordings: list[Recording], tracks: list[Labels]) -> pa.Table:
-    stacked = concat_labels(tracks)
-    repeated = [recording for recording, track in zip(recordings, tracks, strict=True) for _ in range(len(track))]
-    return pa.table(
-        {
-            "recording_id": [recording.recording_id for recording in repeated],
-            "subject": [recording.subject for recording in repeated],
-            "class_name": list(stacked.class_names),
-            "t_us": stacked.t_us,
-            **label_columns(stacked),
-        }
-    )
+def _link_files(recordings: pa.Table, source: Path, target: Path) -> None:
+    """The files of a group into the artefact; they stay in its work folder until the artefact is finished."""
+    for name in group_files(recordings):
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        os.link(source / name, target / name)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import spread
 from ctlev_core.realism import distances, two_sample
 from ctlev_core.realism.summary import AXES, Summary, summarise_events, summarise_frames
+from ctlev_core.recordings.stored_events import stored_events
 from data_contracts import tables
 from data_contracts.manifest import Manifest
 from data_contracts.training_sets import RECORDED
@@ -126,28 +126,27 @@ def _test_rows(group: str, tests: dict[str, two_sample.TwoSampleTest], data: Man
 
 
 def _summarise_recordings(recordings: Manifest, split: str) -> list[Summary]:
-    files = dict(zip(recordings.column("recording_id"), recordings.column("events_file"), strict=True))
+    row_of = {name: row for row, name in enumerate(recordings.column("recording_id"))}
     parts = [part for part in recordings.attached(tables.PARTS).to_pylist() if part["split"] == split]
-    stretches = [(files[part["recording_id"]], part["event_start"], part["event_stop"]) for part in parts]
+    stretches = [(row_of[part["recording_id"]], part["event_start"], part["event_stop"]) for part in parts]
     return _summarise_stretches(recordings, stretches)
 
 
 def _summarise_whole(recordings: Manifest) -> list[Summary]:
     """Every recording once, also where splits divide it."""
-    table = recordings.table
-    files, counts = table["events_file"].to_pylist(), table["num_events"].to_pylist()
-    return _summarise_stretches(recordings, [(file, 0, count) for file, count in zip(files, counts, strict=True)])
+    return _summarise_stretches(recordings, [(row, 0, n) for row, n in enumerate(recordings.column("num_events"))])
 
 
-def _summarise_stretches(recordings: Manifest, stretches: list[tuple[str, int, int]]) -> list[Summary]:
-    """Of stretches (events file, first event, one past the last) those with events, the middle of long ones."""
-    stretches = [stretch for stretch in stretches if stretch[0]]
+def _summarise_stretches(recordings: Manifest, stretches: list[tuple[int, int, int]]) -> list[Summary]:
+    """Of stretches (row, first event, one past the last) those with events, the middle of long ones."""
+    has_events = np.array([bool(file) for file in recordings.column("events_file")], bool)
+    stretches = [stretch for stretch in stretches if has_events[stretch[0]]]
     found = []
     for number in spread(len(stretches), MAX_RECORDINGS).tolist():
-        file, start, stop = stretches[number]
+        row, start, stop = stretches[number]
         start += max(0, stop - start - MAX_EVENTS) // 2
-        path = recordings.path(file)
-        found.append(summarise_events(event_files.read_events_range(path, start, min(stop, start + MAX_EVENTS))))
+        stored = stored_events(recordings, recordings.table.slice(row, 1).to_pylist()[0])
+        found.append(summarise_events(stored.read(start, min(stop, start + MAX_EVENTS))))
     return found
 
 

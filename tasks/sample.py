@@ -17,7 +17,6 @@ import pyarrow as pa
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling.shards import SHARD
-from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import spread, window_around
 from ctlev_core.labels.sources import sensor_size_of
 from ctlev_core.plugin_contracts import CalibratedEventGenerator
@@ -29,6 +28,7 @@ from ctlev_core.postprocessing.quality_filter import (
 )
 from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
 from ctlev_core.progress import ProgressBar
+from ctlev_core.recordings.stored_events import StoredEvents, stored_events
 from ctlev_core.seeds import sample_seeds
 from data_contracts import tables
 from data_contracts.arrays import load_array, save_compressed
@@ -182,7 +182,7 @@ def _calibrated(plugin: plugins.Plugin, recordings: Manifest, conditions: Manife
     if not ranges:
         raise DataError(f"{recordings.ref.path}: no training recording with events, which {plugin.name!r} is fitted to")
     chosen = [ranges[number] for number in spread(len(ranges), MAX_CALIBRATION)]
-    read = (event_files.read_events_range(path, start, stop) for _, path, start, stop in chosen)
+    read = (stored.read(start, stop) for _, stored, start, stop in chosen)
     names = [class_name for class_name, *_ in chosen]
     options, measured = plugin.module.calibrate(read, names, conditions_of(conditions), plugin.options)
     found = {"options": options.model_dump(mode="json"), "measured": measured}
@@ -190,15 +190,15 @@ def _calibrated(plugin: plugins.Plugin, recordings: Manifest, conditions: Manife
     return replace(plugin, options=options)
 
 
-def _training_ranges(recordings: Manifest) -> list[tuple[str, Path, int, int]]:
-    """Class, file, first event and one past the last of what each recording has for training, if not too long."""
+def _training_ranges(recordings: Manifest) -> list[tuple[str, StoredEvents, int, int]]:
+    """Class, events, first event and one past the last of what each recording has for training, if not too long."""
     parts = by_recording(recordings.attached(tables.PARTS))
     found = []
     for row in recordings.table.to_pylist():
         for part in parts[row["recording_id"]].to_pylist() if row["events_file"] else []:
             start, stop = part["event_start"], min(part["event_stop"], part["event_start"] + MAX_CALIBRATION_EVENTS)
             if part["split"] == "train" and stop > start:
-                found.append((row["class_name"], recordings.path(row["events_file"]), start, stop))
+                found.append((row["class_name"], stored_events(recordings, row), start, stop))
     return found
 
 

@@ -40,7 +40,6 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from ctlev_core import plugins
@@ -53,6 +52,7 @@ from data_contracts.compressed_arrays import SUFFIX, CompressedArrayWriter
 from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
+from data_contracts.table_writer import TableWriter
 from data_contracts.tables import TableSchema
 from tasks.gpus import gpu_need, gpus_held
 from tasks.prefect_runs import run_as_task
@@ -187,7 +187,12 @@ class Output:
 
     def write_table(self, table: pa.Table, schema: TableSchema) -> None:
         """Attach a second table beside the manifest."""
-        pq.write_table(table.cast(schema.arrow()), self.folder / f"{schema.name}.parquet", compression="zstd")
+        with self.open_table(schema) as written:
+            written.append(table)
+
+    def open_table(self, schema: TableSchema) -> TableWriter:
+        """The same, to be written as rows come within a `with` block."""
+        return TableWriter(self.folder, schema)
 
 
 class Stage:

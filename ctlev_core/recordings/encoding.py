@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctlev_core.events import files as event_files
 from ctlev_core.events.windows import cut_at_labels, cut_chunks, spread
 from ctlev_core.labels.interpolation import interpolate_labels, is_between_labels
 from ctlev_core.labels.labelling import has_label, labels_at_windows, labels_in_image
 from ctlev_core.plugins import Plugin
+from ctlev_core.recordings.stored_events import StoredEvents
 from data_contracts.arrays import load_array, times_file
 from data_contracts.config import Windows
 from data_contracts.errors import DataError
@@ -51,8 +51,8 @@ class RecordingSource(NamedTuple):
         subject: who is on it.
         class_name: of what is on it; may be empty.
         sensor_size: (width, height) px.
-        file: of its events, or of event images that come finished.
-        has_events: whether it is events.
+        events: where its events are; None where event images come finished.
+        event_images: the file of these, else None.
         parts: by split.
         track: its labels, ascending in time.
         windows: [W, 2] int64 index ranges into its events, where the dataset's own windows are wanted.
@@ -63,8 +63,8 @@ class RecordingSource(NamedTuple):
     subject: str
     class_name: str
     sensor_size: SensorSize
-    file: Path
-    has_events: bool
+    events: StoredEvents | None
+    event_images: Path | None
     parts: tuple[RecordingPart, ...]
     track: Labels
     windows: np.ndarray | None
@@ -108,16 +108,21 @@ def encode_recording(source: RecordingSource, encoding: Plugin, windows: Windows
     Raises:
         DataError: finished event images and options that do not fit them.
     """
-    return (_encode_events if source.has_events else _encode_images)(source, encoding, windows)
+    if source.events is not None:
+        return _encode_events(source, source.events, encoding, windows)
+    assert source.event_images is not None
+    return _encode_images(source, source.event_images, encoding, windows)
 
 
-def _encode_events(source: RecordingSource, plugin: Plugin, windows: Windows) -> Iterator[EncodedWindows]:
+def _encode_events(
+    source: RecordingSource, stored: StoredEvents, plugin: Plugin, windows: Windows
+) -> Iterator[EncodedWindows]:
     """The windows of each part, some at a time: neither events nor histograms of a recording need fit into memory."""
-    path, at_once = source.file, _windows_at_once(plugin, source.sensor_size)
+    at_once = _windows_at_once(plugin, source.sensor_size)
     for part in source.parts:
         start, stop = part.start, part.stop
-        held = event_files.read_events_range(path, start, stop) if stop - start <= MAX_EVENTS else None
-        stamps = _time_stamps(path, start, stop, held)
+        held = stored.read(start, stop) if stop - start <= MAX_EVENTS else None
+        stamps = _time_stamps(stored, start, stop, held)
         if windows.anchor == "labels":
             ranges, own_labels = cut_at_labels(stamps, source.track.t_us, windows)
             ranges, labels = start + ranges, source.track.take(own_labels)
@@ -132,7 +137,7 @@ def _encode_events(source: RecordingSource, plugin: Plugin, windows: Windows) ->
         for rows in _groups(ranges, at_once):
             first, last = int(ranges[rows[0], 0]), int(ranges[rows[-1], 1])
             if held is None:
-                events = event_files.read_events_range(path, first, last)
+                events = stored.read(first, last)
             else:
                 events = held.slice(first - start, last - start)
             local = ranges[rows] - first
@@ -151,7 +156,7 @@ def _encode_events(source: RecordingSource, plugin: Plugin, windows: Windows) ->
             yield EncodedWindows(part.split, rows, t_start, t_end, num_events, counts, frames, own)
 
 
-def _encode_images(source: RecordingSource, plugin: Plugin, windows: Windows) -> Iterator[EncodedWindows]:
+def _encode_images(source: RecordingSource, file: Path, plugin: Plugin, windows: Windows) -> Iterator[EncodedWindows]:
     """Finished event images: every one is a window; the grey values stand for counts.
 
     They are what counts of a recording become by the encoding's normalisation, and go on as those do.
@@ -165,7 +170,7 @@ def _encode_images(source: RecordingSource, plugin: Plugin, windows: Windows) ->
         )
     if len(source.parts) != 1:
         raise DataError(f"{name}: finished event images cannot be split in time")
-    images, t_us = load_array(source.file), np.asarray(load_array(Path(times_file(str(source.file)))))
+    images, t_us = load_array(file), np.asarray(load_array(Path(times_file(str(file)))))
     known = np.arange(len(images))
     if windows.labels == "interpolated":
         known = np.flatnonzero(is_between_labels(source.track, t_us))
@@ -208,12 +213,12 @@ def _tell_full(counts: np.ndarray, name: str, rows: np.ndarray) -> None:
     )  # fmt: skip
 
 
-def _time_stamps(path: Path, start: int, stop: int, held: Events | None) -> Iterator[np.ndarray]:
+def _time_stamps(stored: StoredEvents, start: int, stop: int, held: Events | None) -> Iterator[np.ndarray]:
     if held is not None:
         yield held.t
         return
     for first in range(start, stop, MAX_EVENTS):
-        yield event_files.read_events_range(path, first, min(first + MAX_EVENTS, stop)).t
+        yield stored.read(first, min(first + MAX_EVENTS, stop)).t
 
 
 def _windows_at_once(plugin: Plugin, sensor_size: SensorSize) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import itertools
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,14 +10,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ctlev_core.events import files as event_files
+from ctlev_core.events.decoding import event_chunks
 from ctlev_core.plugin_contracts import DatasetWithChunks, DatasetWithWindowLabels, DatasetWithWindows
 from ctlev_core.plugins import Plugin
 from ctlev_core.progress import ProgressBar
+from ctlev_core.recordings.stored_events import SharedEventsWriter
 from data_contracts.arrays import save_compressed, times_file
 from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 from data_contracts.labels import Labels, Recording, check_image_track, check_labels
+
+MAX_SHARED_US = 1_000_000
+"""Recordings of under a second share files; longer ones have their own, of which parts can be read."""
+MAX_SHARED_EVENTS = 1 << 20
+"""Events of a recording that shares a file at most, for it is read and written as a whole: 13 MiB."""
 
 
 class IngestedRecording(NamedTuple):
@@ -64,14 +71,17 @@ def check_track(labels: Labels, recording: Recording, where: str) -> Labels:
     return labels
 
 
-def ingest_recording(plugin: Plugin, recording: Recording, folder: Path, work: Path) -> IngestedRecording:
+def ingest_recording(
+    plugin: Plugin, recording: Recording, folder: Path, shared: tuple[str, SharedEventsWriter] | None
+) -> IngestedRecording:
     """Read a recording, check it, and write its events and pictures.
 
     Args:
         plugin: the dataset.
         recording: one of `list_recordings`.
-        folder: to write to: `events/<id>.parquet`, `event_images/<id>.npy.zst`, `intensity/<id>.npy.zst`.
-        work: keeps what is finished when a run is interrupted.
+        folder: to write to: `events/<id>.parquet`, `event_images/<id>.npy.zst`, `intensity/<id>.npy.zst`. Long events
+            that an interrupted run has left there are not read again.
+        shared: name and writer of the file for events of under `MAX_SHARED_US`; None = all have a file of their own.
     Raises:
         DataError: the recording cannot be read or breaks the contract.
     """
@@ -83,13 +93,14 @@ def ingest_recording(plugin: Plugin, recording: Recording, folder: Path, work: P
         "class_name": recording.class_name,
         "splits": "+".join(part.split for part in recording.parts),
         **dict.fromkeys(("events_file", "event_images_file", "intensity_file"), ""),
+        "events_batch": None,
         **dict(zip(("sensor_width_px", "sensor_height_px"), recording.sensor_size or (0, 0), strict=True)),
         **dict.fromkeys(("num_events", "num_positive", "num_negative"), 0),
         **dict.fromkeys(("t_first_us", "t_last_us", "duration_us"), 0),
         "num_windows": None,
     }
     if recording.has_events:
-        row |= _ingest_events(plugin, recording, folder, work, where)
+        row |= _ingest_events(plugin, recording, folder, shared, where)
     for kind, wanted in (("event_images", recording.has_event_images), ("intensity", recording.has_intensity)):
         if wanted:
             row |= _ingest_images(plugin, recording, folder, kind, where)
@@ -102,12 +113,12 @@ def ingest_recording(plugin: Plugin, recording: Recording, folder: Path, work: P
     return IngestedRecording(row, rows, labels, windows, window_labels)
 
 
-def _ingest_events(plugin: Plugin, recording: Recording, folder: Path, work: Path, where: str) -> dict[str, Any]:
-    """Events into Parquet, chunk by chunk where the dataset reads in chunks."""
-    name = f"events/{recording.recording_id}.parquet"
-    finished, attached = work / name, folder / name
-    for path in (finished, attached):
-        path.parent.mkdir(parents=True, exist_ok=True)
+def _ingest_events(
+    plugin: Plugin, recording: Recording, folder: Path, shared: tuple[str, SharedEventsWriter] | None, where: str
+) -> dict[str, Any]:
+    """Events into the shared file where they are short, else into Parquet, chunk by chunk where they come so."""
+    name, batch = f"events/{recording.recording_id}.parquet", None
+    finished = folder / name
 
     def watched(chunks: Iterable[Events]) -> Iterator[Events]:
         # Only a recording that takes long gets a bar of its own.
@@ -126,12 +137,41 @@ def _ingest_events(plugin: Plugin, recording: Recording, folder: Path, work: Pat
             chunks = plugin.module.read_event_chunks(recording, plugin.options)
         else:
             chunks = [check_events(plugin.module.read_events(recording, plugin.options), where)]
-        summary = event_files.write_event_chunks_parquet(finished, watched(chunks))
+        short, chunks = _all_if_short(chunks, where) if shared is not None else (None, chunks)
+        if short is not None and shared is not None:
+            name, writer = shared
+            summary = event_files.Summary()
+            summary.add(short)
+            batch = writer.append(short, where)
+        else:
+            finished.parent.mkdir(parents=True, exist_ok=True)
+            summary = event_files.write_event_chunks_parquet(finished, watched(chunks))
     if summary.num_events == 0 or summary.sensor_size is None:
         raise DataError(f"{where}: the recording holds no events")
-    os.link(finished, attached)
     width, height = summary.sensor_size
-    return {"events_file": name, "sensor_width_px": width, "sensor_height_px": height, **summary.result()}
+    return {
+        "events_file": name,
+        "events_batch": batch,
+        "sensor_width_px": width,
+        "sensor_height_px": height,
+        **summary.result(),
+    }
+
+
+def _all_if_short(chunks: Iterable[Events], where: str) -> tuple[Events | None, Iterable[Events]]:
+    """All events of a recording that is short, else None and its chunks, of which no more are read than it takes."""
+    chunks = iter(chunks)
+    read: list[Events] = []
+    num_events = 0
+    for chunk in chunks:
+        read.append(chunk)
+        num_events += len(chunk)
+        stamps = [part.t for part in read if len(part)]
+        if num_events > MAX_SHARED_EVENTS or (stamps and stamps[-1][-1] - stamps[0][0] >= MAX_SHARED_US):
+            return None, itertools.chain(read, chunks)
+    if not num_events:
+        return None, read
+    return event_chunks.concatenate(event_chunks.check_joints(read, where)), ()
 
 
 def _ingest_images(plugin: Plugin, recording: Recording, folder: Path, kind: str, where: str) -> dict[str, Any]:

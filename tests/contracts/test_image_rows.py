@@ -127,7 +127,7 @@ else:
     with CompressedArrayWriter(folder / "frames.npy.zst") as written:
         written.append(np.zeros((1, 512, 512, 3), np.uint8))
         written._file.flush()
-        frame = (folder / "frames.npy.zst").read_bytes()[written._sizes[0][0] :]
+        frame = (folder / "frames.npy.zst").read_bytes()[written._sizes[0] :]
         for _ in range(count - 1):  # the same again, without compressing it
             written._write(frame, 512 * 512 * 3)
             written.rows += 1

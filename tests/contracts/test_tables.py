@@ -70,6 +70,7 @@ def test_key_must_be_unique_and_split_known():
                 )
             },
             **dict.fromkeys(("events_file", "event_images_file", "intensity_file"), ["x"] * 3),
+            "events_batch": pa.nulls(3, pa.int32()),
         }
     )  # fmt: skip
     with pytest.raises(DataError, match=r"column 'recording_id', row 2: 'a' occurs twice"):

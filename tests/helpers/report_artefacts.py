@@ -194,7 +194,7 @@ def _recordings() -> pa.Table:
         "subject": "someone", "class_name": "walk", "splits": "train", "sensor_width_px": SIDE,
         "sensor_height_px": SIDE,
         "num_events": 100, "num_positive": 60, "num_negative": 40, "t_first_us": 0, "t_last_us": 1, "duration_us": 1,
-        "num_windows": None, "events_file": "", "event_images_file": "", "intensity_file": "",
+        "num_windows": None, "events_file": "", "events_batch": None, "event_images_file": "", "intensity_file": "",
     }  # fmt: skip
     rows = [{**row, "recording_id": f"r{number}"} for number in range(COUNT)]
     return pa.Table.from_pylist(rows, schema=tables.RECORDINGS.arrow())

@@ -52,7 +52,8 @@ def write_recordings(folder) -> Manifest:
             {
                 "recording_id": name, "subject": name, "class_name": "walk", "splits": "train",
                 "sensor_width_px": SIZE[0], "sensor_height_px": SIZE[1], "num_windows": None,
-                "events_file": f"{name}.parquet", "event_images_file": "", "intensity_file": "", **of_events,
+                "events_file": f"{name}.parquet", "events_batch": None,
+                "event_images_file": "", "intensity_file": "", **of_events,
             }
         )  # fmt: skip
         parts.append({"recording_id": name, "split": "train", "event_start": 0, "event_stop": len(events)})
