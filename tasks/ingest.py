@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -55,7 +54,8 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
         bar = stack.enter_context(ProgressBar(desc="ingest", total=sum(len(g) for _, g in groups), unit="recording"))
         for folder in finished:
             rows.append(read_group_table(folder, tables.RECORDINGS))
-            _link_files(rows[-1], folder, out.folder)
+            for name in group_files(rows[-1]):
+                out.share(folder / name, name)
             for schema, writer in written.items():
                 table = read_group_table(folder, schema)
                 writer.append(kinds[schema].check(table) if schema in kinds else table)
@@ -69,10 +69,3 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
 
 def _ingest_group(dataset: DatasetChoice, work: Path, numbered: tuple[int, Sequence[Recording]]) -> Path:
     return ingest_group(plugins.load_options(dataset), work, numbered)
-
-
-def _link_files(recordings: pa.Table, source: Path, target: Path) -> None:
-    """The files of a group into the artefact; they stay in its work folder until the artefact is finished."""
-    for name in group_files(recordings):
-        (target / name).parent.mkdir(parents=True, exist_ok=True)
-        os.link(source / name, target / name)

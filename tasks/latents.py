@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -47,17 +45,9 @@ def encode_latents(out: Output, frames: Manifest, *, latents: LatentOptions) -> 
     sample_ids, turns = [], []
     for number, (own, files) in enumerate(write_latent_files(vae, images, latents.num_turns, out.work)):
         for kind, path in files.items():
-            _share(path, out.folder / f"{kind}_{number:04d}.npy")
+            out.share(path, f"{kind}_{number:04d}.npy")
         sample_ids.append(np.tile(names[own.start : own.stop], latents.num_turns))
         turns.append(np.repeat(np.arange(latents.num_turns, dtype=np.int32), len(own)))
     return pa.table(
         {"sample_id": pa.array(np.concatenate(sample_ids).tolist()), "quarter_turns": pa.array(np.concatenate(turns))}
     )
-
-
-def _share(source: Path, target: Path) -> None:
-    """The file under a second name: a run that is killed before its artefact is complete finds the first again."""
-    try:
-        os.link(source, target)
-    except OSError:  # not every file system has links
-        shutil.copyfile(source, target)

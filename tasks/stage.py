@@ -194,6 +194,15 @@ class Output:
         """The same, to be written as rows come within a `with` block."""
         return TableWriter(self.folder, schema)
 
+    def share(self, finished: Path, name: str) -> None:
+        """Attach a file of the work folder, which stays there: a run that is killed finds it again."""
+        target = self.folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(finished, target)
+        except OSError:  # not every file system has links
+            shutil.copyfile(finished, target)
+
 
 class Stage:
     """See the module's docstring. Made by the decorator `stage`."""

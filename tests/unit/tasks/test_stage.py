@@ -26,7 +26,7 @@ from data_contracts.errors import DataError
 from data_contracts.manifest import read_manifest, write_manifest
 from data_contracts.run_record import read_run_record, write_run_record
 from tasks import workers
-from tasks.stage import files_of, in_one_run, planning, stage
+from tasks.stage import Output, files_of, in_one_run, planning, stage
 from tasks.store import Store
 
 
@@ -243,6 +243,20 @@ def test_artefact_of_changed_input_is_made_anew():
     assert cached and repeated.digest != source.digest
     made, cached = run(second, repeated)
     assert not cached and read_manifest(made).column("loss") == [14.0]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_shared_file_stays_in_the_work_folder(links, tmp_path, monkeypatch):
+    def refuse(source, target):
+        raise PermissionError(1, "Operation not permitted")  # what file systems without links say
+
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    (tmp_path / "made").mkdir()
+    finished = tmp_path / "finished.bin"
+    finished.write_bytes(b"events")
+    Output(tmp_path / "made", tmp_path).share(finished, "events/shared.bin")
+    assert (tmp_path / "made/events/shared.bin").read_bytes() == finished.read_bytes() == b"events"
 
 
 def test_failure_publishes_nothing(home):
