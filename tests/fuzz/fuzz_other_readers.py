@@ -267,6 +267,26 @@ def _read_provenance(path: Path) -> Any:
     return read_provenance(path)
 
 
+def _shared_recordings(folder: Path) -> Iterator[bytes]:
+    from ctlev_core.recordings.stored_events import SharedEventsWriter
+    from data_contracts.events import Events
+
+    for marked in (False, True):
+        path = folder / f"shared_{marked}.arrow"
+        with SharedEventsWriter(path) as writer:
+            for count in (5, 0, 40):
+                t, (x, y) = np.sort(RANDOM.integers(0, 10**6, count)), RANDOM.integers(0, 64, (2, count)).astype("u2")
+                p, signal = np.arange(count, dtype="u1") % 2, np.arange(count) % 3 == 0
+                writer.append(Events(t, x, y, p, (64, 64), signal=signal if marked else None), "seed")
+        yield path.read_bytes()
+
+
+def _read_shared_recordings(path: Path) -> Any:
+    from ctlev_core.recordings.stored_events import StoredEvents
+
+    return [StoredEvents(path, batch, (64, 64)).read(0, count) for batch, count in enumerate((5, 0, 40))]
+
+
 TARGETS = {
     "motion": Target("motion.npz", _motions, _read_motion),
     "body": Target("body.pkl", _bodies, _read_body),
@@ -282,6 +302,7 @@ TARGETS = {
     "manifest": Target("manifest.parquet", _manifests, _read_manifest),
     "raw_file_digests": Target("raw_file_digests.json", _remembered, _read_remembered),
     "provenance": Target("provenance.json", _provenance, _read_provenance),
+    "shared_recordings": Target("shared_000000.arrow", _shared_recordings, _read_shared_recordings),
 }
 
 
