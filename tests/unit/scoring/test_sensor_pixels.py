@@ -85,6 +85,7 @@ def recordings_of(folder, sizes):
         "sensor_width_px": pa.array([size[0] for size in sizes.values()], pa.int32()),
         "sensor_height_px": pa.array([size[1] for size in sizes.values()], pa.int32()),
         **dict.fromkeys(numbers, pa.array([1] * count, pa.int64())), "num_windows": pa.nulls(count, pa.int64()),
+        "events_batch": pa.nulls(count, pa.int32()),
         **{name: [""] * count for name in ("events_file", "event_images_file", "intensity_file")},
     }  # fmt: skip
     return read_manifest(write_manifest(folder, pa.table(columns), tables.RECORDINGS))
