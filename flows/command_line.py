@@ -18,7 +18,6 @@ from pydantic import BaseModel, ValidationError
 
 from ctlev_core.duration_text import duration_text
 from ctlev_core.plugins import PluginError, validate_options
-from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError, TrainingError, shortened
 from data_contracts.experiment import Experiment
 from data_contracts.renamed_options import RENAMED_VALUES, name_hint
@@ -229,7 +228,6 @@ def run_command(command: Command, asked: Asked) -> int:
             if foretold := command.foretell(options):
                 print(foretold)
             return 0
-        use_cores(rows)
         use_memory(rows, home)
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
@@ -265,12 +263,3 @@ def check_home(home: Path) -> None:
     """Raise `PermissionError` where the home folder cannot be written."""
     if not os.access(home, os.W_OK | os.X_OK):
         raise PermissionError(f"{home}: the home folder cannot be written; choose another with --home or CTLEV_HOME")
-
-
-def use_cores(rows: list[PlannedStage]) -> None:
-    """Torch on all cores, unless OMP_NUM_THREADS says otherwise, or everything is cached and torch is not needed."""
-    if "OMP_NUM_THREADS" in os.environ or all(row.cached for row in rows):
-        return
-    import torch
-
-    torch.set_num_threads(num_cores())

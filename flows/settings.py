@@ -30,6 +30,8 @@ _ENVIRONMENT = {
     # Idle OpenMP threads that spin cost a busy machine most of its speed: 30 training steps of the pose network with
     # two threads took 44 s spinning and 11 s sleeping while another process had one of the two cores.
     "OMP_WAIT_POLICY": "PASSIVE",
+    # Weights depend on the number of threads: see `ctlev_core.processes.few_threads`.
+    "OMP_NUM_THREADS": "1",
     "HF_HUB_OFFLINE": "1",
     "HF_HUB_DISABLE_TELEMETRY": "1",
     "HF_HUB_DISABLE_PROGRESS_BARS": "1",

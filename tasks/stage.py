@@ -44,7 +44,7 @@ from pydantic import BaseModel
 
 from ctlev_core import plugins
 from ctlev_core.plugin_contracts import PluginWithFiles
-from ctlev_core.processes import begin_memory_peak, memory_peak_mib
+from ctlev_core.processes import asked_threads, begin_memory_peak, few_threads, memory_peak_mib
 from ctlev_core.progress import Progress, current_report, reporting_to
 from ctlev_core.provenance.raw_file_digests import digest_raw_files
 from data_contracts.arrays import save_compressed
@@ -336,7 +336,7 @@ class Stage:
             folder.mkdir(parents=True)
             work.mkdir(parents=True, exist_ok=True)
             opened = {name: _opened(value) for name, value in arguments.items()}
-            with gpus_held(gpu_need(arguments), self.name), _time_limit(self.name):
+            with few_threads(), gpus_held(gpu_need(arguments), self.name), _time_limit(self.name):
                 table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
             record = {
@@ -514,7 +514,8 @@ def _cpu_seconds() -> float:
 @functools.cache
 def _versions() -> dict[str, str]:
     packages = ("ctlev", "torch", "numpy", "diffusers", "transformers", "numba", "pyarrow", "prefect")
-    found = {"python": platform.python_version(), "platform": platform.platform(), "cores": str(os.cpu_count())}
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    found |= {"cores": str(os.cpu_count()), "threads": str(asked_threads())}
     for package in packages:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package)

@@ -23,8 +23,9 @@ from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar, copy_context
 from typing import Any, BinaryIO, TypeVar
 
-from ctlev_core.processes import module_environment, num_cores
+from ctlev_core.processes import CORES, module_environment, num_cores
 from ctlev_core.progress import Progress, Report, current_report, reporting_to
+from data_contracts.errors import DataError
 from tasks.runners import ALONE, Runner, WorkerError, asked_cluster, asked_runner, reply_to, reply_with
 
 R = TypeVar("R")
@@ -43,14 +44,14 @@ class Worker:
     """One process that is handed calls.
 
     Args:
-        threads: for torch and others.
+        cores: its share of them.
     """
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self, cores: int) -> None:
         environment = {
             **module_environment(os.environ),
             **ALONE,
-            "OMP_NUM_THREADS": str(threads),
+            CORES: str(cores),
         }
         command = [sys.executable, "-m", "tasks.workers"]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
@@ -101,9 +102,9 @@ class Worker:
 class Workers:
     """A few processes; each is started by the first call that finds the others busy."""
 
-    def __init__(self, count: int, threads: int) -> None:
+    def __init__(self, count: int) -> None:
         self.count = count
-        self._threads = threads
+        self._cores = max(1, num_cores() // count)
         self._workers: list[Worker | None] = [None] * count
         self._lock = threading.Lock()
         self._closed = False
@@ -118,7 +119,7 @@ class Workers:
             with self._lock:
                 if self._closed:
                     raise WorkerError("the processes that run stages are closed")
-                worker = self._workers[number] = self._workers[number] or Worker(self._threads)
+                worker = self._workers[number] = self._workers[number] or Worker(self._cores)
             return worker.call(function, *arguments)
         finally:
             self._free.put(number)
@@ -167,7 +168,7 @@ def num_workers() -> int:
     """The variable CTLEV_WORKERS, else one process for each core that we may use."""
     asked = os.environ.get(WORKERS, "")
     if asked and not (asked.isdecimal() and int(asked) >= 1):
-        raise ValueError(f"CTLEV_WORKERS must be a positive number, got {asked!r}")
+        raise DataError(f"CTLEV_WORKERS must be a positive number, got {asked!r}")
     return int(asked) if asked else num_cores()
 
 
@@ -262,7 +263,7 @@ def _shard_runner() -> Runner:
     cluster = asked_cluster(count)
     if cluster is not None:
         return cluster
-    return Threads(count) if asked_runner()[0] == "threads" else Workers(count, max(1, num_cores() // count))
+    return Threads(count) if asked_runner()[0] == "threads" else Workers(count)
 
 
 @contextlib.contextmanager
@@ -273,7 +274,7 @@ def _processes() -> Iterator[Runner]:
         yield shared
         return
     count = num_workers()
-    workers = asked_cluster(count) or Workers(count, max(1, num_cores() // count))
+    workers = asked_cluster(count) or Workers(count)
     token = _current.set(workers)
     try:
         yield workers

@@ -142,7 +142,7 @@ def test_files_of_the_users_folder_are_not_imported(tmp_path):
     assert finished.returncode == 0, finished.stderr
     code = (
         "import os; from tasks.workers import Workers\n"
-        "workers = Workers(1, 1); print(workers.call(os.getpid) != os.getpid()); workers.close()"
+        "workers = Workers(1); print(workers.call(os.getpid) != os.getpid()); workers.close()"
     )
     worker = subprocess.run(
         [sys.executable, "-P", "-c", code],

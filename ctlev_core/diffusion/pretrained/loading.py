@@ -22,6 +22,7 @@ from ctlev_core.diffusion.pretrained.checks import complete_schedule
 from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.model_building import build_model
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, read_base_model_files, read_parts
+from ctlev_core.processes import use_cores_for
 from data_contracts.errors import DataError
 
 LIBRARIES = ("diffusers", "transformers")
@@ -101,6 +102,7 @@ def load_base_model(
         BUNDLED_BASE_MODEL if path is None else Path(path), controlnet=controlnet, with_controlnet=with_controlnet
     )
     models = {name: build_model(part, dtype).to(device) for name, part in files.parts.items()}
+    _use_cores_for(*models.values())
     unet, vae = models["unet"], models["vae"]
     side = unet.config.sample_size * 2 ** (len(vae.config.block_out_channels) - 1)
     return PretrainedModel(
@@ -120,7 +122,14 @@ def load_autoencoder(path: Path, device: str | torch.device = "cpu") -> Any:
     Raises:
         DataError: as `load_base_model`.
     """
-    return build_model(read_parts(path).parts["vae"], torch.float32).to(device)
+    vae = build_model(read_parts(path).parts["vae"], torch.float32).to(device)
+    _use_cores_for(vae)
+    return vae
+
+
+def _use_cores_for(*models: Any) -> None:
+    """Large networks are computed with many threads, also small ones beside them."""
+    use_cores_for(sum(weight.nbytes for model in models for weight in model.parameters()))
 
 
 def _load_tokenizer(folder: Path, max_length: int) -> Any:

@@ -16,9 +16,8 @@ from typing import Any
 import torch
 
 from ctlev_core.diffusion.pretrained.loading import choose_device
+from ctlev_core.processes import CORES, SMALL_BYTES, few_threads, num_cores
 
-SMALL_BYTES = 500_000_000
-"""Weights of more use several threads well, and fill the memory when they are read twice."""
 END_TIMEOUT_S = 10.0
 """After being asked to end, a process has so long."""
 
@@ -55,7 +54,7 @@ def spread_over_cores(device: str, checkpoint: Path, most: int) -> list[str]:
     files = [checkpoint] if checkpoint.is_file() else checkpoint.glob("*/*.safetensors")
     if choose_device(device).type != "cpu" or sum(file.stat().st_size for file in files) > SMALL_BYTES:
         return [device]
-    return [device] * max(min(torch.get_num_threads(), most), 1)
+    return [device] * max(min(num_cores(), most), 1)
 
 
 def run_on_devices(
@@ -63,7 +62,6 @@ def run_on_devices(
     devices: Sequence[str],
     shares: Sequence[Any],
     report: Callable[[int], None],
-    num_threads: int,
 ) -> None:
     """Call `function(device, share, report)` in a process for each device, side by side.
 
@@ -74,7 +72,6 @@ def run_on_devices(
         devices: names.
         shares: what each device has to do.
         report: is called here with the numbers reported there.
-        num_threads: of torch in each process.
     Raises:
         RuntimeError: a process was ended from outside, for example because memory ran out.
         Exception: what a call raised, with the traceback of its process as a note.
@@ -86,7 +83,7 @@ def run_on_devices(
     try:
         for device, share in zip(devices, shares, strict=True):
             ours, theirs = context.Pipe(duplex=False)
-            arguments = (function, device, share, num_threads, theirs)
+            arguments = (function, device, share, max(num_cores() // len(devices), 1), theirs)
             process = context.Process(target=_serve, args=arguments, name=f"sampling on {device}", daemon=True)
             process.start()
             theirs.close()  # so that its end is seen here when the process is gone
@@ -127,15 +124,16 @@ def _serve(
     function: Callable[[str, Any, Callable[[int], None]], None],
     device: str,
     share: Any,
-    num_threads: int,
+    cores: int,
     connection: Connection,
 ) -> None:
     """What a process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    torch.set_num_threads(num_threads)
+    os.environ[CORES] = str(cores)
     try:
-        function(device, share, connection.send)
+        with few_threads():
+            function(device, share, connection.send)
     except Exception as error:
         connection.send(_that_travels(error))
 

@@ -288,18 +288,14 @@ def sample_checkpoint(
         function = functools.partial(
             _sample_share, checkpoint, options, with_controlnet, _prompts(conditions), len(conditions)
         )
-        num_threads = torch.get_num_threads()
         if len(devices) == 1:
             devices = spread_over_cores(devices[0], checkpoint, _num_whole(missing) // SHARDS_A_PROCESS)
-            num_threads //= len(devices)
         shares = [missing[number :: len(devices)] for number in range(len(devices))]
         busy = [number for number, share in enumerate(shares) if share]
         if len(devices) == 1:
             function(devices[0], missing, report)
         else:
-            run_on_devices(
-                function, [devices[number] for number in busy], [shares[number] for number in busy], report, num_threads
-            )
+            run_on_devices(function, [devices[number] for number in busy], [shares[number] for number in busy], report)
     return _read(shards)
 
 

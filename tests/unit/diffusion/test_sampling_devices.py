@@ -47,7 +47,7 @@ def act(device, share, report):
 
 def test_reports_come_from_all_processes():
     reported = []
-    run_on_devices(report_share, ["cpu", "cpu"], [[1, 2], [30]], reported.append, 1)
+    run_on_devices(report_share, ["cpu", "cpu"], [[1, 2], [30]], reported.append)
     assert sorted(reported) == [1, 2, 30]
 
 
@@ -57,7 +57,7 @@ def test_reports_come_from_all_processes():
 def test_the_first_failure_ends_the_other_processes(deed, error, message):
     started = time.monotonic()
     with pytest.raises(error, match=message) as caught:
-        run_on_devices(act, ["cpu", "cpu"], [deed, "sleep"], lambda _: None, 1)
+        run_on_devices(act, ["cpu", "cpu"], [deed, "sleep"], lambda _: None)
     assert time.monotonic() - started < 110, "the process that slept was not waited for"
     if deed == "raise":
         assert "in act" in "".join(caught.value.__notes__)
@@ -95,7 +95,7 @@ def test_two_processes_make_the_frames_of_one(tmp_path, monkeypatch):
 def test_small_networks_on_a_cpu_have_a_process_a_core(tmp_path, monkeypatch):
     (tmp_path / "unet").mkdir()
     (tmp_path / "unet" / "model.safetensors").write_bytes(bytes(100))
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    monkeypatch.setattr(devices, "num_cores", lambda: 4)
     assert spread_over_cores("cpu", tmp_path, 9) == ["cpu"] * 4
     assert spread_over_cores("cpu", tmp_path, 2) == ["cpu"] * 2
     assert spread_over_cores("cpu", tmp_path, 0) == ["cpu"]

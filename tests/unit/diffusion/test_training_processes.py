@@ -16,6 +16,7 @@ from ctlev_core.diffusion.training.entry import train_checkpoint
 from ctlev_core.diffusion.training.launch import child_environment
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.generators import controlnet
+from ctlev_core.processes import num_cores
 from data_contracts.errors import TrainingError
 
 OPTIONS = FineTuningOptions(
@@ -177,6 +178,7 @@ def test_children_hear_nothing_of_an_outer_launcher():
     inner = child_environment({**outer, "ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "3"}, 2)
     assert not set(inner) & (set(outer) - {"HOME"})
     assert inner["HOME"] == "/home/me" and inner["ACCELERATE_USE_CPU"] == "true" and inner["OMP_NUM_THREADS"] == "3"
+    assert int(inner["CTLEV_CORES"]) == max(num_cores() // 2, 1)
 
 
 def test_the_number_of_processes_is_no_part_of_a_result():

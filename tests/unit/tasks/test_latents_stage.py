@@ -130,6 +130,7 @@ def test_weights_are_the_same_to_the_last_bit(base_model, inputs, changes, monke
     assert "latents" not in record.arguments and latents.key not in record.upstream
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_a_run_that_was_killed_goes_on_with_the_file_it_was_at(base_model, inputs, monkeypatch):
     monkeypatch.setattr(latent_files, "FILE_FRAMES", 32)
     encode, encoded = latent_files.encode_posterior, []

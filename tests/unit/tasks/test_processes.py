@@ -4,8 +4,10 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
-from ctlev_core.processes import memory_mib, num_cores
+from ctlev_core import processes
+from ctlev_core.processes import asked_threads, few_threads, memory_mib, num_cores, use_cores_for
 
 COUNT = "from ctlev_core.processes import num_cores; print(num_cores())"
 
@@ -36,6 +38,64 @@ def test_a_container_has_the_cores_whose_time_it_gets(monkeypatch, tmp_path, lim
 def test_without_a_limit_all_cores_count(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2}, raising=False)
     assert num_cores(tmp_path / "cpu.max") == 3
+
+
+def test_a_process_with_a_share_has_that_many(monkeypatch, tmp_path):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
+    monkeypatch.setenv("CTLEV_CORES", "3")
+    assert num_cores(tmp_path / "cpu.max") == 3
+    monkeypatch.setenv("CTLEV_CORES", "30")
+    assert num_cores(tmp_path / "cpu.max") == 8
+    monkeypatch.setenv("CTLEV_CORES", "none")
+    with pytest.raises(ValueError, match="CTLEV_CORES must be a positive number, got 'none'"):
+        num_cores(tmp_path / "cpu.max")
+
+
+@pytest.fixture
+def four_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(4)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("four_threads")
+@pytest.mark.parametrize(("asked", "threads"), [(None, 1), ("", 1), ("nonsense", 1), ("0", 1), ("3", 3), ("2,4", 2)])
+def test_torch_has_few_threads_unless_more_are_asked_for(monkeypatch, asked, threads):
+    if asked is None:
+        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    else:
+        monkeypatch.setenv("OMP_NUM_THREADS", asked)
+    with pytest.raises(KeyError), few_threads():
+        assert torch.get_num_threads() == asked_threads() == threads
+        assert "OMP_NUM_THREADS" in os.environ  # for processes that are started here
+        raise KeyError
+    assert torch.get_num_threads() == 4
+    assert os.environ.get("OMP_NUM_THREADS") == asked
+
+
+@pytest.mark.usefixtures("four_threads")
+@pytest.mark.parametrize(("asked", "size", "threads"), [("1", 10**8, 1), ("1", 10**9, 6), ("2", 10**9, 2)])
+def test_large_networks_have_all_cores_until_the_end(monkeypatch, asked, size, threads):
+    monkeypatch.setenv("OMP_NUM_THREADS", asked)
+    monkeypatch.setattr(processes, "num_cores", lambda: 6)
+    with few_threads():
+        use_cores_for(size)
+        assert torch.get_num_threads() == threads
+    assert torch.get_num_threads() == 4
+
+
+def test_a_torch_that_is_imported_later_has_few_threads():
+    code = """
+from ctlev_core.processes import few_threads
+with few_threads():
+    import torch
+    print(torch.get_num_threads())
+print(torch.get_num_threads())
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert run.stdout.split() == ["1", "1"]
 
 
 TABLE = "MemTotal:       20971520 kB\nMemFree:         1048576 kB\nMemAvailable:   15728640 kB\n"

@@ -32,7 +32,7 @@ def test_without_a_watcher_nothing_is_drawn_off_a_terminal(capsys):
 
 
 def test_reports_come_back_from_other_processes():
-    workers, reports = Workers(1, 1), []
+    workers, reports = Workers(1), []
     try:
         with reporting_to(reports.append):
             assert workers.call(sum, [1, 2]) == 3 and not reports

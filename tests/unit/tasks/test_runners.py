@@ -127,7 +127,7 @@ def test_a_call_after_the_end_of_a_cluster_is_an_error_and_starts_no_other(kind,
 @pytest.mark.parametrize("kind", KINDS[1:])
 def test_calls_that_wait_end_when_the_runner_is_closed(kind, tmp_path, monkeypatch):
     monkeypatch.setenv("CTLEV_RUNNER", kind)
-    runner = runners.asked_cluster(2) or Workers(2, 1)
+    runner = runners.asked_cluster(2) or Workers(2)
     started = [tmp_path / "0", tmp_path / "1"]
     with ThreadPoolExecutor(2) as threads:
         waiting = [threads.submit(runner.call, sleep_a_minute, path) for path in started]

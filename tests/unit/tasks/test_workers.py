@@ -87,7 +87,7 @@ def test_the_error_is_told_that_ended_the_others_also_when_it_takes_longer_to_ar
 
 
 def test_a_process_that_is_closed_clears_away_what_it_was_writing(tmp_path):
-    pool = Workers(1, 1)
+    pool = Workers(1)
     thread = threading.Thread(target=lambda: suppress_worker_error(pool, tmp_path), daemon=True)
     thread.start()
     deadline = time.monotonic() + 60
@@ -128,7 +128,7 @@ def raise_unpicklable():
 
 
 def test_an_error_that_cannot_travel_says_what_it_said():
-    pool = Workers(1, 1)
+    pool = Workers(1)
     try:
         with pytest.raises(RuntimeError, match="Unpicklable: this and that"):
             pool.call(raise_unpicklable)
@@ -138,7 +138,7 @@ def test_an_error_that_cannot_travel_says_what_it_said():
 
 
 def test_a_process_that_is_killed_is_an_error_that_says_so():
-    pool = Workers(1, 1)
+    pool = Workers(1)
     try:
         with pytest.raises(WorkerError, match="ended with signal SIGKILL; if memory ran out, set CTLEV_WORKERS=1"):
             pool.call(kill_self)
@@ -149,7 +149,7 @@ def test_a_process_that_is_killed_is_an_error_that_says_so():
 
 
 def test_what_cannot_travel_fails_here_and_the_process_serves_on():
-    pool = Workers(1, 1)
+    pool = Workers(1)
     try:
         with pytest.raises((AttributeError, TypeError), match="pickle"):
             pool.call(lambda: None)
@@ -163,7 +163,7 @@ def kill_self():
 
 
 def test_prints_do_not_disturb_the_replies(capfd):
-    pool = Workers(1, 1)
+    pool = Workers(1)
     try:
         assert pool.call(print, "a line") is None
         assert pool.call(int, "7") == 7
@@ -175,7 +175,7 @@ def test_prints_do_not_disturb_the_replies(capfd):
 PARENT = """
 import os, threading, time
 from tasks.workers import Workers
-pool = Workers(1, 1)
+pool = Workers(1)
 print(pool.call(os.getpid), flush=True)
 threading.Thread(target=pool.call, args=(time.sleep, 600), daemon=True).start()
 time.sleep(600)
