@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ctlev_core import plugins
+from ctlev_core.diffusion.pretrained.adapters import is_adapter
 from ctlev_core.pixel_decoder.options import DECODER_FOLDER
 from ctlev_core.plugins import validate_options
 from ctlev_core.provenance.records import Record, read_provenance
@@ -172,7 +173,7 @@ def _of_folder(
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{folder}: is no artefact of the stage finetune") from error
         return TrainedGenerator(folder / CHECKPOINT, plugin.rpartition("/")[2], decoder, defaults)
-    if not (folder / "model_index.json").is_file():
+    if not (folder / "model_index.json").is_file() and not is_adapter(folder):
         raise DataError(
             f"{folder}: expected an artefact of the stage finetune or a diffusers folder; no model_index.json"
         )

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ctlev_core.diffusion.pretrained.adapters import is_adapter, merge_adapter, read_adapter
 from ctlev_core.diffusion.pretrained.checks import complete_schedule
 from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.model_building import build_model
@@ -88,8 +89,8 @@ def load_base_model(
     """Load a base model, or a checkpoint written by a generator, from local files.
 
     Args:
-        path: a diffusers pipeline folder, or a Stable Diffusion v1 checkpoint in one file with the tokenizer's folder
-            beside it; the bundled small base model when None.
+        path: a diffusers pipeline folder, an adapter's folder (see `adapters`), or a Stable Diffusion v1 checkpoint in
+            one file with the tokenizer's folder beside it; the bundled small base model when None.
         controlnet: name of a subfolder of the base model, or a separate ControlNet folder or file; otherwise the base
             model's own where there is one.
         with_controlnet: False leaves the ControlNet on disk.
@@ -98,6 +99,8 @@ def load_base_model(
     Raises:
         DataError: a folder or file is missing or does not fit; the message names it.
     """
+    if path is not None and is_adapter(Path(path)):
+        return _load_adapted(Path(path), with_controlnet=with_controlnet, dtype=dtype, device=device)
     files = read_base_model_files(
         BUNDLED_BASE_MODEL if path is None else Path(path), controlnet=controlnet, with_controlnet=with_controlnet
     )
@@ -114,6 +117,16 @@ def load_base_model(
         scheduler_config=complete_schedule(files),
         image_size=(side, side),
     )
+
+
+def _load_adapted(checkpoint: Path, **settings: Any) -> PretrainedModel:
+    """The base model of an adapter, changed by it."""
+    adapter = read_adapter(checkpoint)
+    base_model = load_base_model(adapter.base_model, controlnet=adapter.controlnet, **settings)
+    for name in adapter.networks:
+        if (network := getattr(base_model, name)) is not None:
+            merge_adapter(network, name, checkpoint)
+    return base_model
 
 
 def load_autoencoder(path: Path, device: str | torch.device = "cpu") -> Any:

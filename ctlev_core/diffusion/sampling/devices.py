@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from ctlev_core.diffusion.pretrained.adapters import is_adapter, read_adapter
 from ctlev_core.diffusion.pretrained.loading import choose_device
 from ctlev_core.processes import CORES, SMALL_BYTES, few_threads, num_cores
 
@@ -51,6 +52,8 @@ def spread_over_cores(device: str, checkpoint: Path, most: int) -> list[str]:
         checkpoint: folder or file of the weights.
         most: processes there is work for.
     """
+    if is_adapter(checkpoint):
+        checkpoint = read_adapter(checkpoint).base_model
     files = [checkpoint] if checkpoint.is_file() else checkpoint.glob("*/*.safetensors")
     if choose_device(device).type != "cpu" or sum(file.stat().st_size for file in files) > SMALL_BYTES:
         return [device]

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from ctlev_core.diffusion.compilation import SAMPLING_PASSES, compiler_works, pays
 from ctlev_core.diffusion.denoising import Denoiser
+from ctlev_core.diffusion.pretrained.adapters import ADAPTER_FILE, WEIGHTS_FILE
 from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
     choose_device,
@@ -403,7 +404,10 @@ def _read(shards: list[Shard]) -> np.ndarray:
 def _checkpoint_digest(checkpoint: Path) -> str:
     """Digest of the weights, and of the configs that say what they mean."""
     digest = hashlib.sha256()
-    parts = [checkpoint] if checkpoint.is_file() else sorted(path for path in checkpoint.glob("*/*") if path.is_file())
+    parts = [checkpoint]
+    if checkpoint.is_dir():
+        files = [*checkpoint.glob("*/*"), checkpoint / ADAPTER_FILE, checkpoint / WEIGHTS_FILE]
+        parts = sorted(path for path in files if path.is_file())
     for path in parts:
         with path.open("rb") as file:
             digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())

@@ -24,6 +24,7 @@ from ctlev_core.diffusion.training.finetuning import Tune, fine_tune, forget_wei
 from ctlev_core.diffusion.training.fsdp import check_sharding, gather_networks, shard_networks
 from ctlev_core.diffusion.training.latent_files import Latents
 from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
+from ctlev_core.diffusion.training.lora import check_lora, save_lora
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.diffusion.training.trainer import TrainingHistory
 from data_contracts.config import ConditionChoice
@@ -76,6 +77,7 @@ def train_checkpoint(
     count = options.num_processes or int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     launched_so = os.environ.get("ACCELERATE_USE_FSDP", "false").lower() == "true"
     job["fsdp"] = count > 1 and (launched_so if options.fsdp is None else options.fsdp)
+    check_lora(options)
     if job["fsdp"]:
         if options.compile_networks == "auto":
             options = options.model_copy(update={"compile_networks": False})
@@ -123,7 +125,10 @@ def _train(
     )
     written = gather_networks(base_model, keep=distributed.rank == 0) if distributed.sharded else base_model
     if distributed.rank == 0 and written is not None:
-        save_base_model(written, Path(job["out"]))
+        if options.lora_rank is None:
+            save_base_model(written, Path(job["out"]))
+        else:
+            save_lora(written, options, controlnet, Path(job["out"]))
         if history.value_table is not None:
             write_value_table(Path(job["out"]), history.value_table)
             history.value_table = None  # it is in the checkpoint; histories travel as text

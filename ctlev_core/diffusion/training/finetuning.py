@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from ctlev_core.diffusion.training.latent_cache import (
 )
 from ctlev_core.diffusion.training.latent_files import Latents
 from ctlev_core.diffusion.training.loop import check_run, run_training, sample_rows
+from ctlev_core.diffusion.training.lora import add_lora
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.diffusion.training.tensorboard import picture_of_samples
 from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
@@ -108,15 +109,9 @@ def fine_tune(
         )
     _check_text_route(options, conditions)
     device = base_model.unet.device
-    networks = {
-        "unet": (base_model.unet,),
-        "controlnet": (base_model.controlnet,),
-        "both": (base_model.unet, base_model.controlnet),
-    }[tune]
-    parameters = []
-    for network in networks:
-        network.train().requires_grad_(True)
-        parameters += list(network.parameters())
+    names = ("unet", "controlnet") if tune == "both" else (tune,)
+    networks = {name: getattr(base_model, name) for name in names}
+    parameters = _start_to_learn(networks, options, seed)
     validation_rows, training_rows = split_rows(len(frames), options, seed)
     identity = _identity(frames, conditions, options, tune, seed, class_names)
     trainer = Trainer(parameters, options, identity, options.optimizer, keep=options.keep, patience=options.patience)
@@ -167,11 +162,20 @@ def fine_tune(
         description="fine-tuning",
         distributed=distributed,
     )
-    for network in networks:
+    for network in networks.values():
         network.eval().requires_grad_(False)
     if options.values_at and distributed.rank == 0:
         history.value_table = _value_table(base_model, frames, cache, training_rows, options, seed)
     return history
+
+
+def _start_to_learn(networks: dict[str, Any], options: FineTuningOptions, seed: int) -> list[torch.nn.Parameter]:
+    """The weights that learn."""
+    for network in networks.values():
+        network.train()
+    if options.lora_rank is not None:
+        return add_lora(networks, options, seed)
+    return [parameter for network in networks.values() for parameter in network.requires_grad_(True).parameters()]
 
 
 def _check_text_route(options: FineTuningOptions, conditions: Conditions) -> None:

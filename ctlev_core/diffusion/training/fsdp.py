@@ -30,6 +30,8 @@ def check_sharding(options: FineTuningOptions) -> None:
             raise ValueError(
                 f"fsdp needs {name}={needed}, got {getattr(options, name)}: a process holds parts of weights"
             )
+    if options.lora_rank is not None:
+        raise ValueError("fsdp shares out whole networks; what lora_rank trains is small: set fsdp to false")
     if options.precision == "float16":
         raise ValueError("fsdp needs precision float32 or bfloat16, got float16, whose scale of the loss is not shared")
 

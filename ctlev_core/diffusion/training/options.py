@@ -107,6 +107,15 @@ class FineTuningOptions(TrainingOptions):
         "without bound at little noise: there isolated events are decided; what is decided at much noise the "
         "base model knows",
     )
+    lora_rank: int | None = Field(
+        default=None,
+        gt=0,
+        description="train small additions of this rank to the weights (LoRA) in place of the weights; the checkpoint "
+        "holds them alone and needs the base model; null = the weights themselves",
+    )
+    lora_layers: Literal["attention", "all"] = Field(
+        default="attention", description="what has additions: the attention, as usual, or all layers"
+    )
     prompt_dropout: float = Field(
         default=0.0, ge=0, le=1, description="share of empty prompts, needed only for guidance_scale > 1"
     )
