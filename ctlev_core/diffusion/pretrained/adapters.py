@@ -47,11 +47,13 @@ class Adapter:
         base_model: folder or file.
         controlnet: as `load_base_model` takes it.
         networks: those that were adapted.
+        digest: of the weights that were adapted.
     """
 
     base_model: Path
     controlnet: Path | None
     networks: tuple[str, ...]
+    digest: str
 
 
 def is_adapter(checkpoint: Path) -> bool:
@@ -60,10 +62,10 @@ def is_adapter(checkpoint: Path) -> bool:
 
 
 def read_adapter(checkpoint: Path) -> Adapter:
-    """The base model of an adapter, found and checked.
+    """The base model of an adapter, found; its weights, which may be gigabytes, are not read.
 
     Raises:
-        DataError: the description is damaged, or the base model is not there, or not the one that was adapted.
+        DataError: the description is damaged, or the base model is not there.
     """
     path = checkpoint / ADAPTER_FILE
     found = read_json(path)
@@ -80,12 +82,18 @@ def read_adapter(checkpoint: Path) -> Adapter:
         raise DataError(
             f"{path}: the base model that this adapter belongs to is not at {base_model}; set {BASE_MODEL} to its place"
         )
-    if (got := _digest(base_model, controlnet)) != digest:
+    return Adapter(base_model, controlnet, networks, digest)
+
+
+def check_base_model(checkpoint: Path, adapter: Adapter) -> None:
+    """Raise `DataError` unless the base model is the one that was adapted; reads its weights."""
+    got = _digest(adapter.base_model, adapter.controlnet)
+    if got != adapter.digest:
         raise DataError(
-            f"{path}: {base_model} is not the base model that this adapter belongs to: expected weights of digest "
-            f"{digest[:12]}, got {got[:12]}; set {BASE_MODEL} to the place of the right one"
+            f"{checkpoint / ADAPTER_FILE}: {adapter.base_model} is not the base model that this adapter belongs to: "
+            f"expected weights of digest {adapter.digest[:12]}, got {got[:12]}; set {BASE_MODEL} to the place of the "
+            "right one"
         )
-    return Adapter(base_model, controlnet, networks)
 
 
 def write_adapter(checkpoint: Path, base_model: Path | None, controlnet: Path | None, networks: list[str]) -> None:

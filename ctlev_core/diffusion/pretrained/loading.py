@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ctlev_core.diffusion.pretrained.adapters import is_adapter, merge_adapter, read_adapter
+from ctlev_core.diffusion.pretrained.adapters import check_base_model, is_adapter, merge_adapter, read_adapter
 from ctlev_core.diffusion.pretrained.checks import complete_schedule
 from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.model_building import build_model
@@ -122,6 +122,7 @@ def load_base_model(
 def _load_adapted(checkpoint: Path, **settings: Any) -> PretrainedModel:
     """The base model of an adapter, changed by it."""
     adapter = read_adapter(checkpoint)
+    check_base_model(checkpoint, adapter)
     base_model = load_base_model(adapter.base_model, controlnet=adapter.controlnet, **settings)
     for name in adapter.networks:
         if (network := getattr(base_model, name)) is not None:

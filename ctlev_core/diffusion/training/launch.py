@@ -18,7 +18,7 @@ import torch
 
 from ctlev_core.diffusion.training.distributed import DistributedContext, start_distributed, stop_distributed
 from ctlev_core.diffusion.training.trainer import TrainingHistory
-from ctlev_core.processes import CORES, die_with_parent, module_environment, num_cores
+from ctlev_core.processes import CORES, THREADS, die_with_parent, module_environment, num_cores
 from data_contracts.errors import TrainingError
 
 JOB_FILE, HISTORY_FILE = "job.json", "history.json"
@@ -84,5 +84,6 @@ def child_environment(environment: Mapping[str, str], count: int) -> dict[str, s
         if name not in LAUNCHER_VARIABLES and not name.startswith(LAUNCHER_PREFIXES)
     }
     kept = module_environment(kept)
+    kept.setdefault(THREADS, "1")
     kept[CORES] = str(max(1, num_cores() // count))
     return kept
