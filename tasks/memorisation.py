@@ -25,7 +25,7 @@ NUM_PAIRS = 10
 PICTURES = "small pictures"
 
 
-@stage(version=1, schema=tables.SCORES)
+@stage(version=2, schema=tables.SCORES)
 def memorisation(
     out: Output,
     frames: Manifest,

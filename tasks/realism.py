@@ -29,7 +29,7 @@ Frames = tuple[np.ndarray, np.ndarray]
 """Images [N, H, W, 3] uint8, and the recording [N] of each."""
 
 
-@stage(version=4, schema=tables.SCORES)
+@stage(version=5, schema=tables.SCORES)
 def realism(
     out: Output,
     recordings: Manifest | None,

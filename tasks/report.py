@@ -11,7 +11,7 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 
-@stage(version=20, schema=tables.REPORT)
+@stage(version=21, schema=tables.REPORT)
 def report(out: Output, made: ReportInputs[Manifest]) -> pa.Table:
     """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, `provenance.json` and `summary.json`."""
     write_report(made, out.folder)

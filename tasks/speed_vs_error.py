@@ -75,7 +75,7 @@ def _asked(conditions: Manifest, num_images: int, seed: int) -> tuple[np.ndarray
     return rows, Conditions(tuple(every.prompts[row] for row in rows), images), [seeds[row] for row in rows]
 
 
-@stage(version=4, schema=tables.SPEED_VS_ERROR)
+@stage(version=5, schema=tables.SPEED_VS_ERROR)
 def sampling_errors(
     out: Output,
     extractor: Manifest,

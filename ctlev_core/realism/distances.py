@@ -9,7 +9,8 @@ each recording counts once, however many events it has. Distances:
                                 `value` over 11 bins of 21 grey levels, of `power_spectrum` over 12 bins of 0.06
                                 cycles per px
 
-Intervals are percentiles (95 %) under resampling of whole recordings; with fewer than `MIN_RECORDINGS` there is none.
+Intervals (95 %) are those of replicates in which whole recordings are drawn, widened where they are few
+(`statistics.small_samples`); with fewer than `MIN_RECORDINGS` there is none.
 Resampling repeats recordings, which makes divergences a little larger: with few their interval may lie above the value.
 The floor is the distance of a set from itself: over random splits of its recordings into halves. Halves hold half as
 many recordings, so that it is a little too high: a set that lies below it cannot be told from this one.
@@ -25,6 +26,7 @@ import pyarrow as pa
 
 from ctlev_core.realism.summary import AXES, Summary
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
+from ctlev_core.statistics.small_samples import percentile_levels
 from data_contracts.tables import Column, TableSchema
 
 DISTRIBUTIONS = TableSchema(
@@ -65,8 +67,9 @@ def estimate_numbers(summaries: Sequence[Summary], seed: int = 0) -> dict[str, E
         return {name: values[:, 0] for name, values in means.items() if name not in AXES}
 
     found = numbers(np.ones((1, len(summaries))))
-    replicates = numbers(_draws(len(summaries), seed)) if len(summaries) >= MIN_RECORDINGS else {}
-    return {name: _estimate(float(value[0]), replicates.get(name)) for name, value in found.items()}
+    count = len(summaries)
+    replicates = numbers(_draws(count, seed)) if count >= MIN_RECORDINGS else {}
+    return {name: _estimate(float(value[0]), replicates.get(name), count) for name, value in found.items()}
 
 
 def estimate_distances(first: Sequence[Summary], second: Sequence[Summary], seed: int = 0) -> dict[str, Estimate]:
@@ -74,10 +77,11 @@ def estimate_distances(first: Sequence[Summary], second: Sequence[Summary], seed
     ones = np.ones((1, len(first))), np.ones((1, len(second)))
     found = _distances(_means(first, ones[0]), _means(second, ones[1]))
     replicates: dict[str, np.ndarray] = {}
-    if min(len(first), len(second)) >= MIN_RECORDINGS:
+    fewest = min(len(first), len(second))
+    if fewest >= MIN_RECORDINGS:
         draws = _draws(len(first), seed), _draws(len(second), seed + 1)
         replicates = _distances(_means(first, draws[0]), _means(second, draws[1]))
-    return {name: _estimate(float(value[0]), replicates.get(name)) for name, value in found.items()}
+    return {name: _estimate(float(value[0]), replicates.get(name), fewest) for name, value in found.items()}
 
 
 def estimate_floor(summaries: Sequence[Summary], seed: int = 0) -> dict[str, Estimate]:
@@ -93,7 +97,8 @@ def estimate_floor(summaries: Sequence[Summary], seed: int = 0) -> dict[str, Est
     for name, values in replicates.items():
         values = values[np.isfinite(values)]
         if len(values):
-            found[name] = _estimate(float(np.median(values)), values if count >= MIN_RECORDINGS else None)
+            low, high = np.quantile(values, [0.025, 0.975]) if count >= MIN_RECORDINGS else (np.nan, np.nan)
+            found[name] = Estimate(float(np.median(values)), float(low), float(high))
     return found
 
 
@@ -149,8 +154,9 @@ def _draws(count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).multinomial(count, shares, size=_NUM_REPLICATES).astype(np.float64)
 
 
-def _estimate(value: float, replicates: np.ndarray | None) -> Estimate:
+def _estimate(value: float, replicates: np.ndarray | None, count: int) -> Estimate:
+    """`count`: recordings that were drawn, of the smaller set."""
     if replicates is None or not np.isfinite(replicates).any():
         return Estimate(value)
-    low, high = np.quantile(replicates[np.isfinite(replicates)], [0.025, 0.975])
+    low, high = np.quantile(replicates[np.isfinite(replicates)], percentile_levels(count))
     return Estimate(value, float(low), float(high))

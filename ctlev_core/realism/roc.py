@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ctlev_core.statistics.small_samples import stretch, variance_of_mean, widening
+
 NUM_REPLICATES = 1000
 
 
@@ -66,11 +68,12 @@ class HeldOut:
 def interval_of_mean_area(
     trainings: Sequence[HeldOut], kinds: np.ndarray, generator: np.random.Generator
 ) -> tuple[float, float]:
-    """95 % percentile interval of the trainings' mean area.
+    """95 % interval of the trainings' mean area, under resampling of recordings and trainings.
 
     Args:
-        trainings: two or more.
-        kinds: [K] integer; recordings of one kind are drawn anew from one another, for all trainings alike.
+        trainings: two or more, with two recordings or more in each set.
+        kinds: [K] of each recording 1 = of the first set, 2 = of the second, 3 = of both; those of one kind are drawn
+            anew from one another, for all trainings alike.
         generator: of the draws.
     Returns:
         (low, high); NaN where no replicate has frames of both sets in all trainings.
@@ -84,10 +87,12 @@ def interval_of_mean_area(
     areas = areas[np.isfinite(areas).all(axis=1)]
     if not len(areas):
         return float("nan"), float("nan")
-    count = len(trainings)
+    found = np.array([training.area for training in trainings])
+    fewest = min(np.count_nonzero(kinds & 1), np.count_nonzero(kinds & 2))
     middle = areas.mean(axis=1)
-    drawn = np.take_along_axis(areas, generator.integers(count, size=areas.shape), axis=1).mean(axis=1)
-    # The mean of so few trainings drawn from themselves varies too little; stretched, it does not.
-    found = middle + np.sqrt(count / (count - 1)) * (drawn - middle)
-    low, high = np.clip(np.quantile(found, [0.025, 0.975]), 0, 1)
+    drawn = np.take_along_axis(areas, generator.integers(len(found), size=areas.shape), axis=1).mean(axis=1)
+    of_recordings = stretch(fewest) * (middle - found.mean())
+    parts = [(float(of_recordings.var()), fewest - 1.0), variance_of_mean(found)]
+    deviations = widening(parts) * (of_recordings + stretch(len(found)) * (drawn - middle))
+    low, high = np.clip(found.mean() + np.quantile(deviations, [0.025, 0.975]), 0, 1)
     return float(low), float(high)

@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core.scoring.gaussians import check_features, check_same_width
+from ctlev_core.statistics.small_samples import percentile_levels
 from data_contracts.image_rows import Images
 from data_contracts.tables import Column, TableSchema
 
@@ -237,7 +238,7 @@ def _nearest_of(row: np.ndarray, references: np.ndarray, chosen: np.ndarray) -> 
 
 
 def _interval(distances: np.ndarray, real: np.ndarray, recordings: np.ndarray, seed: int) -> tuple[float, float]:
-    """Percentiles of the share of close frames over replicates of both sets; whole recordings of the recorded one."""
+    """Interval of the share of close frames over replicates of both sets; whole recordings of the recorded one."""
     _, group = np.unique(recordings, return_inverse=True)
     if group.max(initial=0) == 0 or len(distances) < 2:
         return float("nan"), float("nan")
@@ -248,5 +249,5 @@ def _interval(distances: np.ndarray, real: np.ndarray, recordings: np.ndarray, s
         drawn = np.concatenate([members[number] for number in rng.integers(0, len(members), len(members))])
         threshold = np.quantile(real[drawn], NEAR_QUANTILE)
         shares[replicate] = (rng.choice(distances, len(distances)) < threshold).mean()
-    low, high = np.quantile(shares, [0.025, 0.975])
+    low, high = np.quantile(shares, percentile_levels(len(members)))
     return float(low), float(high)

@@ -1,7 +1,8 @@
 """How sure is a score? Bootstrap intervals over groups of samples, and the spread over seeds.
 
 Frames of one recording resemble one another, so whole recordings are drawn, never single frames of them: a bootstrap
-over frames would give intervals that are far too narrow.
+over frames would give intervals that are far too narrow. Of few recordings the ends are farther out than percentiles of
+that level (`small_samples`).
 Source: Davison & Hinkley, Bootstrap Methods and their Application, 1997, section 3.8 (clusters).
 """
 
@@ -12,6 +13,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
+
+from ctlev_core.statistics.small_samples import LEVEL, percentile_levels
 
 MIN_RECORDINGS = 5
 """With fewer test recordings a bootstrap over them says too little: the tables then give no interval."""
@@ -45,7 +48,7 @@ def bootstrap_interval(
     values: np.ndarray,
     groups: Sequence[str] | np.ndarray | None = None,
     *,
-    level: float = 0.95,
+    level: float = LEVEL,
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> tuple[float, float]:
@@ -82,7 +85,7 @@ def cluster_bootstrap(
     compute: Callable[[np.ndarray], Mapping[str, float]],
     groups: Sequence[str] | np.ndarray,
     *,
-    level: float = 0.95,
+    level: float = LEVEL,
     num_resamples: int = 500,
     seed: int = 0,
 ) -> tuple[dict[str, float], dict[str, float]]:
@@ -112,7 +115,7 @@ def cluster_bootstrap(
     low, high = {}, {}
     for name in replicates[0]:
         values = [replicate[name] for replicate in replicates]
-        low[name], high[name] = (float(q) for q in np.quantile(values, [(1 - level) / 2, (1 + level) / 2]))
+        low[name], high[name] = (float(q) for q in np.quantile(values, percentile_levels(len(names), level)))
     return low, high
 
 
@@ -127,8 +130,8 @@ def ratio_bootstrap(
     sums: Mapping[str, tuple[np.ndarray, np.ndarray]],
     groups: Sequence[str] | np.ndarray,
     *,
-    level: float = 0.95,
-    num_resamples: int = 500,
+    level: float = LEVEL,
+    num_resamples: int = 2000,
     seed: int = 0,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """What `cluster_bootstrap` gives for scores that are quotients of two sums over rows, with the same draws.
@@ -153,7 +156,7 @@ def ratio_bootstrap(
     usable = (counts > 0).all(axis=1)
     if not usable.any():
         return {}, {}
-    ends = np.quantile(totals[usable] / counts[usable], [(1 - level) / 2, (1 + level) / 2], axis=0)
+    ends = np.quantile(totals[usable] / counts[usable], percentile_levels(len(names), level), axis=0)
     low, high = (dict(zip(sums, end.tolist(), strict=True)) for end in ends)
     return low, high
 

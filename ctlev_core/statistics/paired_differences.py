@@ -1,22 +1,22 @@
 """How much better is one training set than another, and how sure is that? Both are scored on the same samples.
 
 Recordings are drawn, the same for both training sets, and so are the trainings of each training set, independently: an
-interval covers the choice of test recordings and what varies between trainings with other seeds. Trainings are few:
-drawing R of R with replacement makes the variance of their mean (R - 1)/R of what it is, so that deviations are
-stretched by sqrt(R/(R - 1)) (Rao & Wu, Resampling Inference with Complex Survey Data, JASA 1988). Of a training set
-with one training nothing is known about that spread, and the interval covers recordings alone.
+interval covers the choice of test recordings and what varies between trainings with other seeds. Both are few, so that
+deviations of replicates from the score are stretched as `small_samples` has it, and then by the quantile of t, whose
+degrees of freedom are Satterthwaite's of the variances of recordings and of the trainings of each training set. Of a
+training set with one training nothing is known about its spread, and the interval covers recordings alone.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, score_text
+from ctlev_core.statistics.small_samples import stretch, variance_of_mean, widening
 
 NUM_RESAMPLES = 4000
 _CHUNK_NUMBERS = 4_000_000
@@ -96,8 +96,7 @@ def paired_difference(before: Trainings, after: Trainings, seed: int = 0) -> Dif
     Raises:
         ValueError: they are not about the same samples, or no sample is scored by all trainings.
     """
-    value, draws = _means([before, after], seed)
-    return Difference(float(value[1] - value[0]), *_ends(draws[:, 1] - draws[:, 0]))
+    return _contrast(_vary([before, after], seed), {0: -1.0, 1: 1.0})
 
 
 def share_of_gain(start: Trainings, reached: Trainings, oracle: Trainings, seed: int = 0) -> Difference | None:
@@ -109,10 +108,12 @@ def share_of_gain(start: Trainings, reached: Trainings, oracle: Trainings, seed:
     Raises:
         ValueError: as `paired_difference`.
     """
-    value, draws = _means([start, reached, oracle], seed)
-    low, high = _ends(draws[:, 2] - draws[:, 0])
-    if not (low > 0 or high < 0):
+    varied = _vary([start, reached, oracle], seed)
+    gain = _contrast(varied, {0: -1.0, 2: 1.0})
+    if not gain.is_certain:
         return None
+    by = widening(varied.parts({0: 1.0, 1: 1.0, 2: 1.0}))
+    value, draws = varied.values, varied.values + varied.deviations * by
     shares = (draws[:, 1] - draws[:, 0]) / (draws[:, 2] - draws[:, 0])
     return Difference(float((value[1] - value[0]) / (value[2] - value[0])), *_ends(shares))
 
@@ -123,13 +124,49 @@ def unpaired_difference(before: Trainings, after: Trainings, seed: int = 0) -> D
     Raises:
         ValueError: no sample is scored by all trainings of a training_set.
     """
-    (value_before,), draws_before = _means([before], seed)
-    (value_after,), draws_after = _means([after], seed + 1)
-    return Difference(float(value_after - value_before), *_ends(draws_after[:, 0] - draws_before[:, 0]))
+    first, second = _vary([before], seed), _vary([after], seed + 1)
+    value = float(second.values[0] - first.values[0])
+    deviations = second.deviations[:, 0] - first.deviations[:, 0]
+    by = widening([*first.parts({0: 1.0}), *second.parts({0: 1.0})])
+    return Difference(value, *_ends(value + by * deviations))
 
 
-def _means(training_sets: Sequence[Trainings], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean score of each training set [S], and of its replicates [NUM_RESAMPLES, S]; NaN with too few recordings."""
+@dataclass(frozen=True, eq=False)
+class _Varied:
+    """What is known of S training sets on the same samples.
+
+    Attributes:
+        values: [S] mean score.
+        deviations: [NUM_RESAMPLES, S] of replicates, recordings and trainings drawn; NaN with too few recordings.
+        recordings: [NUM_RESAMPLES, S] the part of them that recordings have.
+        num_recordings: that are scored.
+        trainings: of each training set the variance of its mean over trainings, and the degrees of freedom.
+    """
+
+    values: np.ndarray
+    deviations: np.ndarray
+    recordings: np.ndarray
+    num_recordings: int
+    trainings: tuple[tuple[float, float], ...]
+
+    def parts(self, weights: Mapping[int, float]) -> list[tuple[float, float]]:
+        """Variances, with degrees of freedom, of a weighted sum of the training sets."""
+        sampled = sum(weight * self.recordings[:, of_set] for of_set, weight in weights.items())
+        parts = [(float(np.var(sampled)), self.num_recordings - 1.0)]
+        for of_set, weight in weights.items():
+            variance, freedom = self.trainings[of_set]
+            parts.append((weight**2 * variance, freedom))
+        return parts
+
+
+def _contrast(varied: _Varied, weights: Mapping[int, float]) -> Difference:
+    """A weighted sum of the training sets' scores, with its interval."""
+    value = sum(weight * float(varied.values[of_set]) for of_set, weight in weights.items())
+    deviations = np.sum([weight * varied.deviations[:, of_set] for of_set, weight in weights.items()], axis=0)
+    return Difference(value, *_ends(value + widening(varied.parts(weights)) * deviations))
+
+
+def _vary(training_sets: Sequence[Trainings], seed: int) -> _Varied:
     first = training_sets[0]
     if not all(first.scores_the_same_as(other) for other in training_sets):
         raise ValueError("paired scores must be about the same samples in the same order")
@@ -142,20 +179,25 @@ def _means(training_sets: Sequence[Trainings], seed: int) -> tuple[np.ndarray, n
     names, index = np.unique(np.asarray(first.recordings)[scored], return_inverse=True)
     weights = weights[scored]
     counts = np.bincount(index, weights=weights)
-    sums = [
-        np.stack([np.bincount(index, weights=weights * values) for values in training_set.values[:, scored]])
-        for training_set in training_sets
-    ]
+    sums = []
+    for training_set in training_sets:
+        of_set = [np.bincount(index, weights=weights * values) for values in training_set.values[:, scored]]
+        # In the order of their scores, so that the order of trainings changes nothing.
+        sums.append(np.stack(sorted(of_set, key=lambda one: float(one.sum()))))
     found = np.array([of_set.sum() / (len(of_set) * counts.sum()) for of_set in sums])
+    trainings = tuple(variance_of_mean(of_set.sum(axis=1) / counts.sum()) for of_set in sums)
     if len(names) < MIN_RECORDINGS:
-        return found, np.full((1, len(training_sets)), np.nan)
+        unknown = np.full((1, len(training_sets)), np.nan)
+        return _Varied(found, unknown, unknown, len(names), trainings)
     generator = np.random.default_rng(seed)
     drawn = [
         [(times @ of_set.T) / (times @ counts)[:, None] for of_set in sums]
         for times in _draw_recordings(len(names), generator)
     ]
     of_trainings = [np.concatenate(parts) for parts in zip(*drawn, strict=True)]
-    return found, np.stack([_draw_trainings(means, generator) for means in of_trainings], axis=1)
+    recordings = (np.stack([means.mean(axis=1) for means in of_trainings], axis=1) - found) * stretch(len(names))
+    of_draws = np.stack([_draw_trainings(means, generator) for means in of_trainings], axis=1)
+    return _Varied(found, recordings + of_draws, recordings, len(names), trainings)
 
 
 def _draw_recordings(count: int, generator: np.random.Generator) -> Iterator[np.ndarray]:
@@ -166,13 +208,12 @@ def _draw_recordings(count: int, generator: np.random.Generator) -> Iterator[np.
 
 
 def _draw_trainings(means: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """The mean over trainings [B] of replicates [B, R], with trainings drawn as well."""
+    """How much the mean over trainings [B] of replicates [B, R] changes where trainings are drawn as well."""
     count = means.shape[1]
-    centre = means.mean(axis=1)
     if count < 2:
-        return centre
+        return np.zeros(len(means))
     weights = generator.multinomial(count, np.full(count, 1 / count), size=len(means)) / count
-    return centre + math.sqrt(count / (count - 1)) * ((weights * means).sum(axis=1) - centre)
+    return stretch(count) * ((weights * means).sum(axis=1) - means.mean(axis=1))
 
 
 def _ends(draws: np.ndarray) -> tuple[float, float]:

@@ -37,13 +37,12 @@ import pyarrow as pa
 
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from ctlev_core.statistics.paired_differences import NUM_RESAMPLES, Difference
+from ctlev_core.statistics.small_samples import satterthwaite, stretch, t_quantile
 from data_contracts.errors import DataError
 from data_contracts.training_sets import ORACLE, RECORDED, LabelAgreement, TrainingSet
 
 WITHOUT_GENERATOR = (RECORDED, ORACLE)
 """Settings made of these alone learnt from no generator's frames."""
-_LEVEL = 0.975
-_NORMAL = 1.959964
 _HALVINGS = 20
 _KEY = ("subject", "training", "sample_id", "recording_id", "value", "weight", "samples_digest")
 
@@ -219,6 +218,7 @@ class PooledScores:
             return Difference(value, float("nan"), float("nan")), np.full(1, np.nan)
         zeros = np.zeros(NUM_RESAMPLES)
         replicates = sum((weight * (part.recordings - part.value) for weight, part in parts), zeros)
+        replicates *= stretch(self.num_recordings)
         sampled = float(replicates.var()), float(self.num_recordings - 1)
         draws = sum((weight * part.draws for weight, part in parts), np.zeros(self.num_draws))
         within = [(weight**2 * part.variance, part.freedom) for weight, part in parts]
@@ -321,7 +321,7 @@ def _stretched(random: np.random.Generator, count: int, shape: tuple[int, ...]) 
     if count < 2:
         return np.zeros((*shape, count))
     times = random.multinomial(count, np.full(count, 1 / count), size=shape)
-    return times * (math.sqrt(count / (count - 1)) / count)
+    return times * (stretch(count) / count)
 
 
 def _vary(
@@ -394,14 +394,7 @@ def _vary_draws(
     if found > expected:
         deviations = weights @ (means - means.mean()) * math.sqrt(1 - expected / found)
         return deviations + within, (found / count, count - 1.0)
-    return within, (expected / count, _satterthwaite(known))
-
-
-def _satterthwaite(parts: Sequence[tuple[float, float]]) -> float:
-    """Degrees of freedom of a sum of variances, each with its own."""
-    total = sum(variance for variance, _ in parts)
-    below = sum(variance**2 / freedom for variance, freedom in parts if variance)
-    return total**2 / below if below else math.inf
+    return within, (expected / count, satterthwaite(known))
 
 
 def _interval(
@@ -415,16 +408,11 @@ def _interval(
         parts: (variance, degrees of freedom) of what recordings and draws add.
     """
     total = sum(variance for variance, _ in parts)
-    squares = sum(variance * _quantile(freedom) ** 2 for variance, freedom in parts)
-    quantile = math.sqrt(squares / total) if total else _NORMAL
+    squares = sum(variance * t_quantile(freedom) ** 2 for variance, freedom in parts)
+    normal = t_quantile(math.inf)
+    quantile = math.sqrt(squares / total) if total else normal
     half = quantile * float(deviations.std())
-    return Difference(value, value - half, value + half), value + deviations * (quantile / _NORMAL)
-
-
-def _quantile(freedom: float) -> float:
-    from scipy.stats import t as student  # here, because a cached run needs no scipy
-
-    return float(student.ppf(_LEVEL, freedom)) if math.isfinite(freedom) else _NORMAL
+    return Difference(value, value - half, value + half), value + deviations * (quantile / normal)
 
 
 def _minus(after: str, before: str) -> dict[str, float]:

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import t as student
 
+from ctlev_core.statistics import paired_differences
 from ctlev_core.statistics.bootstrap import bootstrap_interval
 from ctlev_core.statistics.paired_differences import (
     Difference,
@@ -41,14 +43,14 @@ def test_equal_scores_differ_by_exactly_zero():
 
 @pytest.mark.parametrize("count", [3, 6])
 def test_the_spread_between_trainings_is_covered(count):
-    """Samples that are alike leave that spread alone: its standard error is s / sqrt(R)."""
+    """Samples that are alike leave that spread alone: the interval is that of t with R - 1 degrees of freedom."""
     offsets = np.random.default_rng(count).normal(0, 1, count)
     before, after = trainings(np.zeros((1, 50))), trainings(np.repeat(offsets[:, None], 50, axis=1))
     found = paired_difference(before, after)
     error = offsets.std(ddof=1) / np.sqrt(count)
     assert found.value == pytest.approx(offsets.mean())
     # Few trainings give few different replicates, so that quantiles are coarse.
-    assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.2)
+    assert found.high - found.low == pytest.approx(2 * student.ppf(0.975, count - 1) * error, rel=0.2)
 
 
 def test_intervals_cover_the_truth_about_as_often_as_they_say():
@@ -63,8 +65,35 @@ def test_intervals_cover_the_truth_about_as_often_as_they_say():
             training_sets.append(trainings(shared + own + effect + seeds + random.normal(0, 0.3, (5, 90)), recordings))
         found = paired_difference(*training_sets, seed=run)
         covered += found.low <= -0.5 <= found.high
-    # 5 trainings and 30 recordings: a little less than 95 %; the binomial spread of 60 runs is 3 %.
-    assert 0.83 <= covered / runs <= 0.99
+    # The binomial spread of 60 runs is 3 %.
+    assert 0.88 <= covered / runs <= 1
+
+
+# Percentiles alone cover the truth in 83, 91, 96 and 90 % of such studies. Of 1,000 the binomial spread is 0.7 %.
+@pytest.mark.parametrize(
+    "num_recordings, num_trainings, spread, least",
+    [(5, 1, 0.0, 0.925), (10, 1, 0.0, 0.925), (10, 2, 0.1, 0.94), (10, 2, 0.5, 0.94)],
+)
+def test_intervals_of_few_recordings_and_trainings_cover_the_truth(
+    monkeypatch, num_recordings, num_trainings, spread, least
+):
+    monkeypatch.setattr(paired_differences, "NUM_RESAMPLES", 1000)
+    random, covered, runs = np.random.default_rng(7), 0, 1000
+    recordings = [f"r{row}" for row in range(num_recordings)]
+    for run in range(runs):
+        effects = (np.zeros(num_recordings), random.normal(0, 1, num_recordings))
+        before, after = (
+            trainings(
+                effect
+                + random.normal(0, spread, (num_trainings, 1))
+                + random.normal(0, 0.3, (num_trainings, num_recordings)),
+                recordings,
+            )
+            for effect in effects
+        )
+        found = paired_difference(before, after, seed=run)
+        covered += found.low <= 0 <= found.high
+    assert covered / runs >= least
 
 
 def test_missing_scores_leave_the_pair_out():
@@ -115,7 +144,7 @@ def test_results_do_not_depend_on_the_order_of_trainings():
     values, other = random.normal(size=(3, 40)), trainings(random.normal(size=(2, 40)))
     first, second = (paired_difference(trainings(rows), other) for rows in (values, values[::-1]))
     assert first.value == pytest.approx(second.value)
-    assert (first.low, first.high) == pytest.approx((second.low, second.high), abs=0.03)
+    assert (first.low, first.high) == pytest.approx((second.low, second.high), rel=1e-12)
 
 
 def test_the_difference_is_that_of_the_weighted_means():
