@@ -2,7 +2,8 @@
 
 Frames of one recording resemble one another, so whole recordings are drawn, never single frames of them: a bootstrap
 over frames would give intervals that are far too narrow. Of few recordings the ends are farther out than percentiles of
-that level (`small_samples`).
+that level (`small_samples`). Replicates are moved by the difference of the score and their mean: a resampled set has
+fewer different recordings, and some scores, such as a calibration error, are larger for that alone.
 Source: Davison & Hinkley, Bootstrap Methods and their Application, 1997, section 3.8 (clusters).
 """
 
@@ -89,7 +90,7 @@ def cluster_bootstrap(
     num_resamples: int = 500,
     seed: int = 0,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Percentile intervals of any scores under resampling of whole groups; one call of `compute` a replicate.
+    """Intervals of any scores under resampling of whole groups; one call of `compute` a replicate.
 
     Args:
         compute: named scores of the given rows, in which rows of a group drawn twice come twice.
@@ -105,6 +106,7 @@ def cluster_bootstrap(
     if len(names) < 2:
         return {}, {}
     by_group, sizes = np.argsort(index, kind="stable"), np.bincount(index)
+    whole = compute(np.arange(len(index)))
     replicates: list[Mapping[str, float]] = []
     for draws in _draws(len(names), num_resamples, seed):
         for counts in draws:
@@ -112,10 +114,19 @@ def cluster_bootstrap(
                 replicates.append(compute(by_group[_repeated(sizes, counts)]))
     if not replicates:
         return {}, {}
-    low, high = {}, {}
-    for name in replicates[0]:
-        values = [replicate[name] for replicate in replicates]
-        low[name], high[name] = (float(q) for q in np.quantile(values, percentile_levels(len(names), level)))
+    scores = [name for name in replicates[0] if name in whole]
+    found = np.array([[replicate[name] for name in scores] for replicate in replicates])
+    return _ends(scores, found, np.array([whole[name] for name in scores]), percentile_levels(len(names), level))
+
+
+def _ends(
+    names: Sequence[str], replicates: np.ndarray, values: np.ndarray, levels: tuple[float, float]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Lower and upper ends by name, of replicates [B, S] of scores [S]."""
+    ends = np.quantile(replicates - replicates.mean(axis=0) + values, levels, axis=0)
+    # No end is outside what was seen: a share stays between 0 and 1.
+    ends = np.clip(ends, np.minimum(values, replicates.min(axis=0)), np.maximum(values, replicates.max(axis=0)))
+    low, high = (dict(zip(names, end.tolist(), strict=True)) for end in ends)
     return low, high
 
 
@@ -156,9 +167,9 @@ def ratio_bootstrap(
     usable = (counts > 0).all(axis=1)
     if not usable.any():
         return {}, {}
-    ends = np.quantile(totals[usable] / counts[usable], percentile_levels(len(names), level), axis=0)
-    low, high = (dict(zip(sums, end.tolist(), strict=True)) for end in ends)
-    return low, high
+    # A replicate that is usable has rows of every score, and so has the whole.
+    values = columns[::2].sum(axis=1) / columns[1::2].sum(axis=1)
+    return _ends(list(sums), totals[usable] / counts[usable], values, percentile_levels(len(names), level))
 
 
 def _draws(group_count: int, num_resamples: int, seed: int) -> Iterator[np.ndarray]:

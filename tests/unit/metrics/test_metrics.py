@@ -210,6 +210,17 @@ def test_replicates_that_cannot_be_scored_are_left_out():
     assert cluster_bootstrap(compute, ["a", "b", "c"]) == ({"score": 1.0}, {"score": 1.0})
 
 
+def test_the_interval_of_a_score_that_grows_as_rows_repeat_has_the_score_in_it():
+    """The share of the most frequent of ten values that are all as frequent: resampled, one is always more frequent."""
+    values = np.repeat(np.arange(10), 3)
+
+    def compute(rows):
+        return {"largest": float(np.bincount(values[rows]).max() / len(rows))}
+
+    low, high = cluster_bootstrap(compute, np.arange(30), seed=1)
+    assert low["largest"] <= 0.1 < high["largest"] < 0.2
+
+
 def test_a_replicate_is_whole_groups_one_after_the_other():
     groups = np.random.default_rng(1).permutation(np.repeat(["a", "b", "c", "d"], [1, 4, 2, 5]))
     members = [np.flatnonzero(groups == name) for name in "abcd"]
@@ -220,8 +231,9 @@ def test_a_replicate_is_whole_groups_one_after_the_other():
         return {"rows": 1.0}
 
     cluster_bootstrap(compute, groups, num_resamples=50, seed=2)
-    assert len(replicates) == 50
-    for rows in replicates:
+    np.testing.assert_array_equal(replicates[0], np.arange(12))
+    assert len(replicates) == 51
+    for rows in replicates[1:]:
         counts = [np.count_nonzero(rows == own[0]) for own in members]
         assert sum(counts) == 4
         expected = [np.tile(own, count) for own, count in zip(members, counts, strict=True)]
