@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from data_contracts.config import (
+    ADDED_LATER,
     ConditionChoice,
     DatasetChoice,
     DownstreamChoice,
@@ -19,6 +20,7 @@ from data_contracts.config import (
     Windows,
 )
 from data_contracts.event_export import EventExport
+from data_contracts.labels import HeldOut
 from data_contracts.training_sets import (
     LABEL_CONSISTENT,
     ORACLE,
@@ -124,6 +126,12 @@ class Experiment(Frozen):
         "labelled", description="bodies to sample from as their own camera sees them, or from new, random sides"
     )
     windows: Windows = Windows()
+    evaluate_on: HeldOut = Field(
+        "test",
+        json_schema_extra=ADDED_LATER,
+        description="recordings that models are scored on and frames compared with: options are chosen on "
+        "`validation`, with which nothing of the test recordings is encoded; `test` is for the last run",
+    )
     num_recorded: int | None = Field(
         None,
         ge=1,

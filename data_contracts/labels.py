@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -15,6 +16,17 @@ from data_contracts.image_rows import Images
 
 SPLITS = ("train", "validation", "test", "condition")
 """`condition`: labels without events, used only as conditions to sample from. Fixed at ingest."""
+
+HELD_OUT_SPLITS = ("test", "validation")
+HeldOut = Literal["test", "validation"]
+"""Splits that nothing is learnt from and models are scored on: options are chosen on one, the other says what came of
+it."""
+
+
+def held_out_split(splits: Iterable[str]) -> HeldOut:
+    """The split that models are scored on, of frames of these splits: `validation` where that is all there is."""
+    found = set(splits)
+    return "validation" if "validation" in found and "test" not in found else "test"
 
 
 @dataclass(frozen=True)

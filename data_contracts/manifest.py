@@ -40,7 +40,7 @@ from data_contracts.file_lists import (
     write_file_list,
 )
 from data_contracts.image_rows import ImageRows
-from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, History, Labels
+from data_contracts.labels import LABEL_ARRAYS, BodyMotions, Conditions, HeldOut, History, Labels, held_out_split
 from data_contracts.run_record import RUN_FILE, read_run_record
 from data_contracts.tables import TABLES, TableSchema, check_table
 
@@ -157,6 +157,11 @@ class Manifest:
         for name, value in values.items():
             keep &= np.array([item == value for item in self.column(name)], dtype=bool)
         return np.flatnonzero(keep)
+
+    @cached_property
+    def held_out(self) -> HeldOut:
+        """The split of frames that models are scored on: `test`, or `validation` of frames for choosing options."""
+        return held_out_split(self.column("split"))
 
     @cached_property
     def labels(self) -> Labels:

@@ -25,7 +25,8 @@ class Link(Frozen):
 class ChainOptions(Frozen):
     """Which frames, how far they are noised, and in how many steps others are sampled.
 
-    Frames of split `test` are held out: the network has not learnt them by heart.
+    Frames of split `test` are held out, or with `evaluate_on: validation` those of validation: the network has not
+    learnt them by heart.
     """
 
     split: Literal["train", "test"] = Field(default="test", description="of the recorded frames that are sent through")

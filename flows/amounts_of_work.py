@@ -12,7 +12,9 @@ from ctlev_core import plugins
 from data_contracts.config import DatasetChoice
 from tasks.stage import PlannedStage
 
-_RECORDINGS = ("num_train_recordings", "num_test_recordings", "num_condition_recordings")
+_RECORDINGS = (
+    "num_train_recordings", "num_test_recordings", "num_validation_recordings", "num_condition_recordings",
+)  # fmt: skip
 _ROWS = ("count", "num_images", "num_frames")
 _FRAMES_OF_CONDITIONS = ("sample", "simulate", "decode_pixels")
 """Stages that make a row for each of their conditions."""

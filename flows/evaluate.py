@@ -27,6 +27,7 @@ from flows.settings import flow
 from flows.synthesize import synthesize
 from tasks.downstream import train_downstream
 from tasks.evaluate import score_distance, score_model
+from tasks.openings import note_opening
 from tasks.stage import call_flow, call_together, numbered
 from tasks.subset import take_label_consistent, take_share
 
@@ -35,12 +36,15 @@ Generated = dict[str, list[ManifestRef]]
 
 
 class Evaluation(Frozen):
-    """Scores, and the models behind them; `extractor` is the model in whose features frames are compared."""
+    """Scores, and the models behind them; `extractor` is the model in whose features frames are compared, `openings`
+    how many experiments were scored on the same test frames.
+    """
 
     extractor: ManifestRef | None
     scores: list[ManifestRef]
     models: list[ManifestRef]
     model_names: list[str]
+    openings: int | None = None
 
 
 @flow(name="evaluate")
@@ -71,6 +75,7 @@ def evaluate(
         scores=[score for _, scores in found for score in scores],
         models=[model for model, _ in found[: len(trained)]],
         model_names=[f"{training_set}, seed {seed}" for training_set, seed in trained],
+        openings=note_opening(dataset.tested_frames, experiment) if experiment.evaluate_on == "test" else None,
     )
 
 
@@ -83,7 +88,7 @@ def _train_and_score(
     model = train_downstream(frames, downstream=experiment.downstream, seed=seed, label=label)
     sensor = partial(sensor_of, experiment, dataset.recordings)
     own = sensor_of(experiment, dataset.tested_recordings)
-    tested = [(dataset.tested_frames, "test", str(training_set), [dataset.poses], own)]
+    tested = [(dataset.tested_frames, experiment.evaluate_on, str(training_set), [dataset.poses], own)]
     if training_set == TrainingSet.of(RECORDED):
         # Do the synthetic frames show what their labels say? The recorded row is the best they can do, labels of other
         # frames the worst.
@@ -157,7 +162,7 @@ def _distances(
         [dataset.frames], downstream=feature_extractor, seed=experiment.seed, label="feature extractor"
     )
     frames = dataset.tested_frames
-    compared = [(frames, "test", "held-out recorded", 0)]
+    compared = [(frames, experiment.evaluate_on, "held-out recorded", 0)]
     compared += [(made, "train", name, number) for name, sets in generated.items() for number, made in enumerate(sets)]
     scores = [
         score_distance(

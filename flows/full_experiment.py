@@ -112,7 +112,7 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         target=dataset.target_frames,
         nearest=nearest,
     )
-    return report(made, label=experiment.name)
+    return report(made, openings=evaluation.openings, label=experiment.name)
 
 
 def _study(study: Study) -> ManifestRef:

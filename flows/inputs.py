@@ -118,7 +118,7 @@ def _look_for(choice: Choice) -> None:
 
 
 def _check_labels(experiment: Experiment) -> None:
-    check_dataset(experiment.metrics, experiment.tested_dataset)
+    check_dataset(experiment.metrics, experiment.tested_dataset, experiment.evaluate_on)
 
 
 def _check_counts(experiment: Experiment) -> None:

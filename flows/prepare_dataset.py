@@ -6,6 +6,7 @@ import sys
 
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.experiment import Experiment
+from data_contracts.labels import HeldOut
 from data_contracts.manifest import ManifestRef
 from flows.cli import script
 from flows.command_line import Command
@@ -50,7 +51,11 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
     """Ingest, encode and condition one dataset."""
     recordings = ingest(dataset=experiment.dataset, label=experiment.dataset.name)
     frames = encode(
-        recordings, encoding=experiment.encoding, windows=experiment.windows, label=experiment.encoding.name
+        recordings,
+        encoding=experiment.encoding,
+        windows=experiment.windows,
+        held_out=held_out_of(experiment),
+        label=experiment.encoding.name,
     )
     if experiment.num_recorded is not None:
         frames = take_recorded(
@@ -59,7 +64,13 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
     poses, target_frames, target_recordings = recordings, None, None
     if experiment.target is not None:
         poses = target_recordings = ingest(dataset=experiment.target, label=f"{experiment.target.name}, target")
-        target_frames = encode(poses, encoding=experiment.encoding, windows=experiment.windows, label="target")
+        target_frames = encode(
+            poses,
+            encoding=experiment.encoding,
+            windows=experiment.windows,
+            held_out=held_out_of(experiment),
+            label="target",
+        )
     if experiment.poses is not None:
         poses = ingest(dataset=experiment.poses, label=f"{experiment.poses.name}, poses")
     frame_conditions = condition_training_frames(experiment, recordings, frames, experiment.condition)
@@ -83,6 +94,11 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         target_frames=target_frames,
         target_recordings=target_recordings,
     )
+
+
+def held_out_of(experiment: Experiment) -> HeldOut | None:
+    """What `encode` is told: None for test recordings, as it was before there was a choice."""
+    return None if experiment.evaluate_on == "test" else experiment.evaluate_on
 
 
 def _more_frames(experiment: Experiment) -> ManifestRef | None:

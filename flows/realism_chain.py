@@ -73,15 +73,16 @@ def realism_chain(asked: RealismChain) -> ManifestRef:
     The links follow one another: whole sampling takes all cores or devices by itself.
     """
     dataset, options = call_flow(prepare_dataset, asked), asked.chain
+    split = asked.evaluate_on if options.split == "test" else options.split
     conditions = condition_some_frames(
         dataset.recordings,
         dataset.frames,
         condition=asked.condition,
         encoding=asked.encoding,
-        split=options.split,
+        split=split,
         count=options.num_frames,
         seed=options.seed,
-        label=f"{asked.condition.name}, recorded frames of split {options.split}",
+        label=f"{asked.condition.name}, recorded frames of split {split}",
     )
     checkpoint = call_flow(train_generator, asked, dataset)
     decoder = train_decoder(

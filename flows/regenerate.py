@@ -137,7 +137,7 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
     frames, downstream, seed = dataset.tested_frames, regeneration.downstream, regeneration.downstream_seeds[0]
     model = train_downstream([frames], downstream=downstream, seed=seed, label=f"{downstream.name} on recorded")
     scored = [
-        (frames, "test", RECORDED, [dataset.poses], dataset.tested_recordings),
+        (frames, regeneration.evaluate_on, RECORDED, [dataset.poses], dataset.tested_recordings),
         (synthetic, "train", str(LabelAgreement(SYNTHETIC)), [], dataset.recordings),
     ]
     return [

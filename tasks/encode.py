@@ -25,7 +25,7 @@ from data_contracts.arrays import load_array, save_compressed
 from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
-from data_contracts.labels import Labels
+from data_contracts.labels import HeldOut, Labels
 from data_contracts.manifest import LabelKinds, Manifest, concat_labels, label_columns, labels_of, rows_by_recording
 from data_contracts.tables import TableSchema
 from tasks.stage import Output, stage
@@ -43,15 +43,24 @@ TABLE_ROWS = 1 << 13
 logger = logging.getLogger(__name__)
 
 
-@stage(version=6, schema=tables.FRAMES)
-def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windows: Windows) -> pa.Table:
+@stage(version=6, schema=tables.FRAMES, optional=("held_out",))
+def encode(
+    out: Output,
+    recordings: Manifest,
+    *,
+    encoding: EncodingChoice,
+    windows: Windows,
+    held_out: HeldOut | None = None,
+) -> pa.Table:
     """Cut every recording into windows and encode each: arrays `histograms` (counts) and `frames` (8-bit RGB).
 
     Counts have the size of the sensor, or with resampling `events` that of the image. Where sensors differ, counts lie
     in the upper left corner of an array that is as large as the largest, with zeros beyond. Of event images that come
     finished every one is a window, and its grey values stand for counts.
+
+    With `held_out="validation"` nothing of the split `test` is encoded, so that no later stage can look at it.
     """
-    sources = _Sources(recordings, windows)
+    sources = _Sources(recordings, windows, without="test" if held_out == "validation" else None)
     canvas = _canvas(sources, encoding)
     made = _FrameTable()
     with out.open_array("histograms") as histograms, out.open_array("frames") as frames:
@@ -69,10 +78,10 @@ def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windo
             made.append(source, cut)
     table = made.finish()
     splits = set(pc.unique(table["split"]).to_pylist()) if len(table) else set()
-    for split in ("train", "test"):
+    for split in ("train", held_out or "test"):
         if split not in splits:
             raise DataError(f"encode: no window in split {split!r}; the recordings are too short for {windows!r}")
-    _check_classes(recordings, table, windows)
+    _check_classes(recordings, table, windows, ("train", held_out or "test"))
     return table
 
 
@@ -139,14 +148,14 @@ def _on_canvas(histograms: np.ndarray, canvas: tuple[int, int] | None) -> Iterat
         yield np.pad(histograms[row : row + 1], beyond)
 
 
-def _check_classes(recordings: Manifest, table: pa.Table, windows: Windows) -> None:
+def _check_classes(recordings: Manifest, table: pa.Table, windows: Windows, needed: tuple[str, ...]) -> None:
     """Say where a class was recorded and none of it is left: what follows does not know that there is such a class."""
     left = {(row["split"], row["class_name"]) for row in _different(table.select(["split", "class_name"]))}
     recorded = {
         (split, row["class_name"])
         for row in _different(_visible(recordings).select(["splits", "class_name"]))
         for split in row["splits"].split("+")
-        if row["class_name"] and split in ("train", "test")
+        if row["class_name"] and split in needed
     }
     for split, name in sorted(recorded - left):
         logger.warning(
@@ -230,10 +239,10 @@ class _Sources(Sequence[RecordingSource]):
         table: a row for each.
     """
 
-    def __init__(self, recordings: Manifest, windows: Windows) -> None:
+    def __init__(self, recordings: Manifest, windows: Windows, without: str | None = None) -> None:
         own = windows.method == "dataset"
         self.table = _visible(recordings)
-        self._recordings, self._own_windows = recordings, own
+        self._recordings, self._own_windows, self._without = recordings, own, without
         schemas = (tables.PARTS, tables.LABELS, *((tables.WINDOWS, tables.WINDOW_LABELS) if own else ()))
         self._attached = {schema.name: recordings.attached(schema) for schema in schemas}
         names = self.table["recording_id"]
@@ -291,7 +300,9 @@ class _Sources(Sequence[RecordingSource]):
                     events=stored_events(self._recordings, row) if has_events else None,
                     event_images=None if has_events else self._recordings.path(row["event_images_file"]),
                     parts=tuple(
-                        RecordingPart(part["split"], part["event_start"], part["event_stop"]) for part in parts[a:b]
+                        RecordingPart(part["split"], part["event_start"], part["event_stop"])
+                        for part in parts[a:b]
+                        if part["split"] != self._without
                     ),
                     track=tracks.take(np.arange(*self._range(tables.LABELS, number, first_label))),
                     windows=windows[c:d] if own else None,

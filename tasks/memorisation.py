@@ -39,12 +39,12 @@ def memorisation(
     features.
 
     Other recorded frames are the training frames against those of other recordings; where all training frames are of
-    one recording, the test frames. The closest pairs lie beside the table.
+    one recording, the held-out frames. The closest pairs lie beside the table.
     """
     learnt, made = frames.rows_where(split="train"), generated.rows_where(split="train")
     made = made[spread(len(made), MAX_OTHER_FRAMES)]
     recordings = np.array(frames.column("recording_id"))
-    other = learnt if len(set(recordings[learnt])) > 1 else frames.rows_where(split="test")
+    other = learnt if len(set(recordings[learnt])) > 1 else frames.rows_where(split=frames.held_out)
     other = other[spread(len(other), MAX_OTHER_FRAMES)]
     if not len(learnt) or not len(made) or not len(other):
         raise DataError(

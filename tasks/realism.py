@@ -39,7 +39,7 @@ def realism(
     *,
     names: Sequence[str],
 ) -> pa.Table:
-    """Events of the test split beside those of the training split, and generated beside recorded training frames.
+    """Events of the held-out split beside those of the training split, and generated beside recorded training frames.
 
     `recordings` are those behind `frames`; None leaves events out. `reference` are other recordings that those of the
     training split are compared with, `names` those of the generators behind `generated`.
@@ -49,28 +49,31 @@ def realism(
     `A against A` for the floor. Distributions lie beside the table.
 
     How well a network tells frames apart is the metric `c2st`: generated from recorded training frames (`NAME against
-    recorded`) and from recorded test frames (`NAME against test`); its floors are the halves of either (`recorded
+    recorded`) and from recorded test frames (`NAME against test`, or
+    `validation` where these are what is held out); its floors are the halves of either (`recorded
     against recorded`, `test against test`) and test from training frames (`test against recorded`). Where there are too
     few frames there is no such row; the table `two_sample_tests`, which lies beside, says why.
     """
     found, tests = [], []
     if recordings is not None:
         learnt = _summarise_recordings(recordings, "train")
-        found.append(_compare("events", "train", "test", learnt, _summarise_recordings(recordings, "test"), recordings))
+        held_out = _summarise_recordings(recordings, frames.held_out)
+        found.append(_compare("events", "train", frames.held_out, learnt, held_out, recordings))
         if reference is not None:
             found.append(_compare("reference", "reference", "train", _summarise_whole(reference), learnt, recordings))
     real = _summarise_frames(frames)
-    recorded = {RECORDED: _read_frames(frames, "train"), "test": _read_frames(frames, "test")}
+    other = frames.held_out
+    recorded = {RECORDED: _read_frames(frames, "train"), other: _read_frames(frames, other)}
     floors = {
         **{f"{name} against {name}": two_sample.compare_halves(*of_split) for name, of_split in recorded.items()},
-        "test against recorded": _tell_apart("test", recorded["test"], RECORDED, recorded[RECORDED]),
+        f"{other} against {RECORDED}": _tell_apart(other, recorded[other], RECORDED, recorded[RECORDED]),
     }
     groups = ["frames", *(f"frames of {name}" for name in names[1:])]
     for group, name, made in zip(groups, names, generated, strict=True):
         found.append(_compare(group, RECORDED, name, real, _summarise_frames(made), made))
         own = {
-            f"{name} against {other}": _tell_apart(name, _read_made_frames(made, others[1]), other, others)
-            for other, others in recorded.items()
+            f"{name} against {split}": _tell_apart(name, _read_made_frames(made, of_split[1]), split, of_split)
+            for split, of_split in recorded.items()
         }
         # The floors are the same for all generators: beside each in the scores, once in the table of tests.
         found.append((_test_rows(group, own | floors, made), []))

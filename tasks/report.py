@@ -11,8 +11,12 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 
-@stage(version=21, schema=tables.REPORT)
-def report(out: Output, made: ReportInputs[Manifest]) -> pa.Table:
-    """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, `provenance.json` and `summary.json`."""
-    write_report(made, out.folder)
+@stage(version=21, schema=tables.REPORT, aside=("openings",))
+def report(out: Output, made: ReportInputs[Manifest], *, openings: int | None = None) -> pa.Table:
+    """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, `provenance.json` and `summary.json`.
+
+    `openings` is how many experiments had been scored on the same test frames when the report was made; it is no part
+    of what the report is of, which later experiments do not change.
+    """
+    write_report(made, out.folder, openings)
     return pa.table({"table": TABLES, "file": [f"{name}.parquet" for name in TABLES]})

@@ -34,7 +34,8 @@ def score_beside_real(
     """
     plugin, folder = plugins.load_options(downstream), extractor.ref.path / "model"
     learnt, held_out, made = (
-        data.rows_where(split=split) for data, split in ((frames, "train"), (frames, "test"), (generated, "train"))
+        data.rows_where(split=split)
+        for data, split in ((frames, "train"), (frames, frames.held_out), (generated, "train"))
     )
     count = min(len(held_out), len(made))
     if min(count, len(learnt)) < 2:

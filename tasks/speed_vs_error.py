@@ -113,7 +113,7 @@ def sampling_errors(
     def features(pictures: np.ndarray, groups: list[str]) -> FeatureSet:
         return FeatureSet(feature_plugin.module.features(folder, pictures), np.array(groups))
 
-    held_out = frames.rows_where(split="test")
+    held_out = frames.rows_where(split=frames.held_out)
     recordings = [frames.column("recording_id")[row] for row in held_out]
     real_frames = np.asarray(frames.array("frames")[held_out])
     real = features(real_frames, recordings)

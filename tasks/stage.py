@@ -123,6 +123,11 @@ def planning() -> Iterator[list[PlannedStage]]:
         _plan.reset(token)
 
 
+def is_planning() -> bool:
+    """Are stages and flows only noting what they would do?"""
+    return _plan.get() is not None
+
+
 @contextlib.contextmanager
 def in_one_run() -> Iterator[None]:
     """Inside this block a flow's stages belong to the run it is called from, one after the other.

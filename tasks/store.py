@@ -8,6 +8,7 @@ locks/<key>                held (flock) while a process makes the artefact; free
 locks/store                shared by every process that uses the store, until it ends; exclusive while pruning
 damaged/<stage>/           artefacts that were set aside; nothing here deletes them
 pruned/                    on its way out
+test_sets/<digest>.jsonl   which experiments were scored on these test frames (tasks.openings)
 published/<experiment>/    which artefacts are the versions of its synthetic data (data_contracts.published)
 """
 

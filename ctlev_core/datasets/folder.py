@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ctlev_core.dataset_files.trees import recording_ids
 from ctlev_core.events import files as event_files
-from data_contracts.config import RUN_SETTING, Frozen
+from data_contracts.config import ADDED_LATER, RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import Labels, Part, Recording
@@ -51,6 +51,19 @@ class Options(Frozen):
     test_fraction: float = Field(
         default=0.3, gt=0, lt=1, description="of the events of a recording, or of the recordings"
     )
+    validation_fraction: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        json_schema_extra=ADDED_LATER,
+        description="the same, before what is tested: to choose options by (`evaluate_on: validation`)",
+    )
+
+    @model_validator(mode="after")
+    def _something_is_learnt_from(self) -> Options:
+        if self.test_fraction + self.validation_fraction >= 1:
+            raise ValueError("test_fraction and validation_fraction leave nothing to learn from")
+        return self
 
 
 def list_recordings(options: Options) -> list[Recording]:
@@ -68,10 +81,9 @@ def list_recordings(options: Options) -> list[Recording]:
     for class_folder in _class_folders(root):
         files = _recording_files(root, class_folder)
         if options.split == "time":
-            boundary = 1 - options.test_fraction
-            parts = [(Part("train", 0.0, boundary), Part("test", boundary, 1.0))] * len(files)
+            parts = [_split_in_time(options)] * len(files)
         else:
-            parts = _split_by_recording(files, options.test_fraction)
+            parts = _split_by_recording(files, options)
         # What looks the same is the same class, however a file system composes its accents.
         class_name = unicodedata.normalize("NFC", class_folder.name)
         for file, parts_of_file in zip(files, parts, strict=True):
@@ -160,12 +172,26 @@ def _is_recording(file: Path) -> bool:
     return True
 
 
-def _split_by_recording(files: list[Path], test_fraction: float) -> list[tuple[Part, ...]]:
-    """The last files by name are for testing: at least one, and never all."""
-    if len(files) < 2:
+def _split_in_time(options: Options) -> tuple[Part, ...]:
+    tested = 1 - options.test_fraction
+    learnt = tested - options.validation_fraction
+    validated = (Part("validation", learnt, tested),) if learnt < tested else ()
+    return (Part("train", 0.0, learnt), *validated, Part("test", tested, 1.0))
+
+
+def _split_by_recording(files: list[Path], options: Options) -> list[tuple[Part, ...]]:
+    """The last files by name are for testing, those before for validation: at least one each, and never all."""
+    least = 3 if options.validation_fraction else 2
+    if len(files) < least:
+        word = "three" if least == 3 else "two"
+        got = f"one ({files[0].name})" if len(files) == 1 else str(len(files))
         raise DataError(
-            f"{files[0].parent}: split 'recording' needs two recordings a class, got one ({files[0].name}); "
+            f"{files[0].parent}: split 'recording' needs {word} recordings a class, got {got}; "
             "add another, or use split 'time'"
         )
-    num_test = min(max(round(len(files) * test_fraction), 1), len(files) - 1)
-    return [(Part("train"),)] * (len(files) - num_test) + [(Part("test"),)] * num_test
+    num_test = min(max(round(len(files) * options.test_fraction), 1), len(files) - least + 1)
+    num_validation = 0
+    if options.validation_fraction:
+        num_validation = min(max(round(len(files) * options.validation_fraction), 1), len(files) - num_test - 1)
+    num_train = len(files) - num_test - num_validation
+    return [(Part("train"),)] * num_train + [(Part("validation"),)] * num_validation + [(Part("test"),)] * num_test

@@ -33,7 +33,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ctlev_core.dataset_files.trees import (
     check_inside,
@@ -45,7 +45,7 @@ from ctlev_core.dataset_files.trees import (
     shuffled,
 )
 from ctlev_core.events import files as event_files
-from data_contracts.config import RUN_SETTING, Frozen
+from data_contracts.config import ADDED_LATER, RUN_SETTING, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events
 from data_contracts.labels import Labels, Part, Recording
@@ -82,11 +82,23 @@ class Options(Frozen):
     classes: tuple[str, ...] = Field(default=(), description="only these; WordNet ids or class names; empty = all")
     images_per_class: int | None = Field(default=100, ge=1, description="to learn from; None = all (about 1,280)")
     test_images_per_class: int | None = Field(default=None, ge=1, description="to test; None = all 50")
+    validation_images_per_class: int = Field(
+        default=0,
+        ge=0,
+        json_schema_extra=ADDED_LATER,
+        description="further training files, to choose options by (`evaluate_on: validation`)",
+    )
     seed: int = Field(default=0, ge=0, description="decides which pictures are taken")
+
+    @model_validator(mode="after")
+    def _files_are_left(self) -> Options:
+        if self.validation_images_per_class and self.images_per_class is None:
+            raise ValueError("validation_images_per_class takes training files, of which images_per_class takes all")
+        return self
 
 
 def list_recordings(options: Options) -> list[Recording]:
-    """The chosen recordings, sorted by split, class and file; id and subject are `<split>/<WordNet id>/<file>`.
+    """The chosen recordings, sorted by folder, class, split and file; id and subject are `<split>/<WordNet id>/<file>`.
 
     Raises:
         DataError: the tree is not as expected (the message says where and shows it), no names, an unknown class, a
@@ -104,10 +116,14 @@ def list_recordings(options: Options) -> list[Recording]:
             raise DataError(f"{root / FOLDERS[split]}: lacks class {missing[0]}, which the other split has")
         for wordnet_id in wanted:
             candidates = shuffled(names_of_files[split][wordnet_id], options.seed, "n_imagenet", split, wordnet_id)
-            for name in sorted(first_of(candidates, limit)):
+            chosen = [(split, name) for name in sorted(first_of(candidates, limit))]
+            if split == "train":
+                others = candidates[len(chosen) : len(chosen) + options.validation_images_per_class]
+                chosen += [("validation", name) for name in sorted(others)]
+            for own, name in chosen:
                 file = _check_there(root / FOLDERS[split] / wordnet_id / name, root, split)
-                recording_id = f"{split}/{wordnet_id}/{file.stem}"
-                parts, class_name = (Part(split),), class_names[wordnet_id]
+                recording_id = f"{own}/{wordnet_id}/{file.stem}"
+                parts, class_name = (Part(own),), class_names[wordnet_id]
                 # The names are part of what the recordings are made of, so their file is as well.
                 sources = (file, names_file)
                 recordings.append(Recording(recording_id, recording_id, parts, class_name, SENSOR_SIZE, files=sources))

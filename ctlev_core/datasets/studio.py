@@ -5,7 +5,7 @@ show four subjects and the SEEN motions; tests show two other subjects and all m
 performances (`in_distribution_tests`); `condition` recordings carry labels, and grey pictures where asked for, but no
 events: random people in UNSEEN motions, from whose poses synthetic data is sampled; `record_conditions` records the
 very same people as training recordings, which is what synthetic data stands in for. The HELD_OUT motions appear in
-tests alone.
+tests alone; `validation` recordings show further subjects in all other motions.
 
 Recordings like those of a real dataset are options: DHP19 is 346 x 260 px, `dhp19`, 4 cameras; CDEHP is 1280 x 800 px,
 `cdehp`, Event-HPE a square sensor, `smpl`, both with intensity frames.
@@ -26,7 +26,7 @@ from ctlev_core.sensor.choice import read_sensor, sensor_preset_files
 from ctlev_core.studio.options import Options
 from data_contracts.errors import DataError
 from data_contracts.events import Events
-from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
+from data_contracts.labels import HELD_OUT_SPLITS, ImageTrack, Labels, Part, Recording, check_labels
 
 if TYPE_CHECKING:
     from ctlev_core.body.motion.procedural import MotionStyle
@@ -40,8 +40,14 @@ __all__ = [
 ]  # fmt: skip
 
 VERSION = 3
-SPLIT_NAMES = ("train", "test", "condition")
-MOTIONS_OF_SPLIT = {"train": SEEN, "test": SEEN + UNSEEN + HELD_OUT, "condition": UNSEEN}
+SPLIT_NAMES = ("train", "test", "condition", "validation")
+"""Their order seeds recordings."""
+MOTIONS_OF_SPLIT = {
+    "train": SEEN,
+    "test": SEEN + UNSEEN + HELD_OUT,
+    "condition": UNSEEN,
+    "validation": SEEN + UNSEEN,
+}
 # Streams of random numbers, each with its own seed, so that any recording can be made alone.
 SUBJECT_STREAM, SENSOR_STREAM, SCENE_STREAM, NOISE_STREAM, CAMERA_STREAM = 10, 11, 12, 13, 14
 AGAIN = "_again"
@@ -58,7 +64,12 @@ def list_recordings(options: Options) -> list[Recording]:
         DataError: the sensor preset is a file that cannot be read, or is no preset.
     """
     read_sensor(options.sensor_preset, options.noise)
-    counts = (options.num_train_recordings, options.num_test_recordings, options.num_condition_recordings)
+    counts = (
+        options.num_train_recordings,
+        options.num_test_recordings,
+        options.num_condition_recordings,
+        options.num_validation_recordings,
+    )
     return [
         _recording(split, index, camera, options)
         for split, count in zip(SPLIT_NAMES, counts, strict=True)
@@ -75,8 +86,9 @@ def _recording(split: str, index: int, camera: int, options: Options) -> Recordi
     if like_training:
         # Another name, for people who are both learnt from and tested on are otherwise refused.
         subject = f"subject{turn % options.num_train_subjects}{AGAIN if split == 'test' else ''}"
-    elif split == "test":
-        subject = f"subject{options.num_train_subjects + turn % options.num_test_subjects}"
+    elif split in HELD_OUT_SPLITS:
+        first = options.num_train_subjects + options.num_test_subjects * HELD_OUT_SPLITS.index(split)
+        subject = f"subject{first + turn % options.num_test_subjects}"
     else:
         subject = f"stranger{index}"
     suffix = f"_cam{camera}" if split != "condition" and options.num_cameras > 1 else ""

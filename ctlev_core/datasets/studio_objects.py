@@ -6,8 +6,8 @@ has WordNet's. The held-out classes are for an experiment's `target`, of which t
 things, which it may know from other pictures, as the paper's generator knows the classes of its Table 5; and, harder,
 ten compositions of two things, such as `cat on box`.
 
-Splits: some drawings of each class are learnt from, others tested, and one label-only recording a class says what is
-sampled.
+Splits: some drawings of each class are learnt from, others tested or kept for validation, and one label-only recording
+a class says what is sampled.
 
 Source: the recordings are made as for N-ImageNet (Kim et al., ICCV 2021: a camera that moves in a plane before a
 monitor) or N-Caltech101 (Orchard et al., Frontiers in Neuroscience 2015: three saccades of 100 ms); the classes and the
@@ -26,7 +26,7 @@ from pydantic import AfterValidator, Field, field_validator
 from ctlev_core.sensor.choice import check_sensor_preset, read_sensor, sensor_preset_files
 from ctlev_core.studio.camera_paths import Motion, sample_camera_path
 from ctlev_core.studio.objects import COLOURS, NAMES, OBJECTS
-from data_contracts.config import Frozen
+from data_contracts.config import ADDED_LATER, Frozen
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording
@@ -58,7 +58,8 @@ COMPOSITIONS = (
 
 HELD_OUT = UNSEEN + COMPOSITIONS
 
-SPLIT_NAMES = ("train", "test", "condition")
+SPLIT_NAMES = ("train", "test", "condition", "validation")
+"""Their order seeds recordings."""
 # Streams of random numbers, each with its own seed.
 DRAWING_STREAM, PATH_STREAM, SENSOR_STREAM, NOISE_STREAM = 40, 41, 42, 43
 MIN_CONTRAST = 0.8
@@ -80,6 +81,12 @@ class Options(Frozen):
     classes: tuple[str, ...] = Field(default=(), description="these, ordinary or held out; empty = all ordinary ones")
     num_train_per_class: int = Field(default=50, ge=0, description="recordings to learn from; the paper has 100")
     num_test_per_class: int = Field(default=25, ge=0, description="recordings to test")
+    num_validation_per_class: int = Field(
+        default=0,
+        ge=0,
+        json_schema_extra=ADDED_LATER,
+        description="recordings to choose options by (`evaluate_on: validation`)",
+    )
     recording_duration_us: int = Field(default=300_000, ge=10_000, description="once along the path")
     motion: Motion = Field(default="saccades", description="of the camera: saccades, square, circle or drift")
     motion_extent: float = Field(
@@ -131,7 +138,7 @@ def list_recordings(options: Options) -> list[Recording]:
         DataError: the sensor file cannot be read.
     """
     read_sensor(options.sensor_preset, options.noise)
-    counts = (options.num_train_per_class, options.num_test_per_class, 1)
+    counts = (options.num_train_per_class, options.num_test_per_class, 1, options.num_validation_per_class)
     return [
         _recording(split, class_name, index, options)
         for split, count in zip(SPLIT_NAMES, counts, strict=True)

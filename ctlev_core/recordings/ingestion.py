@@ -46,7 +46,7 @@ class IngestedRecording(NamedTuple):
 
 
 def list_recordings(plugin: Plugin) -> list[Recording]:
-    """The dataset's recordings, refused when a subject is both learnt from and tested on."""
+    """The dataset's recordings, refused when a subject is in two of training, validation and test."""
     recordings = plugin.module.list_recordings(plugin.options)
     if not recordings:
         raise DataError(f"dataset {plugin.name!r} has no recordings with options {plugin.options!r}")
@@ -54,9 +54,10 @@ def list_recordings(plugin: Plugin) -> list[Recording]:
     for recording in recordings:
         if len(recording.parts) == 1:  # a recording split in time shares its subject by the user's own choice
             subjects.setdefault(recording.parts[0].split, set()).add(recording.subject)
-    shared = subjects.get("train", set()) & subjects.get("test", set())
-    if shared:
-        raise DataError(f"dataset {plugin.name!r}: subjects {sorted(shared)} are in both train and test")
+    for first, second in itertools.combinations(("train", "validation", "test"), 2):
+        shared = subjects.get(first, set()) & subjects.get(second, set())
+        if shared:
+            raise DataError(f"dataset {plugin.name!r}: subjects {sorted(shared)} are in both {first} and {second}")
     return recordings
 
 

@@ -25,7 +25,7 @@ from ctlev_core.report.sections import pictures
 from ctlev_core.report.sections.colour_legends import all_colours
 from ctlev_core.report.sections.contact_sheet import contact_sheet_sections
 from ctlev_core.report.sections.costs import cost_table, versions_table
-from ctlev_core.report.sections.data_split import recordings_table, told_split
+from ctlev_core.report.sections.data_split import recordings_table, told_openings, told_split
 from ctlev_core.report.sections.distances import floor_tables
 from ctlev_core.report.sections.lineage import lineage_diagram, record_tables
 from ctlev_core.report.sections.memorisation import memorisation_sections
@@ -62,16 +62,19 @@ TABLES = ("scores", "samples", "realism", "recordings")
 """Written as Parquet beside the page."""
 
 
-def write_report(made: ReportInputs[Manifest], folder: Path) -> None:
+def write_report(made: ReportInputs[Manifest], folder: Path, openings: int | None = None) -> None:
     """Write `report.html`, `tables.tex`, `tables.md`, `TABLES`, `provenance.json` and `summary.json`.
 
     Args:
         made: what is shown.
         folder: to write to.
+        openings: experiments that were scored on the same test frames so far; None = not known.
     """
-    notice = made.notice
+    tested = made.target or made.frames
+    told = [made.notice]
     if made.target is None:  # whose recordings are others
-        notice = f"{notice} {told_split(made.recordings.column('splits'))}".strip()
+        told.append(told_split(made.recordings.column("splits"), tested.held_out))
+    notice = " ".join(filter(None, [*told, told_openings(tested.held_out, openings)]))
     records = read_records(_artefacts(made))
     traced = trace_lineage([(one.ref.key, one.table) for one in made.scores], records)
     shown = {one.name: one.frames for one in made.generated}

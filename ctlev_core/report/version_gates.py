@@ -8,6 +8,7 @@ from typing import Any
 from ctlev_core.realism.two_sample import C2ST, MIN_FRAMES
 from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts.errors import DataError
+from data_contracts.labels import HELD_OUT_SPLITS
 from data_contracts.published import GateCheck
 from data_contracts.regeneration import Gates
 from data_contracts.training_sets import RECORDED, SYNTHETIC
@@ -61,7 +62,8 @@ def _check_realism(gates: Gates, scores: Sequence[dict[str, Any]]) -> list[GateC
     found = {(row["subject"], row["metric"]): row["value"] for row in scores if row["task"] == "realism"}
     checks: list[GateCheck] = []
     if gates.max_c2st is not None:
-        value = found.get((f"{SYNTHETIC} against test", C2ST))
+        values = [found.get((f"{SYNTHETIC} against {split}", C2ST)) for split in HELD_OUT_SPLITS]
+        value = next((area for area in values if area is not None), None)
         if value is None:
             raise DataError(
                 f"gate max_c2st: needs {MIN_FRAMES} frames of the version and as many held-out recorded ones, of "

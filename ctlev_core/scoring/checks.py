@@ -16,7 +16,7 @@ from ctlev_core.plugin_contracts import FeatureExtractor, MetricOfSkeletons, Plu
 from ctlev_core.plugins import PluginError
 from data_contracts.config import DatasetChoice, DownstreamChoice, MetricChoice
 from data_contracts.errors import DataError
-from data_contracts.labels import Labels
+from data_contracts.labels import HeldOut, Labels
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef, labels_of, read_manifest
 
 _ARRAYS = {
@@ -81,19 +81,24 @@ def check_labels(metrics: Sequence[MetricChoice], labels: Labels, where: str) ->
                 raise PluginError(f"metrics: {choice.name!r} does not fit the labels of {where}: {error}") from None
 
 
-def check_dataset(metrics: Sequence[MetricChoice], dataset: DatasetChoice) -> None:
-    """The same by the labels of one recording, the first that is tested on; it is read for that.
+def check_dataset(metrics: Sequence[MetricChoice], dataset: DatasetChoice, held_out: HeldOut = "test") -> None:
+    """The same by the labels of one recording, the first of the split that is tested on; it is read for that.
 
     Raises:
         PluginError: as `check_labels`.
-        DataError: the dataset cannot be read.
+        DataError: the dataset cannot be read, or has no recording of that split.
     """
     plugin = plugins.load_options(dataset)
     recordings = plugin.module.list_recordings(plugin.options)
-    tested = [recording for recording in recordings if any(part.split == "test" for part in recording.parts)]
+    tested = [recording for recording in recordings if any(part.split == held_out for part in recording.parts)]
     if tested:
         labels = plugin.module.read_labels(tested[0], plugin.options)
         check_labels(metrics, labels, f"dataset {dataset.name!r}")
+    elif held_out == "validation":
+        raise DataError(
+            f"dataset {dataset.name!r}: evaluate_on is 'validation', but its options hold no recordings back for that "
+            "(docs/datasets.md, Validation)"
+        )
 
 
 def check_frames(metrics: Sequence[MetricChoice], folder: Path) -> None:

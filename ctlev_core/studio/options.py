@@ -19,6 +19,13 @@ class Options(Frozen):
     num_test_recordings: int = Field(
         default=300, ge=0, description="Performances of subjects 4 and 5, all motions in turn."
     )
+    num_validation_recordings: int = Field(
+        default=0,
+        ge=0,
+        json_schema_extra=ADDED_LATER,
+        description="Performances of as many other subjects as are tested, the motions of test recordings but those "
+        "that only they show: to choose options by (`evaluate_on: validation`).",
+    )
     num_condition_recordings: int = Field(
         default=1200, ge=0, description="Label-only recordings of random people, UNSEEN motions."
     )

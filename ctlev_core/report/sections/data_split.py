@@ -8,14 +8,15 @@ from ctlev_core.report.page.tables import Cell, Table
 from data_contracts.manifest import Manifest
 
 
-def told_split(splits: Sequence[str]) -> str:
+def told_split(splits: Sequence[str], held_out: str) -> str:
     """A sentence for the first line of a report.
 
     Args:
         splits: of each recording, the splits its parts belong to, joined by +.
+        held_out: the split that is scored.
     """
     parts = [set(each.split("+")) for each in splits]
-    tested = [part for part in parts if "test" in part]
+    tested = [part for part in parts if held_out in part]
     shared = sum("train" in part for part in tested)
     if not tested:
         return ""
@@ -27,6 +28,20 @@ def told_split(splits: Sequence[str]) -> str:
             "windows of the same recordings are told apart, not how well unseen recordings would be."
         )
     return f"Of {len(tested)} tested recordings {shared} are split in time, and also learnt from."
+
+
+def told_openings(held_out: str, openings: int | None) -> str:
+    """A sentence on how often what is scored was looked at before."""
+    if held_out == "validation":
+        return "Scored on validation recordings; nothing of the test recordings was looked at."
+    if openings is None:
+        return ""
+    if openings == 1:
+        return "This is the first experiment in this store to be scored on these test frames."
+    return (
+        f"It is one of {openings} experiments in this store, of other options or seeds, that were scored on these test "
+        "frames; a best of several, chosen by test scores, is better there than elsewhere."
+    )
 
 
 def recordings_table(recordings: Manifest, frames: Manifest) -> Table:

@@ -177,7 +177,7 @@ def _same_classes(class_names: Sequence[str], real: list[Manifest]) -> list[tupl
     shown: dict[str, list[np.ndarray]] = {name: [] for name in class_names}
     for manifest in reversed(real):
         names = manifest.column("class_name")
-        for row in manifest.rows_where(split="test"):
+        for row in manifest.rows_where(split=manifest.held_out):
             if names[row] in shown and len(shown[names[row]]) < GRID_COLUMNS:
                 shown[names[row]].append(np.asarray(manifest.array("frames")[row]))
     if not all(shown.values()):
@@ -218,11 +218,11 @@ def _moment(source_id: str) -> tuple[str, int]:
 
 
 def real_grid(frames: Manifest, target: Manifest | None = None) -> ImageGrid:
-    """Some recorded frames of training and of test, evenly spread; `target` are those of another dataset tested on."""
+    """Some recorded training and held-out frames, evenly spread; `target` are those of another dataset tested on."""
     rows: list[tuple[str, list[np.ndarray]]] = []
-    sets = [("recorded", frames, ("train", "test"))]
+    sets = [("recorded", frames, ("train", frames.held_out))]
     if target is not None:
-        sets = [("the generator's", frames, ("train",)), ("recorded", target, ("train", "test"))]
+        sets = [("the generator's", frames, ("train",)), ("recorded", target, ("train", target.held_out))]
     for name, manifest, splits in sets:
         for split in splits:
             members = manifest.rows_where(split=split)

@@ -9,6 +9,7 @@ from ctlev_core.realism.two_sample import MIN_FRAMES
 from ctlev_core.report.page.display_names import set_name
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.statistics.bootstrap import score_text
+from data_contracts.labels import HELD_OUT_SPLITS
 
 _CAPTION = (
     "A small network learns from half of the recordings which of two sets a frame is from. Area: under the ROC curve "
@@ -21,8 +22,14 @@ _CAPTION = (
 _AREA_COLUMN = 1
 _NAMES = {
     "recorded against recorded": "recorded training frames: halves",
-    "test against test": "recorded test frames: halves",
-    "test against recorded": "recorded training from recorded test frames",
+    **{
+        name: text
+        for split in HELD_OUT_SPLITS
+        for name, text in (
+            (f"{split} against {split}", f"recorded {split} frames: halves"),
+            (f"{split} against recorded", f"recorded training from recorded {split} frames"),
+        )
+    },
 }
 
 
@@ -49,5 +56,7 @@ def two_sample_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
 
 def _name(subject: str) -> str:
     first, _, second = subject.partition(" against ")
-    against = {"recorded": "recorded training frames", "test": "recorded test frames"}.get(second, second)
-    return _NAMES.get(subject, f"{set_name(first)} from {against}")
+    against = {"recorded": "recorded training frames"} | {
+        split: f"recorded {split} frames" for split in HELD_OUT_SPLITS
+    }
+    return _NAMES.get(subject, f"{set_name(first)} from {against.get(second, second)}")

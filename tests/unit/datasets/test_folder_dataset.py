@@ -65,6 +65,38 @@ def test_split_by_recording_tests_on_the_last_files(num, fraction, num_test, tmp
     assert [r.parts for r in recordings] == [(Part("train"),)] * (num - num_test) + [(Part("test"),)] * num_test
 
 
+def test_what_comes_before_the_test_part_is_for_validation(root):
+    for recording in listed(root, test_fraction=0.25, validation_fraction=0.25):
+        assert recording.parts == (Part("train", 0.0, 0.5), Part("validation", 0.5, 0.75), Part("test", 0.75, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("num", "fractions", "counts"),
+    [
+        (3, (0.01, 0.01), (1, 1, 1)),
+        (3, (0.9, 0.05), (1, 1, 1)),
+        (10, (0.3, 0.2), (5, 2, 3)),
+        (4, (0.3, 0.6), (1, 2, 1)),
+    ],
+)
+def test_split_by_recording_validates_on_the_files_before(num, fractions, counts, tmp_path):
+    for index in range(num):
+        write_recording(tmp_path / "person" / f"{index}.parquet")
+    test, validation = fractions
+    recordings = listed(tmp_path, split="recording", test_fraction=test, validation_fraction=validation)
+    splits = [name for name, count in zip(("train", "validation", "test"), counts, strict=True) for _ in range(count)]
+    assert [r.parts for r in recordings] == [(Part(split),) for split in splits]
+
+
+def test_validation_by_recording_needs_three_recordings_a_class(tmp_path):
+    for index in range(2):
+        write_recording(tmp_path / "car" / f"{index}.parquet")
+    with pytest.raises(DataError, match="car: split 'recording' needs three recordings a class, got 2"):
+        listed(tmp_path, split="recording", validation_fraction=0.2)
+    with pytest.raises(ValidationError, match="leave nothing to learn from"):
+        folder.Options(root=tmp_path, test_fraction=0.5, validation_fraction=0.5)
+
+
 def test_split_by_recording_needs_two_recordings_a_class(root):
     with pytest.raises(DataError, match=r"car: split 'recording' needs two recordings a class, got one \(a\.parquet\)"):
         listed(root, split="recording")

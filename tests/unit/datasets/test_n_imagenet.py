@@ -89,6 +89,17 @@ def test_the_choice_follows_the_seed_grows_and_knows_nothing_of_other_classes(ro
     assert only == listed(root, images_per_class=2, test_images_per_class=1, classes=(TENCH,))
 
 
+def test_validation_takes_further_training_files(root):
+    plain = listed(root, images_per_class=2, test_images_per_class=1)
+    recordings = listed(root, images_per_class=2, test_images_per_class=1, validation_images_per_class=2)
+    added = [r for r in recordings if r.parts == (Part("validation"),)]
+    assert [r for r in recordings if r not in added] == plain and len(added) == 6
+    learnt = {r.files[0] for r in plain}
+    assert all(r.files[0].parent.parent.name == "extracted_train" and r.files[0] not in learnt for r in added)
+    with pytest.raises(ValueError, match="of which images_per_class takes all"):
+        n_imagenet.Options(root=root, images_per_class=None, validation_images_per_class=1)
+
+
 def test_the_paper_s_number_of_images_is_the_default():
     assert n_imagenet.Options(root=Path()).images_per_class == 100
     assert "root" not in cache_material(n_imagenet.Options(root=Path(), names_file=Path("x")))

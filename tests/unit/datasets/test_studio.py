@@ -16,7 +16,7 @@ from ctlev_core.sensor.dvs_pixel import PRESETS, EventBudgetError, simulate_even
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
-from data_contracts.labels import check_image_track, check_labels
+from data_contracts.labels import Part, check_image_track, check_labels
 
 OPTIONS = studio.Options(num_train_recordings=24, num_test_recordings=40, num_condition_recordings=26)
 RECORDINGS = studio.list_recordings(OPTIONS)
@@ -37,15 +37,28 @@ def same_events(first, second):
 
 
 def test_splits_share_no_subject_and_held_out_motions_are_in_tests_alone():
-    subjects = {split: {r.subject for r in of_split(split)} for split in studio.SPLIT_NAMES}
+    splits = ("train", "test", "condition")
+    subjects = {split: {r.subject for r in of_split(split)} for split in splits}
     assert subjects["train"] == {f"subject{i}" for i in range(4)}
     assert subjects["test"] == {"subject4", "subject5"}
     assert len(subjects["condition"]) == 26 and not subjects["condition"] & (subjects["train"] | subjects["test"])
-    motions = {split: {r.class_name for r in of_split(split)} for split in studio.SPLIT_NAMES}
+    motions = {split: {r.class_name for r in of_split(split)} for split in splits}
     assert motions == {"train": set(SEEN), "test": set(SEEN + UNSEEN + HELD_OUT), "condition": set(UNSEEN)}
     assert len({r.recording_id for r in RECORDINGS}) == len(RECORDINGS) == 90
     # Every training subject performs every motion.
     assert len({(r.subject, r.class_name) for r in of_split("train")}) == 16
+
+
+def test_validation_recordings_show_further_people_and_change_no_others():
+    more = changed(num_validation_recordings=30)
+    recordings = studio.list_recordings(more)
+    assert recordings[: len(RECORDINGS)] == RECORDINGS
+    added = recordings[len(RECORDINGS) :]
+    assert {r.parts for r in added} == {(Part("validation"),)} and len(added) == 30
+    assert {r.subject for r in added} == {"subject6", "subject7"}
+    assert {r.class_name for r in added} == set(SEEN + UNSEEN)
+    assert len(studio.read_events(added[0], more)) > 0
+    assert "num_validation_recordings" not in cache_material(OPTIONS)
 
 
 def test_tests_can_show_the_people_and_motions_of_training():

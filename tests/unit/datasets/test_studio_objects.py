@@ -28,6 +28,15 @@ from data_contracts.labels import Recording, check_image_track, check_labels
 SMALL = Options(num_train_per_class=2, num_test_per_class=1)
 
 
+def test_validation_recordings_change_no_others():
+    plain, more = SMALL, SMALL.model_copy(update={"num_validation_per_class": 2})
+    recordings = studio_objects.list_recordings(more)
+    assert [r for r in recordings if r.parts[0].split != "validation"] == studio_objects.list_recordings(plain)
+    added = [r for r in recordings if r.parts[0].split == "validation"]
+    assert len(added) == 2 * len({r.class_name for r in recordings})
+    assert len(studio_objects.read_events(added[0], more)) > 0
+
+
 def of_split(split: str, options: Options = SMALL) -> list[Recording]:
     return [r for r in studio_objects.list_recordings(options) if r.parts[0].split == split]
 

@@ -144,6 +144,14 @@ def test_a_dataset_is_asked_for_the_labels_of_one_recording():
         check_dataset([MetricChoice(name="mpjpe2d")], objects)
 
 
+def test_a_dataset_without_recordings_for_validation_is_refused_in_the_plan():
+    metrics = [MetricChoice(name="classification")]
+    with pytest.raises(DataError, match="evaluate_on is 'validation', but its options hold no recordings back"):
+        check_dataset(metrics, DatasetChoice(name="studio_objects"), "validation")
+    held_back = DatasetChoice(name="studio_objects", options={"num_validation_per_class": 1})
+    check_dataset(metrics, held_back, "validation")
+
+
 def test_frames_that_are_there_already_are_looked_at_in_the_plan(tmp_path):
     metrics = [MetricChoice(name="mpjpe2d")]
     check_frames(metrics, tmp_path / "planned")

@@ -34,8 +34,8 @@ def make_events(seed):
     )
 
 
-def make_dataset(*, images=False, windows=None, release=None):
-    """A dataset module of two recordings; finished event images, or those of `release`, in the place of events."""
+def make_dataset(*, images=False, windows=None, release=None, splits=("train", "test")):
+    """A dataset module of a recording a split; finished event images, or those of `release`, in the place of events."""
     images = images or release is not None
 
     class Options(Frozen):
@@ -44,8 +44,7 @@ def make_dataset(*, images=False, windows=None, release=None):
     def list_recordings(options):
         kind = {"has_events": not images, "has_event_images": images, "has_intensity": True, "sensor_size": SENSOR}
         return [
-            Recording(f"{split}/one", f"{split} subject", (Part(split),), class_name="walk", **kind)
-            for split in ("train", "test")
+            Recording(f"{split}/one", f"{split} subject", (Part(split),), class_name="walk", **kind) for split in splits
         ]
 
     def read_labels(recording, options):
@@ -90,14 +89,15 @@ def run_stage(stage, **arguments):
 def frames_of(home, monkeypatch):
     """Ingest and encode a dataset module; returns both manifests."""
 
-    def run(module, windows=None, **encoding):
+    def run(module, windows=None, held_out=None, **encoding):
         original = plugins.load
         monkeypatch.setattr(
             plugins, "load", lambda kind, name: module if (kind, name) == ("datasets", "test") else original(kind, name)
         )
         recordings = run_stage(ingest, dataset=DatasetChoice(name="test"))
         choice = EncodingChoice(name="event_histogram", options=encoding)
-        frames = run_stage(encode, recordings=recordings, encoding=choice, windows=windows or Windows(num_events=40))
+        asked = {"encoding": choice, "windows": windows or Windows(num_events=40), "held_out": held_out}
+        frames = run_stage(encode, recordings=recordings, **asked)
         return read_manifest(recordings), read_manifest(frames)
 
     return run
@@ -114,6 +114,22 @@ def test_events_labels_and_intensity_frames_arrive(frames_of):
     track = recordings.array("intensity/train/one")
     assert track.shape == (3, 24, 32) and recordings.array("intensity/train/one.t_us").tolist() == [0, 500, 1000]
     assert recordings.column("event_images_file") == ["", ""]
+
+
+def test_test_recordings_are_not_encoded_where_options_are_chosen(frames_of):
+    splits = ("train", "validation", "test")
+    _, every = frames_of(make_dataset(splits=splits))
+    _, chosen = frames_of(make_dataset(splits=splits), held_out="validation")
+    assert set(every.column("split")) == set(splits) and every.held_out == "test"
+    assert set(chosen.column("split")) == {"train", "validation"} and chosen.held_out == "validation"
+    kept = np.flatnonzero(np.array(every.column("split")) != "test")
+    assert chosen.column("sample_id") == [every.column("sample_id")[row] for row in kept]
+    np.testing.assert_array_equal(chosen.array("frames"), every.array("frames")[kept])
+
+
+def test_without_recordings_for_validation_there_are_no_frames(frames_of):
+    with pytest.raises(DataError, match="no window in split 'validation'"):
+        frames_of(make_dataset(), held_out="validation")
 
 
 def test_finished_event_images_become_frames_with_the_labels_of_their_moment(frames_of):

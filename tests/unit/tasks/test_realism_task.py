@@ -92,6 +92,17 @@ def test_every_generator_is_told_from_training_and_test_frames_beside_both_floor
     assert {row["group"] for row in rows} == {"frames", "frames of gan"}, "no recordings, no events"
 
 
+def test_frames_for_validation_take_the_place_of_test_frames(tmp_path, run):
+    splits = ["train"] * 80 + ["validation"] * 80
+    real = frame_set(tmp_path / "recorded", noise(160, 0.2, 0), [f"r{row // 2}" for row in range(160)], splits)
+    made = synthetic_set(tmp_path / "made_set", noise(80, 0.2, 1), ["elsewhere"] * 80)
+    _, tests = run(real, [made], ("synthetic",))
+    assert {subject for _, subject in tests} == {
+        "recorded against recorded", "validation against recorded", "validation against validation",
+        "synthetic against recorded", "synthetic against validation",
+    }  # fmt: skip
+
+
 def test_with_few_frames_the_table_says_why_and_the_scores_have_no_row(tmp_path, run):
     real = frame_set(tmp_path / "recorded", noise(20, 0.2, 0), [f"r{row}" for row in range(20)], ["train"] * 20)
     made = synthetic_set(tmp_path / "made_set", np.zeros((50, 12, 12, 3), np.uint8), ["elsewhere"] * 50)

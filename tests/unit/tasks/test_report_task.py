@@ -143,6 +143,8 @@ def test_frames_of_words_stand_beside_real_ones_of_their_class(experiment):
             return 3
 
     class Real(Words):
+        held_out = "test"
+
         def column(self, name):
             columns = {"sample_id": ["r0", "r1", "r2"], "recording_id": ["r"] * 3, "class_name": ["y", "x", "z"]}
             return columns.get(name, [0] * 3)
