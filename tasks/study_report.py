@@ -26,6 +26,7 @@ from ctlev_core.report.studies.study import (
     study_tables,
     study_verdict,
     study_words,
+    usefulness_tables,
 )
 from ctlev_core.report.studies.summary import read_summary
 from data_contracts import tables
@@ -80,6 +81,7 @@ def study_report(
     scores = pooled_tables(groups) if groups else []
     if groups:
         shown[-1] = [distances_table([*(group.parts[0] for group in groups), *alone])]
+    useful = usefulness_tables(alone)
     links = [(part.heading, f"{title}/{part.name}/{PAGE}") for part in parts]
     links += [
         (f"Speed against error ({speed.experiment.replace('_', ' ')})", f"{title}/{SPEED_VS_ERROR}/{PAGE}")
@@ -96,6 +98,7 @@ def study_report(
         sections=[
             Chapter("By the number of recordings", pooled_sections(groups, scores)),
             *([overview] if groups and overview.rows else []),
+            *useful,
             *study_chapters(alone, shown),
             *(Chapter("Speed against error", speed_sections(parts, speed)) for speed in measured),
             Chapter(
@@ -111,6 +114,7 @@ def study_report(
     kept = (
         scores
         + ([overview] if overview.rows or not groups else [])
+        + useful
         + [table for of_part in shown for table in of_part]
         + [speed_table(parts, speed) for speed in measured]
     )
@@ -145,5 +149,5 @@ def _groups(
 
 def _part(folder: Path, name: str, training_sets: Sequence[str], generators: Sequence[str]) -> Part:
     paired = PairedScores(pq.read_table(folder / "samples.parquet"))
-    rows = pq.read_table(folder / "scores.parquet").to_pylist()
-    return Part(name, rows, training_sets, generators, paired, read_summary(folder))
+    rows, realism = (pq.read_table(folder / f"{table}.parquet").to_pylist() for table in ("scores", "realism"))
+    return Part(name, rows, training_sets, generators, paired, read_summary(folder), realism)

@@ -43,6 +43,7 @@ from ctlev_core.report.sections.score_tables import (
     trained_rows,
 )
 from ctlev_core.report.sections.training_curves import base_model_figures, loss_curves
+from ctlev_core.report.sections.usefulness import usefulness_of, usefulness_sections
 from ctlev_core.report.sections.verdict import Verdict, verdict
 from ctlev_core.report.studies.paper_numbers import paper_section
 from ctlev_core.report.studies.summary import Summary, write_summary
@@ -88,7 +89,7 @@ def write_report(made: ReportInputs[Manifest], folder: Path, openings: int | Non
     grid, *other_grids = pictures.sample_grids(made.conditions, shown, recorded, colours)
     charts, moving = _charts(rows, _learnt_with(records)), pictures.motion(made.conditions, own)
     results, by_class = _results(rows, made.training_sets, list(shown), paired)
-    quality = _Quality.of(made, rows)
+    quality = _Quality.of(made, rows, paired)
     page = render_report(
         title=made.title,
         lead=notice,
@@ -183,24 +184,27 @@ class _Quality(NamedTuple):
     realism: Sequence[Section]
     memorisation: Sequence[Section]
     rejections: Sequence[Section]
+    usefulness: Sequence[Section]
 
     @classmethod
-    def of(cls, made: ReportInputs[Manifest], rows: list[Row]) -> _Quality:
+    def of(cls, made: ReportInputs[Manifest], rows: list[Row], paired: PairedScores) -> _Quality:
         distributions, tests = (
             made.realism.attached(schema).to_pylist() for schema in (DISTRIBUTIONS, TWO_SAMPLE_TESTS)
         )
+        realism, names = made.realism.table.to_pylist(), [one.name for one in made.generated]
         frames, memorised = ([getattr(one, name) for one in made.generated] for name in ("frames", "memorisation"))
         return cls(
             frame_tables(rows),
             floor_tables(made.scores),
-            realism_sections(made.realism.table.to_pylist(), distributions, tests),
+            realism_sections(realism, distributions, tests),
             memorisation_sections(made.frames, frames, memorised),
             rejection_sections({one.name: one.frames for one in made.generated}),
+            usefulness_sections(usefulness_of(rows, realism, names, paired)),
         )
 
     @property
     def others(self) -> list[Section]:
-        return [*self.floors, *self.memorisation, *self.rejections]
+        return [*self.usefulness, *self.floors, *self.memorisation, *self.rejections]
 
     def sections(self) -> list[Section | Folded]:
         return [
@@ -211,6 +215,7 @@ class _Quality(NamedTuple):
             *self.memorisation[:1],
             *_folded("Closest pairs of generated and training frames", self.memorisation[1:]),
             *self.rejections,
+            *self.usefulness,
         ]
 
 

@@ -81,6 +81,7 @@ def _report(folder: Path, name: str, easy: np.ndarray, random: np.random.Generat
         for training_set in ("held-out recorded", "synthetic")
     ]
     pq.write_table(pa.Table.from_pylist(rows, schema=tables.SCORES.arrow()), folder / "scores.parquet")
+    pq.write_table(tables.SCORES.arrow().empty_table(), folder / "realism.parquet")
     pictures = [random.integers(0, 255, (16, 16, 3), np.uint8) for _ in range(4)]
     grid = ImageGrid("asked for, and sampled", [("asked for", pictures), ("sampled", pictures)])
     write_summary(folder, Summary(f"Verdict of {name}.", [Step("1. A label", "7", "see")], grid))

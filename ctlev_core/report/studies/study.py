@@ -12,6 +12,7 @@ from ctlev_core.report.page.display_names import Name, metric_heading, metric_na
 from ctlev_core.report.page.html import Chapter, Folded, Section, Text
 from ctlev_core.report.page.tables import Cell, Table
 from ctlev_core.report.sections.score_tables import PairedScores, cell_text, score_tables, trained_rows
+from ctlev_core.report.sections.usefulness import usefulness_of, usefulness_overview
 from ctlev_core.report.sections.verdict import made_better
 from ctlev_core.report.studies import paper_numbers
 from ctlev_core.report.studies.speed_summary import SpeedSummary
@@ -42,6 +43,7 @@ class Part:
         generators: whose frames were compared, its own first.
         paired: its scores sample by sample.
         summary: of its report.
+        realism: rows of the table `realism`.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Part:
     generators: Sequence[str]
     paired: PairedScores
     summary: Summary
+    realism: Sequence[Row] = ()
 
     @property
     def compares(self) -> bool:
@@ -182,6 +185,13 @@ def study_chapters(parts: Sequence[Part], tables: Sequence[Sequence[Table]]) -> 
 def _untitled(heading: str, table: Table) -> Table:
     """With the title it has on the experiment's own page."""
     return replace(table, title=table.title.removeprefix(f"{heading}: "))
+
+
+def usefulness_tables(parts: Sequence[Part]) -> list[Table]:
+    """Which number ranks generators as their gains do, where two experiments or more compare enough of them."""
+    found = [(part.heading, usefulness_of(part.rows, part.realism, part.generators, part.paired)) for part in parts]
+    known = [(heading, one) for heading, one in found if one is not None]
+    return [usefulness_overview(known)] if len(known) > 1 else []
 
 
 def speed_sections(parts: Sequence[Part], speed: SpeedSummary) -> list[Section | Folded]:
