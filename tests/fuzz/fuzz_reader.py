@@ -31,7 +31,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 
 REAL_AEDAT4 = Path(__file__).resolve().parents[2].parent / "shared/real/events/person/tonic_sample.aedat4"
-SENSORS = {"aedat2": (346, 260), "atis": (240, 180)}
+SENSORS = {"aedat2": (346, 260), "aedat3": (346, 260), "atis": (240, 180)}
 
 
 class Failure(Exception):
@@ -98,7 +98,6 @@ def valid_files(name: str, folder: Path) -> Iterator[bytes]:
         yield aedat4_writer.aedat4([aedat4_writer.packet([(1, 2, 3, 1), (5, 319, 239, 0)]), aedat4_writer.packet([])])
         if REAL_AEDAT4.is_file():
             yield REAL_AEDAT4.read_bytes()
-        return
     generator = np.random.default_rng(0)
     width, height = SENSORS.get(name, (640, 480))
     for count, duration in ((1, 1), (5, 10**5), (40, 10**6)):

@@ -128,7 +128,9 @@ def test_headers_that_are_refused(tmp_path, head, message):
 def test_what_is_written_follows_the_format(tmp_path):
     rows = [(5, 1, 2, 1), (2**31 - 1, 345, 259, 0), (2**31, 0, 0, 1), (2**62 - 1, 7, 8, 0)]
     reader.write(tmp_path / "a", make_events(rows, (346, 260)))
-    expected = header(("#Source 0: DAVIS346",)).replace(b"2016-04-01 10:00:00 (TZ+0200)", b"1970-01-01 00:00:00 (TZ+0000)")
+    expected = header(("#Source 0: DAVIS346",)).replace(
+        b"2016-04-01 10:00:00 (TZ+0200)", b"1970-01-01 00:00:00 (TZ+0000)"
+    )
     expected += packet(event(5, 1, 2, 1) + event(2**31 - 1, 345, 259, 0))
     expected += packet(event(0, 0, 0, 1), overflows=1) + packet(event(2**31 - 1, 7, 8, 0), overflows=2**31 - 1)
     assert (tmp_path / "a").read_bytes() == expected
