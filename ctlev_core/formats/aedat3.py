@@ -9,6 +9,7 @@ Source: iniVation, "AEDAT 3.1 file format", docs.inivation.com; libcaer, events/
 
 from __future__ import annotations
 
+import itertools
 import re
 import struct
 from collections.abc import Iterator
@@ -232,7 +233,7 @@ def write(path: Path, events: Events) -> None:
     starts = sorted(breaks)
     with path.open("wb") as file:
         file.write("".join(f"{line}\r\n" for line in lines).encode("ascii"))
-        for start, stop in zip(starts, starts[1:], strict=False):
+        for start, stop in itertools.pairwise(starts):
             counts = (stop - start,) * 3
             file.write(_PACKET.pack(_POLARITY, 0, _EVENT.itemsize, _TIME_PLACE, int(overflows[start]), *counts))
             file.write(rows[start:stop].tobytes())

@@ -116,7 +116,7 @@ def test_a_format_without_a_writer_is_read_only(tmp_path, monkeypatch):
     monkeypatch.delattr(load("formats", "aedat4"), "write")
     with pytest.raises(PluginError, match="format 'aedat4' is read only"):
         find_writer(tmp_path / "a.aedat4", "aedat4")
-    with pytest.raises(PluginError, match="no format is written with the suffix '.aedat4'"):
+    with pytest.raises(PluginError, match=r"no format is written with the suffix '\.aedat4'"):
         find_writer(tmp_path / "a.aedat4")
 
 

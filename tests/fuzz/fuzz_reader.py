@@ -24,6 +24,7 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "helpers"))
 import aedat4_writer
+import ecf_writer
 
 from ctlev_core import plugins
 from ctlev_core.events.decoding import event_chunks
@@ -122,6 +123,9 @@ def valid_files(name: str, folder: Path) -> Iterator[bytes]:
         with h5py.File(folder / "mvsec", "w") as file:
             file["davis/left/events"] = np.stack([x, y, t / 1e6, p * 2 - 1], 1)
         yield (folder / "mvsec").read_bytes()
+        rows = list(zip(t.tolist(), x.tolist(), y.tolist(), p.tolist(), strict=True))
+        chunks = [ecf_writer.encode(rows[4 * layout : 4 * layout + 4], layout) for layout in range(3)]
+        yield ecf_writer.write(folder / "ecf", chunks, 12, 4).read_bytes()
 
 
 def mutate(content: bytes, chance: random.Random) -> bytes:

@@ -1,7 +1,6 @@
 """The FlatBuffers of an AEDAT 4 file with one stream of events: its header, packets, and the table of packets.
 
-Each is a table whose fields are all there, so its bytes are known but for lengths and values. Positions are counted
-from the buffer's length, which precedes it; 64-bit values lie at multiples of 8 of that.
+A buffer starts with its own length. 64-bit values lie at multiples of 8 bytes from there.
 
 Source: iniVation, "AEDAT 4.0 file format", docs.inivation.com; FlatBuffers, "Internals", flatbuffers.dev.
 """
@@ -18,7 +17,7 @@ from data_contracts.events import Events, SensorSize
 VERSION_LINE = b"#!AER-DAT4.0\r\n"
 LZ4 = 1
 _ROOT = 32
-"""Where the one table or first table of a buffer lies: after length, root, identifier and the list of field places."""
+"""Where the table of a buffer lies: after length, place of the table, identifier and list of the fields' places."""
 _EVENT = np.dtype(
     {"names": ["t", "x", "y", "p"], "formats": ["<i8", "<i2", "<i2", "u1"], "offsets": [0, 8, 10, 12], "itemsize": 16}
 )
@@ -30,7 +29,7 @@ _TABLE_ROW = np.dtype(
         "itemsize": 48,
     }
 )
-"""A table: the distance back to its list of field places, then its fields; padded so that the next is aligned too."""
+"""A table: the distance back to the list of its fields' places, then its fields; padded so that the next is aligned."""
 
 _XML = """<dv version="2.0"><node name="outInfo" path="/mainloop/Recorder/outInfo/">
 <node name="0" path="/mainloop/Recorder/outInfo/0/"><attr key="compression" type="string">LZ4</attr>
@@ -44,7 +43,7 @@ _XML = """<dv version="2.0"><node name="outInfo" path="/mainloop/Recorder/outInf
 
 @dataclass(frozen=True)
 class Packet:
-    """What the table of packets says of one: its first byte (after its own header), length, events and their times."""
+    """What the table of packets says of one; `place` is the file's byte after the header of the packet."""
 
     place: int
     num_bytes: int
@@ -81,7 +80,7 @@ def packet_table(packets: list[Packet]) -> bytes:
     for row, one in zip(rows, packets, strict=True):
         row["place"], row["bytes"], row["num_events"] = one.place, one.num_bytes, one.num_events
         row["first"], row["last"] = one.first_us, one.last_us
-    # One list of field places for all rows stands at the end, so the distance back is negative.
+    # All rows share one list of their fields' places. It stands at the end, so the distance back is negative.
     fields = struct.pack("<7H", 14, 44, 4, 12, 20, 28, 36)
     rows["fields"] = places - (start + rows.nbytes)
     offsets = (places - (vector + 4 + 4 * np.arange(len(packets)))).astype("<u4")
@@ -91,10 +90,13 @@ def packet_table(packets: list[Packet]) -> bytes:
 
 
 def _buffer(identifier: bytes, places: tuple[int, ...], table: bytes, content: bytes) -> bytes:
-    """A size-prefixed buffer of one table with fields at `places`, followed by what they refer to.
+    """A size-prefixed buffer of one table.
 
     Args:
+        identifier: four letters.
+        places: of the fields, counted from the start of the table.
         table: its fields, which follow the four bytes of the distance back to the list of their places.
+        content: what fields refer to, right after the table.
     """
     fields = struct.pack(f"<{2 + len(places)}H", 4 + 2 * len(places), 4 + len(table), *places)
     head = struct.pack("<I", _ROOT - 4) + identifier + bytes(_ROOT - 12 - len(fields)) + fields

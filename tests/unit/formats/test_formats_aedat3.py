@@ -149,7 +149,7 @@ def test_packets_hold_at_most_4096_events(tmp_path):
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(DataError, match="for sensors of 128 x 128, .*640 x 480 px, got 320 x 240"):
+    with pytest.raises(DataError, match=r"for sensors of 128 x 128, .*640 x 480 px, got 320 x 240"):
         reader.write(tmp_path / "a", make_events([(1, 2, 3, 1)], (320, 240)))
     with pytest.raises(DataError, match=r"holds times below 2\^62 us, got 4611686018427387904"):
         reader.write(tmp_path / "a", make_events([(2**62, 2, 3, 1)]))

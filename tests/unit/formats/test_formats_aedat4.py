@@ -1,4 +1,4 @@
-"""AEDAT 4: what is written follows the format; a corrupt file is an error of this file, whatever it does to the decoder."""
+"""AEDAT 4: what is written follows the format; a corrupt file is an error, whatever it does to the decoder."""
 
 import struct
 import subprocess
