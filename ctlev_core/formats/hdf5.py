@@ -4,9 +4,9 @@
   which is added; `ms_to_idx` is not needed. Other names of `event_tables.COLUMN_NAMES` will do, such as xs and ts.
 - MVSEC: a dataset `davis/left/events` [N, 4] with columns x, y, t, p, t in seconds and p in {-1, 1}. `read` takes the
   left camera, on which MVSEC's ground truth is given, or with `camera="right"` the other.
-- Prophesee: a dataset `CD/events` [N] of rows with the fields x, y, p, t, compressed with Prophesee's filter ECF or with
-  one of HDF5's; the attribute `geometry` of the file, such as 1280x720, states the sensor. Other files may have such
-  rows in `events`.
+- Prophesee: a dataset `CD/events` [N] of rows with the fields x, y, p, t, compressed with Prophesee's filter ECF or one
+  of HDF5's; the attribute `geometry` of the file, such as 1280x720, states the sensor. Other files may have such rows
+  in `events`.
 
 Integer times are microseconds, float times seconds unless their column says `_us`, rounded to the nearest microsecond.
 An attribute `sensor_size`

@@ -90,18 +90,26 @@ def encode(rows: Rows, layout: int, stray_bits: bool = False) -> bytes:
 
 
 def write(
-    path: Path, chunks: Sequence[bytes], num_rows: int, chunk_rows: int, geometry: str | None = "1280x720"
+    path: Path,
+    chunks: Sequence[bytes],
+    num_rows: int,
+    chunk_rows: int,
+    geometry: str = "1280x720",
+    fields: np.dtype = ROW,
+    shuffle: bool = False,
+    filter_mask: int = 0,
 ) -> Path:
-    """A file whose `CD/events` has the encoded chunks."""
+    """A file whose `CD/events` has the encoded chunks; bit 0 of `filter_mask` says that they are not encoded."""
     with h5py.File(path, "w") as file:
         group = file.create_group("CD")
         options = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         options.set_chunk((chunk_rows,))
+        if shuffle:
+            options.set_shuffle()
         options.set_filter(FILTER, h5py.h5z.FLAG_OPTIONAL)  # HDF5 has no such filter, and makes do
         space = h5py.h5s.create_simple((num_rows,), (h5py.h5s.UNLIMITED,))
-        dataset = h5py.h5d.create(group.id, b"events", h5py.h5t.py_create(ROW), space, options)
+        dataset = h5py.h5d.create(group.id, b"events", h5py.h5t.py_create(fields), space, options)
         for number, content in enumerate(chunks):
-            dataset.write_direct_chunk((number * chunk_rows,), content)
-        if geometry is not None:
-            file.attrs["geometry"] = geometry
+            dataset.write_direct_chunk((number * chunk_rows,), content, filter_mask)
+        file.attrs["geometry"] = geometry
     return path

@@ -62,7 +62,7 @@ def decode_ecf(content: np.ndarray, t: np.ndarray, x: np.ndarray, y: np.ndarray,
 
 
 @njit(cache=True, nogil=True)
-def _word(content: np.ndarray, place: int, num_bytes: int) -> int:
+def _word(content: np.ndarray, place: int, num_bytes: int) -> np.int64:
     word = np.int64(0)
     for byte in range(num_bytes):
         word |= np.int64(content[place + byte]) << 8 * byte

@@ -186,6 +186,22 @@ def test_a_missing_chunk_is_refused(tmp_path):
     raises_both_ways(path, r"a\.h5: CD/events: chunk from row 30 on: expected it to be stored with the filter ECF")
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"shuffle": True}, r"expected ECF as its only filter, got the filters \[2, 36559\]"),
+        ({"filter_mask": 1}, "chunk from row 0 on: expected it to be stored with the filter ECF, got none"),
+        (
+            {"fields": np.dtype([(name, "i4") for name in ("ts", "x", "y", "p")])},
+            "expected the fields x, y, p, t, got ts, x, y, p",
+        ),
+    ],
+)
+def test_other_uses_of_the_filter_are_refused(tmp_path, options, message):
+    path = ecf_writer.write(tmp_path / "a.h5", [GOOD], 30, 30, **options)
+    raises_both_ways(path, rf"a\.h5: CD/events: {message}")
+
+
 def test_events_beyond_the_geometry_are_refused(tmp_path):
     chunk = ecf_writer.encode([(5, 640, 1, 1)], 0)
     raises_both_ways(ecf_writer.write(tmp_path / "a.h5", [chunk], 1, 30, "640x480"), "x must be below 640, got 640 at")
