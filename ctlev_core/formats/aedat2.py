@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ctlev_core.events.decoding import aedat2, record_files
-from ctlev_core.events.decoding.sensor_sizes import smallest_sensor
+from ctlev_core.events.decoding.sensor_sizes import INIVATION_CAMERAS, smallest_sensor
 from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize, check_events
 
@@ -26,17 +26,7 @@ VERSION = 1
 HAS_SIGNATURE = True
 SUFFIXES = (".aedat", ".aedat2")
 
-SENSORS: dict[str, SensorSize] = {
-    "DVS128": (128, 128),
-    "DAVIS128": (128, 128),
-    "DAVIS208": (208, 192),
-    "DAVIS240": (240, 180),
-    "DAVIS346": (346, 260),
-    "DAVIS640": (640, 480),
-}
-"""Cameras by the start of jAER's names for them; (width, height) px."""
-
-_UNNAMED_SENSORS = (SENSORS["DAVIS240"], SENSORS["DAVIS346"], SENSORS["DAVIS640"])
+_UNNAMED_SENSORS = tuple(INIVATION_CAMERAS[name] for name in ("DAVIS240", "DAVIS346", "DAVIS640"))
 _SPECIAL_EVENT = 0x400
 _LONGEST_GAP_US, _MAX_FILLERS = 1 << 30, 1 << 16
 
@@ -75,9 +65,9 @@ def _open(path: Path) -> record_files.RecordFile:
 
     header = aedat2.read_header(path)
     num_records = aedat2.check_size(path, header)
-    known = re.match("|".join(SENSORS), header.chip.upper())
+    known = re.match("|".join(INIVATION_CAMERAS), header.chip.upper())
     if header.chip and not known:
-        raise DataError(f"{path}: unknown camera {header.chip!r}; known: {', '.join(SENSORS)}")
+        raise DataError(f"{path}: unknown camera {header.chip!r}; known: {', '.join(INIVATION_CAMERAS)}")
     layout = decoding.DVS128 if known and known[0] == "DVS128" else decoding.DAVIS
 
     def sensor_size(state: np.ndarray, num_events: int) -> SensorSize:
@@ -91,11 +81,11 @@ def _open(path: Path) -> record_files.RecordFile:
         if layout == decoding.DVS128 and largest_address > 0xFFFF:
             raise DataError(f"{path}: a DVS128 has 16-bit addresses, got {largest_address:#x}")
         if known:
-            return SENSORS[known[0]]
+            return INIVATION_CAMERAS[known[0]]
         if largest_address <= 0xFFFF:
             raise DataError(
                 f"{path}: the header names no camera, and none of the {num_records} addresses passes 16 bits: expected "
-                f"a line '# AEChip: ...' with one of {', '.join(SENSORS)}"
+                f"a line '# AEChip: ...' with one of {', '.join(INIVATION_CAMERAS)}"
             )
         return smallest_sensor(
             int(state[record_files.LARGEST_X]), int(state[record_files.LARGEST_Y]), str(path), _UNNAMED_SENSORS
@@ -124,7 +114,7 @@ def write(path: Path, events: Events) -> None:
             late.
     """
     check_events(events, f"events to be written to {path}")
-    chips = {size: name for name, size in SENSORS.items() if name.startswith("DAVIS")}
+    chips = {size: name for name, size in INIVATION_CAMERAS.items() if name.startswith("DAVIS")}
     if events.sensor_size not in chips:
         raise DataError(
             f"{path}: AEDAT 2.0 is written for sensors of {', '.join(f'{w} x {h}' for w, h in chips)} px, got "

@@ -1,6 +1,6 @@
 """AEDAT 4, the files of iniVation's DV software: compressed packets of events, frames, IMU samples and triggers.
 
-Only the event stream is read. Time stamps are the file's own, unix time in microseconds.
+Only the event stream is read and written. Time stamps are the file's own, unix time in microseconds.
 
 Source: iniVation, "AEDAT 4.0 file format"; decoded by the `aedat` package, in a process of its own.
 """
@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ctlev_core.events.decoding import aedat4_process, event_chunks
+from ctlev_core.events.decoding import aedat4_encoding, aedat4_process, event_chunks
 from data_contracts.errors import DataError
-from data_contracts.events import Events, SensorSize
+from data_contracts.events import Events, SensorSize, check_events
 
 VERSION = 1
 HAS_SIGNATURE = True
@@ -24,6 +24,8 @@ SUFFIXES = (".aedat4",)
 _MAGIC = b"#!AER-DAT4.0"
 _SHORT, _INT, _UINT, _LONG = (struct.Struct(f"<{code}") for code in "HiIq")
 _PACKET = struct.Struct("<ii")  # stream, bytes
+_PACKET_EVENTS = 1 << 13
+_LARGEST_SIDE = 1 << 15
 
 
 def sniff(path: Path) -> bool:
@@ -103,3 +105,37 @@ def _events(packets: Iterator[bytes], sensor_size: SensorSize) -> Iterator[Event
         yield Events(
             rows["t"].astype(np.int64), rows["x"].copy(), rows["y"].copy(), rows["on"].astype(np.uint8), sensor_size
         )
+
+
+def write(path: Path, events: Events) -> None:
+    """Write one stream of events, compressed with LZ4 as DV does, so that `read` returns them unchanged.
+
+    Raises:
+        DataError: events break `check_events`, or the sensor has more than 32,768 px a side.
+    """
+    import pyarrow as pa
+
+    check_events(events, f"events to be written to {path}")
+    if max(events.sensor_size) > _LARGEST_SIDE:
+        raise DataError(
+            f"{path}: AEDAT 4 holds sensors of at most {_LARGEST_SIDE} px a side, got {events.sensor_size[0]} x "
+            f"{events.sensor_size[1]}"
+        )
+
+    def compress(content: bytes) -> bytes:
+        return pa.compress(content, codec="lz4", asbytes=True)
+
+    packets = []
+    with path.open("wb") as file:
+        file.write(aedat4_encoding.header(events.sensor_size, -1))
+        for start in range(0, len(events), _PACKET_EVENTS):
+            part = events.slice(start, start + _PACKET_EVENTS)
+            content = compress(aedat4_encoding.packet(part))
+            file.write(_PACKET.pack(0, len(content)))
+            times = int(part.t[0]), int(part.t[-1])
+            packets.append(aedat4_encoding.Packet(file.tell(), len(content), len(part), *times))
+            file.write(content)
+        table_place = file.tell()
+        file.write(compress(aedat4_encoding.packet_table(packets)))
+        file.seek(0)
+        file.write(aedat4_encoding.header(events.sensor_size, table_place))

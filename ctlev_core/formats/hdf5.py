@@ -1,9 +1,12 @@
-"""HDF5 files of events, in the layouts of DSEC, of MVSEC, and plain ones.
+"""HDF5 files of events, in the layouts of DSEC, of MVSEC, of Prophesee, and plain ones.
 
 - DSEC: datasets x, y, t, p in the group `events` (or `CD/events`, or at the root), t in microseconds from `t_offset`,
   which is added; `ms_to_idx` is not needed. Other names of `event_tables.COLUMN_NAMES` will do, such as xs and ts.
 - MVSEC: a dataset `davis/left/events` [N, 4] with columns x, y, t, p, t in seconds and p in {-1, 1}. `read` takes the
   left camera, on which MVSEC's ground truth is given, or with `camera="right"` the other.
+- Prophesee: a dataset `CD/events` [N] of rows with the fields x, y, p, t, compressed with Prophesee's filter ECF or one
+  of HDF5's; the attribute `geometry` of the file, such as 1280x720, states the sensor. Other files may have such rows
+  in `events`.
 
 Integer times are microseconds, float times seconds unless their column says `_us`, rounded to the nearest microsecond.
 An attribute `sensor_size`
@@ -11,7 +14,8 @@ An attribute `sensor_size`
 
 DSEC compresses with blosc: install hdf5plugin to read it.
 
-Source: uzh-rpg/DSEC, scripts/utils/eventslicer.py (t_offset); MVSEC, mvsec_to_hdf5 layout as its users read it.
+Source: uzh-rpg/DSEC, scripts/utils/eventslicer.py (t_offset); MVSEC, mvsec_to_hdf5 layout as its users read it;
+Prophesee, "HDF5 event file format", docs.prophesee.ai.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ctlev_core.events.decoding import event_chunks, event_tables
+from ctlev_core.events.decoding import ecf_files, event_chunks, event_tables
 from ctlev_core.safe_files import hdf5_files
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, SensorSize, check_events
@@ -34,6 +38,7 @@ SUFFIXES = (".h5", ".hdf5")
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _GROUPS = ("events", "CD/events", "/")
+_ROWS = ("CD/events", "events")
 _MATRIX_COLUMNS = ("x", "y", "t", "p")
 _BLOCK = 1 << 18
 
@@ -95,7 +100,7 @@ def write(path: Path, events: Events) -> None:
 
 def _chunks(path: Path, num_events: int, camera: str) -> Iterator[Events]:
     with _open(path) as file:
-        source = _find_matrix(file, path, camera) or _find_columns(file, path)
+        source = _find_matrix(file, path, camera) or _find_rows(file, path) or _find_columns(file, path)
         length, read_block, sensor_size = source
 
         def chunks() -> Iterator[event_tables.Columns]:
@@ -147,6 +152,30 @@ def _find_matrix(file: Any, path: Path, camera: str) -> Source | None:
     return dataset.shape[0], read_block, _sensor_size(dataset, where)
 
 
+def _find_rows(file: Any, path: Path) -> Source | None:
+    """Prophesee's table, or another of rows with named fields; None where the file has none."""
+    for name in _ROWS:
+        dataset = hdf5_files.find_object(file, name, str(path))
+        if hasattr(dataset, "shape") and dataset.dtype.names:
+            break
+    else:
+        return None
+    where = f"{path}: {name}"
+    found = event_tables.require_columns(dataset.dtype.names, where)
+    if dataset.ndim != 1:
+        raise DataError(f"{where}: expected rows [N], got {dataset.shape}")
+    dataset = hdf5_files.check_dataset(dataset, where, rows=True)
+    read_rows = ecf_files.row_reader(dataset, where) or dataset.__getitem__
+
+    def read_block(rows: slice) -> event_tables.Columns:
+        block = read_rows(rows)
+        values = {column: block[key] for column, key in found.items()}
+        values["t"] = event_tables.times_as_named(found["t"], values["t"], where)
+        return values
+
+    return dataset.shape[0], read_block, _sensor_size(dataset, where) or _geometry(file, path)
+
+
 def _find_columns(file: Any, path: Path) -> Source:
     """One dataset a column."""
     for name in _GROUPS:
@@ -193,6 +222,17 @@ def _time_offset(file: Any, path: Path) -> int:
     if abs(offset) >= 1 << 62:
         raise DataError(f"{path}: expected t_offset below 2^62 us, got {offset}")
     return offset
+
+
+def _geometry(file: Any, path: Path) -> SensorSize | None:
+    if "geometry" not in file.attrs:
+        return None
+    text = file.attrs["geometry"]
+    text = text.decode("ascii", "replace") if isinstance(text, bytes) else str(text)
+    size = event_tables.parse_sensor_size(text)
+    if size is None:
+        raise DataError(f"{path}: expected the attribute geometry as WIDTHxHEIGHT, got {text[:40]!r}")
+    return size
 
 
 def _sensor_size(holder: Any, where: str) -> SensorSize | None:

@@ -82,17 +82,19 @@ def dataset_names(group: Any, where: str) -> list[str]:
     return [name for name in group if hasattr(find_object(group, name, where), "shape")]
 
 
-def check_dataset(dataset: Any, where: str, max_bytes: int | None = None) -> Any:
+def check_dataset(dataset: Any, where: str, max_bytes: int | None = None, rows: bool = False) -> Any:
     """The same dataset: it holds numbers that lie in this very file, in chunks of bounded size.
 
     Args:
         dataset: of h5py.
         where: names file and dataset in messages.
         max_bytes: of all its values; None where they are read in blocks.
+        rows: a value is a row of named numbers.
     Raises:
         DataError: it does not; nothing was read.
     """
-    if dataset.shape is None or dataset.dtype.kind not in "buif":
+    types = [dataset.dtype[name] for name in dataset.dtype.names or ()] if rows else [dataset.dtype]
+    if dataset.shape is None or not types or any(one.kind not in "buif" for one in types):
         raise DataError(f"{where}: expected numbers, got {dataset.dtype}")
     if dataset.external:
         raise DataError(f"{where}: its values are in another file, {dataset.external[0][0][:80]!r}; not read")

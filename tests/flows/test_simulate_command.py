@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from ctlev_core import read_events, simulate_video
 from ctlev_core.plugin_contracts import FormatWithWriter
-from ctlev_core.plugins import load, names
+from ctlev_core.plugins import PluginError, load, names
 from flows.cli import app
 from flows.simulate import find_writer
 
@@ -77,7 +77,16 @@ def test_a_format_that_cannot_hold_the_events_says_so_of_the_file_asked_for(vide
 
 
 def test_the_suffix_says_the_format(tmp_path):
-    for suffix, name in ((".parquet", "parquet"), (".raw", "evt3"), (".npz", "npz"), (".csv", "csv"), (".dat", "dat")):
+    for suffix, name in (
+        (".parquet", "parquet"),
+        (".raw", "evt3"),
+        (".npz", "npz"),
+        (".csv", "csv"),
+        (".dat", "dat"),
+        (".aedat", "aedat2"),
+        (".aedat3", "aedat3"),
+        (".aedat4", "aedat4"),
+    ):
         assert find_writer(tmp_path / f"a{suffix}") == name
 
 
@@ -86,7 +95,6 @@ def test_the_suffix_says_the_format(tmp_path):
     [
         (["{missing}", "{out}.parquet"], "got nothing there"),
         (["{video}", "{out}.mp3"], r"no format is written with the suffix '.mp3'; known: "),
-        (["{video}", "{out}.parquet", "--format", "aedat4"], "format 'aedat4' is read only"),
         (["{video}", "{out}.parquet", "--format", "evt9"], "unknown plug-in 'evt9'"),
         (["{video}", "{out}.parquet", "--sensor", "dvs364"], "expected one of ideal"),
         (["{video}", "{out}/in/a.parquet"], "there is no folder"),
@@ -102,6 +110,14 @@ def test_what_cannot_be_done_is_said_and_leaves_nothing(video, tmp_path, argumen
     status, _, errors = invoke(*(argument.format(**given) for argument in arguments))
     assert status == 2 and message in " ".join(errors.replace("│", " ").split())
     assert not list(tmp_path.iterdir())
+
+
+def test_a_format_without_a_writer_is_read_only(tmp_path, monkeypatch):
+    monkeypatch.delattr(load("formats", "aedat4"), "write")
+    with pytest.raises(PluginError, match="format 'aedat4' is read only"):
+        find_writer(tmp_path / "a.aedat4", "aedat4")
+    with pytest.raises(PluginError, match=r"no format is written with the suffix '\.aedat4'"):
+        find_writer(tmp_path / "a.aedat4")
 
 
 def test_what_is_there_stays_unless_it_may_be_replaced(video, tmp_path):

@@ -24,6 +24,7 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "helpers"))
 import aedat4_writer
+import ecf_writer
 
 from ctlev_core import plugins
 from ctlev_core.events.decoding import event_chunks
@@ -31,7 +32,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 
 REAL_AEDAT4 = Path(__file__).resolve().parents[2].parent / "shared/real/events/person/tonic_sample.aedat4"
-SENSORS = {"aedat2": (346, 260), "atis": (240, 180)}
+SENSORS = {"aedat2": (346, 260), "aedat3": (346, 260), "atis": (240, 180)}
 
 
 class Failure(Exception):
@@ -98,7 +99,6 @@ def valid_files(name: str, folder: Path) -> Iterator[bytes]:
         yield aedat4_writer.aedat4([aedat4_writer.packet([(1, 2, 3, 1), (5, 319, 239, 0)]), aedat4_writer.packet([])])
         if REAL_AEDAT4.is_file():
             yield REAL_AEDAT4.read_bytes()
-        return
     generator = np.random.default_rng(0)
     width, height = SENSORS.get(name, (640, 480))
     for count, duration in ((1, 1), (5, 10**5), (40, 10**6)):
@@ -123,6 +123,9 @@ def valid_files(name: str, folder: Path) -> Iterator[bytes]:
         with h5py.File(folder / "mvsec", "w") as file:
             file["davis/left/events"] = np.stack([x, y, t / 1e6, p * 2 - 1], 1)
         yield (folder / "mvsec").read_bytes()
+        rows = list(zip(t.tolist(), x.tolist(), y.tolist(), p.tolist(), strict=True))
+        chunks = [ecf_writer.encode(rows[4 * layout : 4 * layout + 4], layout) for layout in range(3)]
+        yield ecf_writer.write(folder / "ecf", chunks, 12, 4).read_bytes()
 
 
 def mutate(content: bytes, chance: random.Random) -> bytes:

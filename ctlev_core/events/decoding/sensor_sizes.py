@@ -22,6 +22,16 @@ COMMON_SENSORS: tuple[SensorSize, ...] = (
 )
 """(width, height) in pixels, the smallest first."""
 
+INIVATION_CAMERAS: dict[str, SensorSize] = {
+    "DVS128": (128, 128),
+    "DAVIS128": (128, 128),
+    "DAVIS208": (208, 192),
+    "DAVIS240": (240, 180),
+    "DAVIS346": (346, 260),
+    "DAVIS640": (640, 480),
+}
+"""Cameras by the start of the names that jAER and cAER give them, in capitals; (width, height) px."""
+
 
 def smallest_sensor(
     largest_x: int, largest_y: int, where: str, sensors: Sequence[SensorSize] = COMMON_SENSORS

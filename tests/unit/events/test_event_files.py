@@ -25,6 +25,8 @@ REAL = Path(__file__).resolve().parents[3].parent / "shared" / "real" / "events"
 SIZE = (640, 480)
 WRITABLE = {
     "aedat2": (346, 260),
+    "aedat3": (346, 260),
+    "aedat4": SIZE,
     "atis": (240, 180),
     "csv": SIZE,
     "dat": SIZE,
@@ -109,7 +111,7 @@ def test_equal_events_in_large_blocks(name, tmp_path):
     assert_same(event_chunks.concatenate(event_files.read_event_chunks(path, 40_001)), events)
 
 
-@pytest.mark.parametrize("name", ["csv", "evt2", "evt3", "hdf5", "npz", "parquet"])
+@pytest.mark.parametrize("name", ["aedat3", "aedat4", "csv", "evt2", "evt3", "hdf5", "npz", "parquet"])
 def test_a_recording_without_events_is_one_empty_chunk(name, tmp_path):
     plugins.load("formats", name).write(tmp_path / "events", make_events(0))
     chunks = list(event_files.read_event_chunks(tmp_path / "events"))

@@ -185,9 +185,10 @@ def test_windows_are_found_in_their_recording(tmp_path):
         np.testing.assert_array_equal(window.x, events.x[inside])
 
 
-def test_what_cannot_be_exported_is_refused(tmp_path):
+def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     generated = write_generated(tmp_path / "generated", real_frames(tmp_path))
-    with pytest.raises(DataError, match="'aedat4' is read, not written"):
+    with monkeypatch.context() as patch, pytest.raises(DataError, match="'aedat4' is read, not written"):
+        patch.delattr(plugins.load("formats", "aedat4"), "write")
         export(tmp_path, generated, name="a", format="aedat4")
     recordings = write_recordings(tmp_path / "r")
     images = write_frames(tmp_path / "f", True, num_events=0)
