@@ -39,7 +39,7 @@ _FLOOR = "held-out recorded"
 _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
 _WIDEST = 7
 """Training sets side by side that fit on a page."""
-_ENOUGH = 5
+_ENOUGH = 4
 """Trainings of a training set from which their spread is known well enough to say no more about it."""
 _SOURCES = {
     ORACLE: "recorded frames of the very poses that synthetic frames are sampled from: the most they can give",
@@ -241,10 +241,13 @@ def _notes(by_set: dict[str, list[Row]], metric: str) -> list[str]:
     notes += _meanings([metric])
     if any(one.in_part for one in parsed):
         notes.append("50 % of synthetic, and the like: the first part of the synthetic frames")
-    if min(len({_training(row) for row in of_set}) for of_set in by_set.values()) < _ENOUGH:
+    fewest = min(len({_training(row) for row in of_set}) for of_set in by_set.values())
+    if fewest == 1:
+        notes.append("Intervals cannot cover the spread between trainings where there is one.")
+    elif fewest < _ENOUGH:
         notes.append(
-            "Intervals cannot cover the spread between trainings where there is one, and cover it poorly where there "
-            "are two or three."
+            "Two or three trainings say little about their own spread: intervals of differences are wider for it, and "
+            "more trainings make them narrower."
         )
     return notes
 
