@@ -1,8 +1,9 @@
-"""The files of an artefact with their sizes and digests, where they are too many for the manifest's metadata."""
+"""Files of an artefact or of folders, with sizes and digests; lists of them too long for a manifest's metadata."""
 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,28 @@ def file_digest(path: Path) -> str:
     """SHA-256 of a file's content, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def files_of(places: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Files, and every file of folders, named by the place's number and the path inside it, folders sorted.
+
+    Links to folders are followed: parts of a model that several models share are often linked.
+    """
+    return [
+        (str(number) if path == place else f"{number}/{path.relative_to(place).as_posix()}", path)
+        for number, place in enumerate(places)
+        for path in ([place] if place.is_file() else sorted(_files_within(place)))
+        if path.is_file()
+    ]
+
+
+def _files_within(folder: Path) -> Iterator[Path]:
+    seen = set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        seen.add(os.path.realpath(place))
+        # Not into a folder that links to one around it.
+        folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) not in seen]
+        yield from (Path(place, name) for name in names)
 
 
 def write_file_list(folder: Path, files: Sequence[Path]) -> None:

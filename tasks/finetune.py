@@ -12,8 +12,9 @@ from ctlev_core import plugins
 from ctlev_core.pictures.labelled_pictures import picture_files
 from data_contracts import tables
 from data_contracts.config import GeneratorChoice
+from data_contracts.file_lists import files_of
 from data_contracts.manifest import Manifest, conditions_of, history_table, matching_rows
-from tasks.stage import Output, files_of, stage
+from tasks.stage import Output, stage
 
 
 def _base_model_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:

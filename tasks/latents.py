@@ -12,8 +12,9 @@ from ctlev_core.diffusion.pretrained.paths import learned_autoencoder
 from ctlev_core.diffusion.training.options import LatentOptions
 from data_contracts import tables
 from data_contracts.errors import DataError
+from data_contracts.file_lists import files_of
 from data_contracts.manifest import Manifest
-from tasks.stage import Output, files_of, stage
+from tasks.stage import Output, stage
 
 
 def _autoencoder_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:

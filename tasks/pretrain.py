@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from data_contracts import tables
+from data_contracts.file_lists import files_of
 from data_contracts.manifest import history_table
-from tasks.stage import Output, files_of, stage
+from tasks.stage import Output, stage
 
 if TYPE_CHECKING:  # torch, which flows that pre-train nothing need not wait for
     from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions

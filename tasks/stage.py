@@ -51,6 +51,7 @@ from data_contracts.arrays import save_compressed
 from data_contracts.compressed_arrays import SUFFIX, CompressedArrayWriter
 from data_contracts.config import Choice, cache_material
 from data_contracts.errors import DataError
+from data_contracts.file_lists import files_of
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.table_writer import TableWriter
 from data_contracts.tables import TableSchema
@@ -400,28 +401,6 @@ def _time_limit(name: str) -> Iterator[None]:
 def numbered(label: str, number: int) -> str:
     """The label of one of several alike; the first has none."""
     return f"{label}, {number + 1}" if number else label
-
-
-def files_of(places: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Files, and every file of folders, named by the place's number and the path inside it, for `raw_files`.
-
-    Links to folders are followed: parts of a model that several models share are often linked.
-    """
-    return [
-        (str(number) if path == place else f"{number}/{path.relative_to(place).as_posix()}", path)
-        for number, place in enumerate(places)
-        for path in ([place] if place.is_file() else sorted(_files_within(place)))
-        if path.is_file()
-    ]
-
-
-def _files_within(folder: Path) -> Iterator[Path]:
-    seen = set()
-    for place, folders, names in os.walk(folder, followlinks=True):
-        seen.add(os.path.realpath(place))
-        # Not into a folder that links to one around it.
-        folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) not in seen]
-        yield from (Path(place, name) for name in names)
 
 
 def input_files_of(argument: str) -> RawFiles:

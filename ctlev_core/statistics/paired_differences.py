@@ -181,9 +181,9 @@ def _vary(training_sets: Sequence[Trainings], seed: int) -> _Varied:
     counts = np.bincount(index, weights=weights)
     sums = []
     for training_set in training_sets:
-        of_set = [np.bincount(index, weights=weights * values) for values in training_set.values[:, scored]]
+        of_set = np.stack([np.bincount(index, weights=weights * values) for values in training_set.values[:, scored]])
         # In the order of their scores, so that the order of trainings changes nothing.
-        sums.append(np.stack(sorted(of_set, key=lambda one: float(one.sum()))))
+        sums.append(of_set[np.argsort(of_set.sum(axis=1), kind="stable")])
     found = np.array([of_set.sum() / (len(of_set) * counts.sum()) for of_set in sums])
     trainings = tuple(variance_of_mean(of_set.sum(axis=1) / counts.sum()) for of_set in sums)
     if len(names) < MIN_RECORDINGS:

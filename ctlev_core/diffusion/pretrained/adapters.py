@@ -24,6 +24,7 @@ from ctlev_core.diffusion.pretrained.components import read_json
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, base_model_places
 from ctlev_core.safe_files.tensor_files import read_tensor_table
 from data_contracts.errors import DataError
+from data_contracts.file_lists import file_digest, files_of
 
 if TYPE_CHECKING:
     from torch import nn
@@ -164,10 +165,6 @@ def _place_of(named: str) -> Path:
 def _digest(base_model: Path, controlnet: Path | None) -> str:
     """Of all weights and configs of the base model."""
     digest = hashlib.sha256()
-    for place in base_model_places(base_model, controlnet=controlnet):
-        files = [place] if place.is_file() else sorted(path for path in place.rglob("*") if path.is_file())
-        for path in files:
-            name = path.name if place.is_file() else path.relative_to(place).as_posix()
-            with path.open("rb") as file:
-                digest.update(name.encode() + hashlib.file_digest(file, "sha256").digest())
+    for name, path in files_of(base_model_places(base_model, controlnet=controlnet)):
+        digest.update(f"{name} {file_digest(path)}\n".encode())
     return digest.hexdigest()

@@ -180,8 +180,17 @@ def test_another_base_model_is_refused(base_folder, adapter, tmp_path, monkeypat
     monkeypatch.setenv("CTLEV_BASE_MODEL", str(other))
     with pytest.raises(DataError, match=r"other is not the base model that this adapter belongs to"):
         load_base_model(adapter)
-    monkeypatch.setenv("CTLEV_BASE_MODEL", str(shutil.copytree(base_folder, tmp_path / "moved")))
+    moved = shutil.copytree(base_folder, tmp_path / "moved")
+    monkeypatch.setenv("CTLEV_BASE_MODEL", str(moved))
     load_base_model(adapter)
+    # Parts that several base models share are often links.
+    for name, of in (("unet", base_folder), ("unet", other)):
+        shutil.rmtree(moved / name) if not (moved / name).is_symlink() else (moved / name).unlink()
+        (moved / name).symlink_to(of / name)
+        if of == base_folder:
+            load_base_model(adapter)
+    with pytest.raises(DataError, match="moved is not the base model"):
+        load_base_model(adapter)
     monkeypatch.setenv("CTLEV_BASE_MODEL", str(tmp_path / "none"))
     with pytest.raises(DataError, match=r"is not at .*none; set CTLEV_BASE_MODEL"):
         load_base_model(adapter)

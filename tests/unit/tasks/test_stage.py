@@ -23,10 +23,11 @@ from ctlev_core.plugins import PluginError
 from data_contracts import tables
 from data_contracts.config import RUN_SETTING, DatasetChoice, Frozen, Windows, cache_material
 from data_contracts.errors import DataError
+from data_contracts.file_lists import files_of
 from data_contracts.manifest import read_manifest, write_manifest
 from data_contracts.run_record import read_run_record, write_run_record
 from tasks import workers
-from tasks.stage import Output, files_of, in_one_run, planning, stage
+from tasks.stage import Output, in_one_run, planning, stage
 from tasks.store import Store
 
 
