@@ -50,6 +50,7 @@ ALL = (
     Benchmark("sampling"),
     Benchmark("arrays"),
     Benchmark("operations"),
+    Benchmark("many_recordings", ("20000",)),
     Benchmark("gpu", needs_gpu=True),
 )
 
