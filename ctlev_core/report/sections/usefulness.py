@@ -217,7 +217,12 @@ def _generators_table(found: Usefulness) -> Table:
     shown = found.predictors[:_NUM_SHOWN]
     order = sorted(found.gains, key=lambda name: -found.gains[name].added.value)
     body: list[list[Cell]] = [
-        [set_name(name), found.gains[name].added.text(), found.gains[name].alone, *(one.values[name] for one in shown)]
+        [
+            set_name(name),
+            found.gains[name].added.text(),
+            None if math.isnan(found.gains[name].alone) else score_text(found.gains[name].alone, signed=True),
+            *(one.values[name] for one in shown),
+        ]
         for name in order
     ]
     better = "less error" if lower_is_better(found.metric) else "more"
