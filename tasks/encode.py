@@ -43,7 +43,7 @@ TABLE_ROWS = 1 << 13
 logger = logging.getLogger(__name__)
 
 
-@stage(version=6, schema=tables.FRAMES)
+@stage(version=6, schema=tables.FRAMES, spreads=True)
 def encode(out: Output, recordings: Manifest, *, encoding: EncodingChoice, windows: Windows) -> pa.Table:
     """Cut every recording into windows and encode each: arrays `histograms` (counts) and `frames` (8-bit RGB).
 

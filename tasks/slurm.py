@@ -238,7 +238,7 @@ def _folder(home: Path) -> Path:
 def _compute_if_seen(
     witness: str, environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> bytes:
-    """In a job, which must see the same home: else it would compute everything anew, into a folder that nobody reads."""
+    """In a job. One that sees another home would compute everything anew, into a folder that nobody reads."""
     if not os.path.exists(witness):
         home = Path(witness).parents[1]
         error = DataError(
@@ -276,6 +276,6 @@ def _last_line(job: _Job) -> str:
     path = Path(job.log_directory, f"{job.job_name}-{job.job_id}.err")
     try:
         lines = path.read_text(errors="replace").split("\n")
-    except OSError as error:
-        return str(error)
+    except OSError:
+        return f"no {path.name}: do all nodes see {path.parent}, under the same path?"
     return f"{path}: " + next((line.strip() for line in reversed(lines) if line.strip()), "empty")

@@ -55,11 +55,12 @@ PartitionName={partition} Nodes=node Default=YES MaxTime=INFINITE State=UP
 
 
 @contextlib.contextmanager
-def slurm_cluster(folder: Path) -> Iterator[dict[str, str]]:
+def slurm_cluster(folder: Path, hidden: Path | None = None) -> Iterator[dict[str, str]]:
     """Run the three daemons within this block.
 
     Args:
         folder: of their files; with a short path, for one is a socket.
+        hidden: a folder that is empty on the node, as where a disk is not shared.
     Yields:
         The variables that lead SLURM's programs to them.
     Raises:
@@ -85,7 +86,10 @@ def slurm_cluster(folder: Path) -> Iterator[dict[str, str]]:
     environment = {"SLURM_CONF": str(configuration), "PATH": _SEARCHED}
     files = {"socket": "socket", "key-file": "key", "pid-file": "pid", "log-file": "log", "seed-file": "seed"}
     munge = [f"--{option}={folder}/munge.{name}" for option, name in files.items()]
-    commands = (["munged", "--foreground", "--force", *munge], ["slurmctld", "-D"], ["slurmd", "-D", "-N", "node"])
+    node = ["slurmd", "-D", "-N", "node"]
+    if hidden is not None:
+        node = ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs none "$0" && exec "$@"', str(hidden), *node]
+    commands = (["munged", "--foreground", "--force", *munge], ["slurmctld", "-D"], node)
     with contextlib.ExitStack() as stack:
         for command in commands:
             stack.enter_context(_running(command, environment, folder))
@@ -139,7 +143,11 @@ def _wait_until_idle(environment: Mapping[str, str], folder: Path) -> None:
             if _output(["sinfo", "--noheader", "--format=%T"], environment).strip() == "idle":
                 return
         time.sleep(0.2)
-    ends = [f"{path.name}: {path.read_text()[-1000:]}" for path in sorted(folder.glob("*.*")) if path.suffix in (".log", ".out")]
+    ends = [
+        f"{path.name}: {path.read_text()[-1000:]}"
+        for path in sorted(folder.glob("*.*"))
+        if path.suffix in (".log", ".out")
+    ]
     raise RuntimeError("SLURM's node is not idle\n" + "\n".join(ends))
 
 
