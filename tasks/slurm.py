@@ -205,8 +205,10 @@ class Slurm(Dask):
         """Cancel the jobs; calls that wait raise `WorkerError`."""
         self._ended.set()
         super().close()
+        # dask_jobqueue removes its files of keys only when the cluster object is collected.
+        keys = [vars(self._own).pop(f"_job_{name}", None) for name in ("ca_file", "cert", "key")]
         with self._guard:
-            for file in self._homes.values():
+            for file in [*self._homes.values(), *filter(None, keys)]:
                 with contextlib.suppress(OSError):
                     file.close()
             self._homes.clear()
