@@ -11,6 +11,7 @@ from pathlib import Path
 from ctlev_core.processes import memory_mib
 from data_contracts.errors import DataError
 from flows.stage_costs import StageCost, estimate_stages
+from tasks.runners import is_elsewhere
 from tasks.stage import PlannedStage
 from tasks.workers import WORKERS, num_workers
 
@@ -36,6 +37,8 @@ def use_memory(rows: Sequence[PlannedStage], home: Path) -> None:
 def fitting_processes(rows: Sequence[PlannedStage], costs: Mapping[str, StageCost | None]) -> int:
     """How many stages may run side by side, one at least; what CTLEV_WORKERS says where it says anything.
 
+    Where other machines compute, their memory is not known.
+
     Raises:
         DataError: one stage alone needs more memory than the machine has, and CTLEV_WORKERS does not say to try.
     """
@@ -43,7 +46,7 @@ def fitting_processes(rows: Sequence[PlannedStage], costs: Mapping[str, StageCos
     stages = {row.key: row for row in rows if not row.cached}
     needs = {key: cost.memory_mib for key in stages if (cost := costs.get(key)) is not None}
     largest = sorted(needs, key=lambda key: needs[key], reverse=True)[:wanted]
-    if os.environ.get(WORKERS) or not largest:
+    if os.environ.get(WORKERS) or is_elsewhere() or not largest:
         return wanted
     whole, free = memory_mib()
     if needs[largest[0]] > whole:

@@ -43,7 +43,7 @@ TABLE_ROWS = 1 << 13
 logger = logging.getLogger(__name__)
 
 
-@stage(version=6, schema=tables.FRAMES, optional=("held_out",))
+@stage(version=6, schema=tables.FRAMES, optional=("held_out",), spreads=True)
 def encode(
     out: Output,
     recordings: Manifest,

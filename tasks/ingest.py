@@ -40,7 +40,7 @@ def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     return [(f"{named[r.recording_id]}:{path.name}", path) for r in recordings for path in r.files]
 
 
-@stage(version=6, schema=tables.RECORDINGS, raw_files=_raw_files, readers=("formats", "motions"))
+@stage(version=6, schema=tables.RECORDINGS, raw_files=_raw_files, readers=("formats", "motions"), spreads=True)
 def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     """Read every recording once, check it, and keep events and labels in the project's own form."""
     plugin = plugins.load_options(dataset)

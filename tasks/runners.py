@@ -1,10 +1,11 @@
-"""Which processes compute: the variable CTLEV_RUNNER, and the clusters of Dask and Ray that it may ask for.
+"""Which processes compute: the variable CTLEV_RUNNER, and the clusters of Dask, Ray and SLURM that it may ask for.
 
     CTLEV_RUNNER   shards of a stage    stages of branches
     threads        threads here         processes here        the default
     processes      processes here       processes here
     dask           a local cluster      the same; `dask:tcp://HOST:8786` = one that runs already
     ray            a local cluster      the same; `ray:HOST:6379`, `ray:auto` = one that runs already
+    slurm          a job of SLURM       the same, and all other stages; `slurm:4` = four jobs, `slurm:0-8` = as needed
 
 A runner calls a function elsewhere and waits for it; results never depend on which. Machines of a cluster need the same
 version of ctlev and the home under the same path, on a disk whose `flock` works across them. A cluster that we started
@@ -21,6 +22,8 @@ import importlib.util
 import logging
 import os
 import pickle
+import re
+import shutil
 import threading
 import traceback
 from abc import ABC, abstractmethod
@@ -30,7 +33,7 @@ from typing import Any, Protocol, TypeVar
 from data_contracts.errors import DataError
 
 R = TypeVar("R")
-KINDS = ("threads", "processes", "dask", "ray")
+KINDS = ("threads", "processes", "dask", "ray", "slurm")
 ALONE = {"CTLEV_WORKERS": "1", "CTLEV_RUNNER": "threads"}
 """Environment of a process that does our work: it starts none of its own."""
 CONNECT_TIMEOUT_S = 60
@@ -73,36 +76,68 @@ class Runner(Protocol):
 
 
 def asked_runner() -> tuple[str, str]:
-    """Kind and address, from CTLEV_RUNNER.
+    """Kind and address, from CTLEV_RUNNER; of SLURM the number of jobs.
 
     Raises:
-        DataError: no such kind, an address where none belongs, or a package that is not installed.
+        DataError: no such kind, an address where none belongs, or a package or program that is not installed.
     """
     asked = os.environ.get("CTLEV_RUNNER", "") or KINDS[0]
     kind, _, address = asked.partition(":")
-    if kind not in KINDS or (address and kind not in _CLUSTERS):
-        raise DataError(f"CTLEV_RUNNER must be one of {', '.join(KINDS)}, dask:ADDRESS or ray:ADDRESS, got {asked!r}")
-    if kind in _CLUSTERS and importlib.util.find_spec(_CLUSTERS[kind].package) is None:
-        raise DataError(
-            f"CTLEV_RUNNER={asked} needs the package {_CLUSTERS[kind].package!r}: pip install -e '.[{kind}]'"
-        )
+    if kind not in KINDS or (address and kind not in _PACKAGES):
+        known = f"{', '.join(KINDS)}, dask:ADDRESS, ray:ADDRESS or slurm:JOBS"
+        raise DataError(f"CTLEV_RUNNER must be one of {known}, got {asked!r}")
+    if kind in _PACKAGES and importlib.util.find_spec(_PACKAGES[kind]) is None:
+        raise DataError(f"CTLEV_RUNNER={asked} needs the package {_PACKAGES[kind]!r}: pip install -e '.[{kind}]'")
+    if kind == "slurm":
+        num_jobs(address)
+        missing = [program for program in ("sbatch", "squeue", "scancel") if shutil.which(program) is None]
+        if missing:
+            raise DataError(f"CTLEV_RUNNER={asked} needs SLURM's programs; not on PATH: {', '.join(missing)}")
     return kind, address
 
 
+def num_jobs(asked: str) -> tuple[int, int]:
+    """The fewest and the most jobs of SLURM: `4` and `0-8`, by default one.
+
+    Raises:
+        DataError: it is neither.
+    """
+    found = re.fullmatch(r"(\d{1,6})(?:-(\d{1,6}))?", asked or "1", re.ASCII)
+    least, most = (int(found[1]), int(found[2] or found[1])) if found else (0, 0)
+    if most < max(least, 1):
+        raise DataError(f"CTLEV_RUNNER=slurm:JOBS expects a number of jobs, as slurm:4 or slurm:0-8, got {asked!r}")
+    return least, most
+
+
+def is_elsewhere() -> bool:
+    """Do other machines compute, of which this one knows neither memory nor cores?"""
+    kind, address = asked_runner()
+    return kind == "slurm" or bool(address)
+
+
 def asked_cluster(count: int) -> Runner | None:
-    """The cluster of Dask or Ray that is asked for, if one is.
+    """The cluster of Dask, Ray or SLURM that is asked for, if one is.
 
     Args:
         count: processes of a local one.
     """
     kind, address = asked_runner()
-    if kind not in _CLUSTERS:
+    if kind not in _PACKAGES:
         return None
-    cluster = _running.get((kind, address))
-    if cluster is None:
-        cluster = _running[kind, address] = _CLUSTERS[kind](address, count)
-        atexit.register(cluster.close)
-    return cluster
+    with _starting:
+        cluster = _running.get((kind, address))
+        if cluster is None:
+            cluster = _running[kind, address] = _cluster_class(kind)(address, count)
+            atexit.register(cluster.close)
+        return cluster
+
+
+def _cluster_class(kind: str) -> Callable[[str, int], Runner]:
+    if kind == "slurm":
+        from tasks.slurm import Slurm  # which needs this module
+
+        return Slurm
+    return {"dask": Dask, "ray": Ray}[kind]
 
 
 def is_passing(error: BaseException | None) -> bool:
@@ -134,21 +169,21 @@ def reply_with(error: Exception) -> bytes:
         return pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}")))
 
 
-def _compute(environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
+def compute_there(environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
     """In a process of a cluster, which may have started before we did."""
     os.environ.update(environment)
     return reply_to(function, arguments)
 
 
-def _environment() -> dict[str, str]:
+def environment_there() -> dict[str, str]:
+    """What `compute_there` sets."""
     home = os.environ.get("CTLEV_HOME")
     return ALONE | ({"CTLEV_HOME": os.path.abspath(home)} if home else {})
 
 
 class _Cluster(ABC):
-    """What Dask and Ray share."""
+    """What Dask, Ray and SLURM share."""
 
-    package = ""
     count = 1
 
     def __init__(self, address: str) -> None:
@@ -180,23 +215,28 @@ class _Cluster(ABC):
 class Dask(_Cluster):
     """A cluster of Dask. Its workers have one thread each: two stages in a process would share random numbers."""
 
-    package = "distributed"
-
     def __init__(self, address: str, count: int) -> None:
         super().__init__(address)
-        distributed = importlib.import_module(self.package)
-        self._local = None
-        if not address:
-            # By its own, workers give freed memory back at once: arrays of some 100 KiB then cost a third more.
-            with importlib.import_module("dask").config.set({"distributed.nanny.pre-spawn-environ": {}}):
-                self._local = distributed.LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    host="127.0.0.1",
-                    dashboard_address=None,
-                    silence_logs=logging.CRITICAL,
-                )
-        self._client = distributed.Client(self._local or address, timeout=CONNECT_TIMEOUT_S)
+        distributed = importlib.import_module("distributed")
+        self._own = self._start(address, count)
+        self._client = distributed.Client(self._own or address, timeout=CONNECT_TIMEOUT_S)
+        self.count = self._count_workers()
+
+    def _start(self, address: str, count: int) -> Any:
+        """A cluster of our own, unless there is an address of one that runs elsewhere."""
+        if address:
+            return None
+        # By its own, workers give freed memory back at once: arrays of some 100 KiB then cost a third more.
+        with importlib.import_module("dask").config.set({"distributed.nanny.pre-spawn-environ": {}}):
+            return importlib.import_module("distributed").LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+            )
+
+    def _count_workers(self) -> int:
         self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
         threads = list(self._client.nthreads().values())
         if set(threads) != {1}:
@@ -205,15 +245,15 @@ class Dask(_Cluster):
                 f"{self._name}: workers must have one thread each, got {sorted(threads)}: "
                 "dask worker --nworkers N --nthreads 1"
             )
-        self.count = len(threads)
+        return len(threads)
 
     def _reply(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
-        return self._client.submit(_compute, _environment(), function, arguments, pure=False).result()
+        return self._client.submit(compute_there, environment_there(), function, arguments, pure=False).result()
 
     def close(self) -> None:
-        """End the local cluster, or take leave of one that runs elsewhere, which ends what we asked for."""
+        """End our own cluster, or take leave of one that runs elsewhere, which ends what we asked for."""
         super().close()
-        for part in (self._client, self._local):
+        for part in (self._client, self._own):
             if part is not None:
                 with contextlib.suppress(Exception):  # it may be gone already
                     part.close()
@@ -222,8 +262,6 @@ class Dask(_Cluster):
 class Ray(_Cluster):
     """A cluster of Ray; this process is its driver."""
 
-    package = "ray"
-
     def __init__(self, address: str, count: int) -> None:
         super().__init__(address)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -231,10 +269,10 @@ class Ray(_Cluster):
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         # A call that comes too late, from a thread that has not heard of the end, would start a cluster nobody ends.
         os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
-        ray = self._ray = importlib.import_module(self.package)
+        ray = self._ray = importlib.import_module("ray")
         own = {} if address else {"num_cpus": count, "include_dashboard": False}
         ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **own)
-        self._compute = ray.remote(num_cpus=1)(_compute)
+        self._compute = ray.remote(num_cpus=1)(compute_there)
         self.count = max(int(ray.cluster_resources().get("CPU", 1)), 1)
         self._closed = False
         self._waiting = 0
@@ -247,7 +285,7 @@ class Ray(_Cluster):
             self._waiting += 1
         try:
             # A `get` that waits while another thread shuts Ray down never returns: look up now and then.
-            reply = self._compute.remote(_environment(), function, arguments)
+            reply = self._compute.remote(environment_there(), function, arguments)
             while not self._ray.wait([reply], timeout=LOOK_UP_S)[0]:
                 if self._closed:
                     raise WorkerError("the cluster was closed")
@@ -266,5 +304,8 @@ class Ray(_Cluster):
         self._ray.shutdown()
 
 
-_CLUSTERS: dict[str, type[Dask] | type[Ray]] = {"dask": Dask, "ray": Ray}
+_PACKAGES = {"dask": "distributed", "ray": "ray", "slurm": "dask_jobqueue"}
+"""Of the clusters: what each needs."""
 _running: dict[tuple[str, str], Runner] = {}
+_starting = threading.Lock()
+"""Branches that begin at the same time start one cluster."""

@@ -127,7 +127,7 @@ def quality_filter_of(frames: Manifest) -> QualityFilter:
     return fit_quality_filter(real, polarity=not real[..., 1].any())
 
 
-@stage(version=3, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"), optional=("part",))
+@stage(version=3, schema=tables.SYNTHETIC, raw_files=input_files_of("sampling"), optional=("part",), spreads=True)
 def simulate(
     out: Output,
     recordings: Manifest,

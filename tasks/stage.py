@@ -59,7 +59,7 @@ from tasks.gpus import gpu_need, gpus_held
 from tasks.prefect_runs import run_as_task
 from tasks.runners import asked_runner
 from tasks.store import Store
-from tasks.workers import current_workers, together
+from tasks.workers import current_workers, stage_workers, together
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -222,6 +222,7 @@ class Stage:
         readers: Sequence[str] = (),
         optional: Sequence[str] = (),
         aside: Sequence[str] = (),
+        spreads: bool = False,
     ) -> None:
         self.function = function
         self.name = function.__name__
@@ -231,6 +232,7 @@ class Stage:
         self.readers = readers
         self.optional = optional
         self.aside = aside
+        self.spreads = spreads
         self.signature = inspect.signature(function)
         self.__doc__ = function.__doc__
 
@@ -310,7 +312,7 @@ class Stage:
         found = self.find(key, arguments)
         if found is not None:
             return found, True
-        workers = current_workers()
+        workers = current_workers() if self.spreads else stage_workers()
         if workers is not None:
             # Whoever else wants this artefact waits here, and leaves the processes to those who have work for them.
             with _being_made.setdefault(key, threading.Lock()):
@@ -425,6 +427,7 @@ def stage(
     readers: Sequence[str] = (),
     optional: Sequence[str] = (),
     aside: Sequence[str] = (),
+    spreads: bool = False,
 ) -> Callable[[Callable[..., pa.Table]], Stage]:
     """Make a function a stage.
 
@@ -435,8 +438,9 @@ def stage(
         readers: kinds of plug-ins that read them, found by what is in the files: one that is mended reads all anew.
         optional: parameters that leave the key as it is where they are None: what is stored without them stays valid.
         aside: parameters that spare work and change no result: they are in neither key nor record.
+        spreads: most of its work is in shards (`map_shards`), which go to a cluster one by one.
     """
-    return lambda function: Stage(function, version, schema, raw_files, readers, optional, aside)
+    return lambda function: Stage(function, version, schema, raw_files, readers, optional, aside, spreads)
 
 
 def _run_stage(module: str, name: str, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:

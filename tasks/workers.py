@@ -26,7 +26,16 @@ from typing import Any, BinaryIO, TypeVar
 from ctlev_core.processes import CORES, module_environment, num_cores
 from ctlev_core.progress import Progress, Report, current_report, reporting_to
 from data_contracts.errors import DataError
-from tasks.runners import ALONE, Runner, WorkerError, asked_cluster, asked_runner, reply_to, reply_with
+from tasks.runners import (
+    ALONE,
+    Runner,
+    WorkerError,
+    asked_cluster,
+    asked_runner,
+    is_elsewhere,
+    reply_to,
+    reply_with,
+)
 
 R = TypeVar("R")
 S = TypeVar("S")
@@ -164,6 +173,14 @@ def current_workers() -> Runner | None:
     return _current.get()
 
 
+def stage_workers() -> Runner | None:
+    """Who runs a stage that spreads no shards: `current_workers`, or SLURM's jobs, also for a stage alone.
+
+    The machine that submits jobs is often one where nothing may be computed, and has no GPU.
+    """
+    return current_workers() or (asked_cluster(num_workers()) if asked_runner()[0] == "slurm" else None)
+
+
 def num_workers() -> int:
     """The variable CTLEV_WORKERS, else one process for each core that we may use."""
     asked = os.environ.get(WORKERS, "")
@@ -255,7 +272,7 @@ def _call_each(function: Callable[[S], R], shards: Sequence[S]) -> list[R]:
 
 def _has_several() -> bool:
     """Is more than one process or thread to be had? Of a cluster that runs elsewhere we assume it."""
-    return num_workers() > 1 or bool(asked_runner()[1])
+    return is_elsewhere() or num_workers() > 1
 
 
 def _shard_runner() -> Runner:

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import shutil
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +17,7 @@ import pytest
 from data_contracts import tables
 from data_contracts.errors import DataError
 from tasks import runners
-from tasks.runners import WorkerError, asked_runner
+from tasks.runners import WorkerError, asked_runner, is_elsewhere, num_jobs
 from tasks.stage import planning, stage
 from tasks.store import Store
 from tasks.workers import MAX_GROUP, Workers, _groups, current_workers, is_spread, map_shards, together
@@ -194,14 +195,14 @@ def test_one_worker_computes_here(monkeypatch):
     assert current_workers() is None
 
 
-@pytest.mark.parametrize("asked", ["slurm", "threads:2", "processes:tcp://host:1"])
+@pytest.mark.parametrize("asked", ["pbs", "threads:2", "processes:tcp://host:1"])
 def test_an_unknown_runner_is_refused_before_anything_runs(asked, monkeypatch):
     monkeypatch.setenv("CTLEV_RUNNER", asked)
     with pytest.raises(DataError, match=f"threads, processes, dask, ray, .* got '{asked}'"), planning():
         pass
 
 
-@pytest.mark.parametrize(("kind", "package"), [("dask", "distributed"), ("ray", "ray")])
+@pytest.mark.parametrize(("kind", "package"), [("dask", "distributed"), ("ray", "ray"), ("slurm", "dask_jobqueue")])
 def test_a_missing_package_is_named_with_what_to_install(kind, package, monkeypatch):
     monkeypatch.setenv("CTLEV_RUNNER", f"{kind}:host:1")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else sys)
@@ -216,6 +217,30 @@ def test_kind_and_address(monkeypatch):
         "dask": ("dask", ""),
         "dask:tcp://host:8786": ("dask", "tcp://host:8786"),
         "ray:auto": ("ray", "auto"),
+        "slurm": ("slurm", ""),
+        "slurm:0-8": ("slurm", "0-8"),
     }.items():
         monkeypatch.setenv("CTLEV_RUNNER", asked)
+        monkeypatch.setattr(shutil, "which", lambda name: name)
         assert asked_runner() == expected
+        assert is_elsewhere() == (asked in ("dask:tcp://host:8786", "ray:auto", "slurm", "slurm:0-8"))
+
+
+def test_numbers_of_jobs():
+    assert [num_jobs(asked) for asked in ("", "4", "0-8", "3-3")] == [(1, 1), (4, 4), (0, 8), (3, 3)]
+
+
+@pytest.mark.parametrize("jobs", ["0", "0-0", "5-2", "-3", "3-", "x", "1.5", "two", "1-2-3"])
+def test_wrong_numbers_of_jobs_are_refused_before_anything_runs(jobs, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: sys)
+    monkeypatch.setenv("CTLEV_RUNNER", f"slurm:{jobs}")
+    with pytest.raises(DataError, match=f"expects a number of jobs, as slurm:4 or slurm:0-8, got '{jobs}'"), planning():
+        pass
+
+
+def test_a_machine_without_the_programs_of_slurm_says_so(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: sys)
+    monkeypatch.setattr(shutil, "which", lambda name: None if name == "squeue" else name)
+    monkeypatch.setenv("CTLEV_RUNNER", "slurm")
+    with pytest.raises(DataError, match="needs SLURM's programs; not on PATH: squeue$"), planning():
+        pass

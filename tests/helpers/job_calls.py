@@ -1,0 +1,29 @@
+"""What tests have computed in jobs of SLURM."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+
+def number_and_job(shard: int) -> tuple[int, str]:
+    """The shard and the job that computed it, after half a second."""
+    time.sleep(0.5)
+    return shard, os.environ["SLURM_JOB_ID"]
+
+
+def variable(name: str) -> str | None:
+    """Of the environment there."""
+    return os.environ.get(name)
+
+
+def note_and_wait(folder: Path) -> int:
+    """Note the job in `jobs` and wait for `go_on`; how often it was begun."""
+    folder.mkdir(exist_ok=True)
+    with (folder / "jobs").open("a") as file:
+        file.write(os.environ["SLURM_JOB_ID"] + "\n")
+    until = time.monotonic() + 120
+    while not (folder / "go_on").exists() and time.monotonic() < until:
+        time.sleep(0.1)
+    return len((folder / "jobs").read_text().split())
