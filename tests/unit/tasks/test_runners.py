@@ -242,5 +242,5 @@ def test_a_machine_without_the_programs_of_slurm_says_so(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: sys)
     monkeypatch.setattr(shutil, "which", lambda name: None if name == "squeue" else name)
     monkeypatch.setenv("CTLEV_RUNNER", "slurm")
-    with pytest.raises(DataError, match="needs SLURM's programs; not on PATH: squeue$"), planning():
+    with pytest.raises(DataError, match=r"needs SLURM's programs; not on PATH: squeue$"), planning():
         pass
