@@ -75,12 +75,12 @@ class _Adaptive(distributed.Adaptive):
 
     async def target(self) -> int:
         """Workers of whole jobs."""
-        processes = len(self.cluster.new_spec.get("group", [""]))
+        processes = len(self.cluster.new_spec.get("group", [""]))  # pyright: ignore[reportAttributeAccessIssue]
         return math.ceil(await super().target() / processes) * processes
 
     async def workers_to_close(self, target: int) -> list[str]:
         """Those of jobs that have nothing to do."""
-        workers = self.cluster.scheduler.workers.values()
+        workers = self.cluster.scheduler.workers.values()  # pyright: ignore[reportAttributeAccessIssue]
         busy = {_job_of(worker) for worker in workers if worker.processing}
         idle = {worker.name for worker in workers if _job_of(worker) not in busy}
         return [name for name in await super().workers_to_close(target) if name in idle]
@@ -106,9 +106,9 @@ class Slurm(Dask):
         folder = str(_folder(home_folder()))
         environment = module_environment({"PYTHONPATH": os.environ.get("PYTHONPATH", "")})
         try:
-            cluster = dask_jobqueue.SLURMCluster(
+            cluster = dask_jobqueue.SLURMCluster(  # pyright: ignore[reportPrivateImportUsage]
                 name=NAME,
-                job_cls=_Job,
+                job_cls=_Job,  # pyright: ignore[reportArgumentType]
                 cores=self._processes,  # of Dask: a thread each
                 processes=self._processes,
                 job_cpu=given["job-cpu"] or self._cores,
@@ -257,7 +257,7 @@ def _job_of(worker: Any) -> str:
 
 
 def _configured(name: str) -> Any:
-    return dask.config.get(f"jobqueue.slurm.{name}")
+    return dask.config.get(f"jobqueue.slurm.{name}")  # pyright: ignore[reportPrivateImportUsage]
 
 
 def _queue() -> dict[str, tuple[str, str]] | None:
