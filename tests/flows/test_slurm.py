@@ -153,10 +153,11 @@ def test_a_run_whose_job_is_cancelled_has_the_digests_of_threads(smoke_home, clu
 def test_jobs_are_as_many_as_there_is_work_for(jobs, tmp_path, monkeypatch):
     monkeypatch.setattr("tasks.slurm.IDLE_S", 2)
     monkeypatch.setenv("CTLEV_RUNNER", "slurm:0-2")
+    before = set(queued(jobs, "all"))  # SLURM remembers those that ended, for a while
     runner = runners.asked_cluster(1)
     assert runner.count == 4
     time.sleep(3)
-    assert not queued(jobs, "all")
+    assert set(queued(jobs, "all")) <= before
     with ThreadPoolExecutor(4) as threads:
         calls = [tmp_path / str(number) for number in range(4)]
         waiting = [threads.submit(runner.call, note_and_wait, call) for call in calls]
