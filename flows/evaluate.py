@@ -29,6 +29,7 @@ from tasks.downstream import train_downstream
 from tasks.evaluate import score_distance, score_model
 from tasks.openings import note_opening
 from tasks.stage import call_flow, call_together, numbered
+from tasks.store import home_folder
 from tasks.subset import take_label_consistent, take_share
 
 Generated = dict[str, list[ManifestRef]]
@@ -75,7 +76,9 @@ def evaluate(
         scores=[score for _, scores in found for score in scores],
         models=[model for model, _ in found[: len(trained)]],
         model_names=[f"{training_set}, seed {seed}" for training_set, seed in trained],
-        openings=note_opening(dataset.tested_frames, experiment) if experiment.evaluate_on == "test" else None,
+        openings=note_opening(home_folder(), dataset.tested_frames, experiment)
+        if experiment.evaluate_on == "test"
+        else None,
     )
 
 

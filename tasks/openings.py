@@ -9,21 +9,22 @@ from __future__ import annotations
 import hashlib
 import json
 from datetime import UTC, datetime
+from pathlib import Path
 
 from data_contracts.config import cache_material
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from tasks.stage import is_planning
-from tasks.store import home_folder
 
 FOLDER = "test_sets"
 _SAYS_NOTHING = ("name", "data_notice")
 
 
-def note_opening(frames: ManifestRef, experiment: Experiment) -> int | None:
+def note_opening(home: Path, frames: ManifestRef, experiment: Experiment) -> int | None:
     """Note that an experiment is scored on test frames, and count the experiments that were.
 
     Args:
+        home: folder of the store.
         frames: recorded frames; what is in them decides, so that a change elsewhere begins no new count.
         experiment: the same one twice is noted once.
     Returns:
@@ -35,7 +36,7 @@ def note_opening(frames: ManifestRef, experiment: Experiment) -> int | None:
         return None
     material = {name: value for name, value in cache_material(experiment).items() if name not in _SAYS_NOTHING}
     options = hashlib.sha256(json.dumps(material, sort_keys=True).encode()).hexdigest()[:32]
-    file = home_folder() / FOLDER / f"{frames.digest}.jsonl"
+    file = home / FOLDER / f"{frames.digest}.jsonl"
     known = _read_options(file.read_text(encoding="utf-8")) if file.is_file() else set()
     if options not in known:
         file.parent.mkdir(parents=True, exist_ok=True)
