@@ -71,14 +71,15 @@ def evaluate(
     if experiment.feature_extractor is not None:
         calls.append(partial(_distances, experiment, experiment.feature_extractor, dataset, generated))
     found = call_together(*calls)
+    openings = None
+    if experiment.evaluate_on == "test":
+        openings = note_opening(home_folder(), dataset.tested_frames, experiment)
     return Evaluation(
         extractor=found[-1][0] if experiment.feature_extractor is not None else None,
         scores=[score for _, scores in found for score in scores],
         models=[model for model, _ in found[: len(trained)]],
         model_names=[f"{training_set}, seed {seed}" for training_set, seed in trained],
-        openings=note_opening(home_folder(), dataset.tested_frames, experiment)
-        if experiment.evaluate_on == "test"
-        else None,
+        openings=openings,
     )
 
 

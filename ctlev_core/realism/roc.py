@@ -88,7 +88,7 @@ def interval_of_mean_area(
     if not len(areas):
         return float("nan"), float("nan")
     found = np.array([training.area for training in trainings])
-    fewest = min(np.count_nonzero(kinds & 1), np.count_nonzero(kinds & 2))
+    fewest = int(min(np.count_nonzero(kinds & 1), np.count_nonzero(kinds & 2)))
     middle = areas.mean(axis=1)
     drawn = np.take_along_axis(areas, generator.integers(len(found), size=areas.shape), axis=1).mean(axis=1)
     of_recordings = stretch(fewest) * (middle - found.mean())
