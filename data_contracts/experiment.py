@@ -32,7 +32,7 @@ from data_contracts.training_sets import (
 )
 
 TrainedOn = Literal["recorded", "synthetic", "recorded+synthetic"]
-LabelOrder = Literal["random", "in_time"]
+LabelOrder = Literal["random", "in_time", "stretches"]
 View = Literal["labelled", "new"]
 NAME_PATTERN = r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$"
 
@@ -170,6 +170,13 @@ class Experiment(Frozen):
         description="fine-tunings, each with a seed and synthetic frames of its own, of the generator and of each "
         "baseline; the downstream seeds take turns with them",
     )
+    motion_layers: dict[str, Any] | None = Field(
+        None,
+        json_schema_extra=ADDED_LATER,
+        description="options of layers that make consecutive frames from one another; {} = their defaults; of the "
+        "experiment's own diffusion generator, while baselines make each frame by itself; needs temporal_order; null = "
+        "none",
+    )
     oracle: Oracle | None = Field(
         None, description="recordings of the sampled poses: the most that synthetic frames can give"
     )
@@ -238,6 +245,12 @@ class Experiment(Frozen):
     def _only_histograms_hold_counts(self) -> Experiment:
         if self.stochastic_rounding and self.encoding.name != "event_histogram":
             raise ValueError(f"stochastic_rounding needs encoding 'event_histogram', got {self.encoding.name!r}")
+        return self
+
+    @model_validator(mode="after")
+    def _stretches_are_asked_for(self) -> Experiment:
+        if self.motion_layers is not None and not self.temporal_order:
+            raise ValueError("motion_layers make frames that follow one another: set temporal_order to true")
         return self
 
     @model_validator(mode="after")

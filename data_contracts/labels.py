@@ -258,6 +258,8 @@ class Conditions:
         motions: what N bodies do, for a generator that records them; else None.
         class_names: N classes, whose names may take turns while a generator learns; else None.
         made_by: the plug-in that made them, where it is known: the colours of its images may be directions.
+        stretches: N names of stretches: consecutive rows of one name follow one another in time, and are made from one
+            another by a generator that can do so; None = each row is by itself.
     """
 
     prompts: tuple[str, ...]
@@ -265,6 +267,7 @@ class Conditions:
     motions: BodyMotions | None = None
     class_names: tuple[str, ...] | None = None
     made_by: ConditionChoice | None = None
+    stretches: tuple[str, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.prompts)
@@ -274,7 +277,8 @@ class Conditions:
         images = None if self.images is None else self.images[rows]
         motions = None if self.motions is None else self.motions.take(rows)
         names = None if self.class_names is None else tuple(np.array(self.class_names, object)[rows])
-        return Conditions(tuple(np.array(self.prompts, object)[rows]), images, motions, names, self.made_by)
+        stretches = None if self.stretches is None else tuple(np.array(self.stretches, object)[rows])
+        return Conditions(tuple(np.array(self.prompts, object)[rows]), images, motions, names, self.made_by, stretches)
 
 
 @dataclass

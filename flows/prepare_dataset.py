@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 
+from ctlev_core.diffusion.training.options import MotionOptions
+from ctlev_core.plugins import validate_options
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.labels import HeldOut
@@ -139,6 +141,7 @@ def condition_asked_samples(
     part: str | None = None,
 ) -> ManifestRef:
     """The conditions a generator is asked for; of the same labels for every condition of a `part`, or of all."""
+    order, motion = "in_time" if experiment.temporal_order else "random", motion_options(experiment)
     return condition_samples(
         poses,
         recordings,
@@ -147,12 +150,24 @@ def condition_asked_samples(
         encoding=experiment.encoding,
         windows=experiment.windows,
         count=experiment.num_synthetic,
-        order="in_time" if experiment.temporal_order else "random",
+        order=order if motion is None else "stretches",
         views=experiment.view,
         seed=experiment.seed,
         part=part,
+        length=None if motion is None else motion.context,
         label=_of_part(f"{condition.name}, to sample", part),
     )
+
+
+def motion_options(experiment: Experiment) -> MotionOptions | None:
+    """The options of the experiment's motion layers, checked; None where it asks for none.
+
+    Raises:
+        PluginError: an option is unknown or wrong.
+    """
+    if experiment.motion_layers is None:
+        return None
+    return validate_options(MotionOptions, experiment.motion_layers, "motion_layers")
 
 
 def _of_part(label: str, part: str | None) -> str:

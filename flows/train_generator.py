@@ -13,10 +13,11 @@ from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from flows.cli import script
 from flows.command_line import Command
-from flows.prepare_dataset import PreparedDataset, prepare_dataset
+from flows.prepare_dataset import PreparedDataset, motion_options, prepare_dataset
 from flows.settings import flow
 from tasks.finetune import finetune
 from tasks.latents import encode_latents
+from tasks.motion_layers import train_motion_layers
 from tasks.pretrain import pretrain
 from tasks.stage import call_flow, numbered
 
@@ -29,13 +30,20 @@ def train_generator(experiment: Experiment, dataset: PreparedDataset | None = No
     """Fine-tune the experiment's generator, the `number`-th of several; the dataset is prepared unless it is given."""
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
-    return fine_tuned(
+    seed, label = experiment.seed + number, numbered(experiment.generator.name, number)
+    checkpoint = fine_tuned(
         experiment,
         dataset.frames,
         dataset.frame_conditions,
         generator=experiment.generator,
-        seed=experiment.seed + number,
-        label=numbered(experiment.generator.name, number),
+        seed=seed,
+        label=label,
+    )
+    options = motion_options(experiment)
+    if options is None:
+        return checkpoint
+    return train_motion_layers(
+        checkpoint, dataset.frames, dataset.frame_conditions, options=options, seed=seed, label=label
     )
 
 

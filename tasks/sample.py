@@ -15,8 +15,9 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.diffusion.motion_files import has_motion_layers, read_settings
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds
-from ctlev_core.diffusion.sampling.shards import SHARD
+from ctlev_core.diffusion.sampling.shards import SHARD, whole_stretches
 from ctlev_core.events.windows import spread, window_around
 from ctlev_core.labels.sources import sensor_size_of
 from ctlev_core.plugin_contracts import CalibratedEventGenerator
@@ -30,6 +31,7 @@ from ctlev_core.postprocessing.stochastic_rounding import round_frames, training
 from ctlev_core.progress import ProgressBar
 from ctlev_core.recordings.stored_events import StoredEvents, stored_events
 from ctlev_core.seeds import sample_seeds
+from ctlev_core.supervised.frame_sequences import name_stretches
 from data_contracts import tables
 from data_contracts.arrays import load_array, save_compressed
 from data_contracts.compressed_arrays import SUFFIX
@@ -68,7 +70,8 @@ def sample(
     """One frame per condition row, each from a seed of its own; the labels come along unchanged.
 
     A row whose frame cannot be an event image, beside the training frames among `frames`, is sampled again, in all
-    `max_attempts` times. If the last is rejected too it is kept, and says why. With `rounding`, the encoding of the
+    `max_attempts` times. If the last is rejected too it is kept, and says why. Where the checkpoint has motion layers,
+    rows that follow one another in time are made from one another, and none again. With `rounding`, the encoding of the
     training frames, each frame becomes the rendering of event counts that it is the expectation of. Training frames are
     those of one `part` of a union where one is named.
     """
@@ -76,6 +79,10 @@ def sample(
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
     num_events = None if rounding is None else training_counts(frames)
     folder = checkpoint.ref.path / "checkpoint"
+    if has_motion_layers(folder):
+        interval_us = read_settings(folder).interval_us
+        asked = replace(asked, stretches=name_stretches(conditions, np.arange(len(asked)), interval_us))
+        max_attempts = 1  # a frame that was made anew would be of another stretch
 
     def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
         return plugin.module.sample(folder, asked.take(rows), plugin.options, seeds=seeds, work=out.work)
@@ -83,13 +90,13 @@ def sample(
     seeds = sample_seeds(seed, len(asked))
     if isinstance(plugin.options, SamplingOptions):
         seeds = noise_seeds(seeds, plugin.options)  # here, so that every row is told the seed it was made from
-    quality_filter, chunk, told = quality_filter_of(frames), _chunk_rows(frames), SampleLog([], [], [])
+    quality_filter, told = quality_filter_of(frames), SampleLog([], [], [])
     with out.open_array("frames") as written:
-        for start in range(0, len(seeds), chunk):
-            rows = np.arange(start, min(start + chunk, len(seeds)))
+        for chunk in whole_stretches(asked, _chunk_rows(frames)):
+            rows = np.arange(len(seeds))[chunk]
             made = sample_until_accepted(
                 lambda members, seeds, rows=rows: sample_rows(rows[members], seeds),
-                seeds[start : start + chunk],
+                seeds[chunk],
                 quality_filter,
                 max_attempts=max_attempts,
             )

@@ -38,11 +38,13 @@ class Batch:
         embeddings: [B, L, D] prompt embeddings.
         conditions: [K, 3, H, W] condition images in [0, 1] of the first K <= B rows, or None; the other rows go through
             the U-Net alone.
+        num_frames: of each stretch, whose rows lie behind one another and are equally noisy; 1 = images.
     """
 
     latents: Tensor
     embeddings: Tensor
     conditions: Tensor | None = None
+    num_frames: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +147,8 @@ def denoising_loss(
     emphasis: Emphasis = PLAIN,
 ) -> Tensor:
     """Weighted mean squared error of the prediction at random time steps; noise comes from the CPU stream."""
-    timesteps = emphasis.draw(len(batch.latents), schedule.num_timesteps, generator)
+    num_draws = len(batch.latents) // batch.num_frames
+    timesteps = emphasis.draw(num_draws, schedule.num_timesteps, generator).repeat_interleave(batch.num_frames)
     noise = torch.randn(batch.latents.shape, generator=generator)
     device = batch.latents.device
     noisy, target = schedule.noised(batch.latents, noise.to(device), timesteps.to(device))
@@ -160,10 +163,10 @@ def validation_losses(
     """Unweighted loss with the true and with shuffled conditions, over the same noise.
 
     The difference says how much the network uses its condition; the loss alone does not. Prompts are shuffled where
-    there are no condition images.
+    there are no condition images. `batch_size` is a multiple of the batch's `num_frames`; stretches stay whole.
     """
-    count = len(batch.latents)
-    order = torch.arange(count).roll(max(1, count // 2))
+    count, num_frames = len(batch.latents), batch.num_frames
+    order = torch.arange(count).roll(max(1, count // num_frames // 2) * num_frames)
     losses = []
     for shuffled in (False, True):
         conditions, embeddings = batch.conditions, batch.embeddings
@@ -174,7 +177,8 @@ def validation_losses(
         total = 0.0
         for start in range(0, count, batch_size):
             rows = slice(start, start + batch_size)
-            part = Batch(batch.latents[rows], embeddings[rows], None if conditions is None else conditions[rows])
+            images = None if conditions is None else conditions[rows]
+            part = Batch(batch.latents[rows], embeddings[rows], images, num_frames)
             with torch.no_grad():
                 loss = denoising_loss(denoiser, schedule, part, generator_for(seed, start))
             total += float(loss) * len(part.latents)

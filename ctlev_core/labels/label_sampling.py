@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
+from ctlev_core.events.windows import spread
+from data_contracts.errors import DataError
 from data_contracts.parts import PREFIX, part_of
 
 
@@ -53,6 +56,43 @@ def balanced_choice(class_names: Sequence[str], recordings: Sequence[str], count
         random = np.random.default_rng([seed, number])
         queues.append(np.concatenate([_in_turns(random.permutation(rows), groups) for _ in range(rounds)]))
     return np.array([queues[i % len(classes)][i // len(classes)] for i in range(count)], dtype=np.int64)
+
+
+def choose_stretches(
+    recordings: Sequence[str], t_us: np.ndarray, count: int, length: int, interval_us: int
+) -> np.ndarray:
+    """`count` row indices: stretches of `length` moments that follow one another every `interval_us`.
+
+    A recording has as many stretches as fit into it one behind another. Of all of them so many as are needed are taken,
+    evenly spread, and all again where they are too few; the last may be shorter.
+
+    Args:
+        recordings: of N moments; those of one recording lie together, in the order of their times.
+        t_us: [N] int64.
+        count: of moments.
+        length: moments of a stretch.
+        interval_us: from one to the next, which is kept to within a tenth.
+    Raises:
+        DataError: no recording has such a stretch.
+    """
+    stretches, offset = [], 0
+    for _, group in itertools.groupby(recordings):
+        times = t_us[offset : (offset := offset + len(list(group)))]
+        wanted = np.arange(times[0], times[-1] + interval_us // 2, interval_us)
+        nearest = np.abs(times[:, None] - wanted).argmin(axis=0)
+        kept = np.abs(times[nearest] - wanted) <= interval_us / 10
+        runs = np.split(np.arange(len(wanted)), np.flatnonzero(~kept))
+        for run in (run[kept[run]] for run in runs):
+            for start in range(0, len(run) - length + 1, length):
+                stretches.append(offset - len(times) + nearest[run[start : start + length]])
+    if not stretches:
+        raise DataError(
+            f"no recording has labels for a stretch of {length} frames, one every {interval_us} us as training frames: "
+            "label longer or more often"
+        )
+    needed = -(-count // length)
+    chosen = np.sort(np.resize(spread(len(stretches), needed), needed))
+    return np.concatenate([stretches[number] for number in chosen])[:count]
 
 
 def spread_choice(groups: Sequence[str], recordings: Sequence[str], count: int, seed: int) -> np.ndarray:

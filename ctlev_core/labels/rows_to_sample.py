@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from ctlev_core import plugins
 from ctlev_core.events.windows import spread
-from ctlev_core.labels.label_sampling import balanced_choice, surrounded
+from ctlev_core.labels.label_sampling import balanced_choice, choose_stretches, surrounded
 from ctlev_core.labels.labelling import labels_in_image
 from ctlev_core.labels.sources import (
     LabelledRows,
@@ -21,6 +21,7 @@ from ctlev_core.labels.sources import (
     rows_of_frames,
     sensor_size_of,
 )
+from ctlev_core.supervised.frame_sequences import frame_interval_us
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
@@ -44,6 +45,7 @@ def choose_rows_to_sample(
     views: View,
     needs_pictures: bool,
     seed: int,
+    length: int = 1,
 ) -> LabelledRows:
     """Choose labels to sample from.
 
@@ -51,6 +53,7 @@ def choose_rows_to_sample(
     such, and otherwise from the training frames. In random order classes take turns, and within a class recordings;
     moments nearer than half a window (the median of the training frames) to an end of their recording are left out
     where it has others. In order of time the recordings follow one another, `count` moments evenly spread over them.
+    Stretches are `length` moments each, as far apart as training frames are, of recordings evenly spread over all.
     Bodies without 2D joints are seen by a virtual camera. New views turn each body, or in order of time each recording,
     to a camera of its own.
 
@@ -70,6 +73,7 @@ def choose_rows_to_sample(
         views: `labelled`, or `new` ones.
         needs_pictures: whether the condition is made of the grey pictures at a window's ends.
         seed: of the choice and the views.
+        length: moments of a stretch, where they are chosen so.
     Raises:
         DataError: there is nothing to choose from, or no body to see from a new side.
     """
@@ -79,7 +83,14 @@ def choose_rows_to_sample(
     if moments.num_rows:
         inner = surrounded(moments["recording_id"].to_pylist(), moments["t_us"].to_numpy(), half_us)
         allowed = np.flatnonzero(inner) if order == "random" else np.arange(moments.num_rows)
-        chosen = moments.take(_choose(moments, allowed, count, order, seed))
+        if order == "stretches":
+            interval_us = frame_interval_us(frames, frames.rows_where(split="train"))
+            rows_of_stretches = choose_stretches(
+                moments["recording_id"].to_pylist(), moments["t_us"].to_numpy(), count, length, interval_us
+            )
+            chosen = moments.take(rows_of_stretches)
+        else:
+            chosen = moments.take(_choose(moments, allowed, count, order, seed))
         names, times = chosen["recording_id"].to_pylist(), chosen["t_us"].to_numpy()
         together = np.arange(count) if order == "random" else np.unique(names, return_inverse=True)[1]
         turned = None if views == "labelled" else together
@@ -98,7 +109,13 @@ def choose_rows_to_sample(
         raise DataError(f"{poses.ref.path}: the dataset of poses has no recording in split 'condition'")
     else:
         learnt = frames.rows_where(split="train")
-        rows = rows_of_frames(recordings, frames, _choose(frames.table, learnt, count, order, seed))
+        if order == "stretches":
+            names, times = frames.column("recording_id"), frames.table["t_end_us"].to_numpy()[learnt]
+            interval_us = frame_interval_us(frames, learnt)
+            learnt = learnt[choose_stretches([names[row] for row in learnt], times, count, length, interval_us)]
+            rows = rows_of_frames(recordings, frames, learnt)
+        else:
+            rows = rows_of_frames(recordings, frames, _choose(frames.table, learnt, count, order, seed))
     if needs_pictures:
         if views == "new":
             raise DataError("conditions of pictures show them as they were; set view to 'labelled'")

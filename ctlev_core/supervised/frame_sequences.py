@@ -6,11 +6,13 @@ be equally far apart: where windows were left out, the next one that was kept fo
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest
 
 
@@ -57,6 +59,44 @@ def find_sequences(count: int, length: int, *names: Sequence[object]) -> FrameSe
         own = np.asarray(each) if len(each) else rows
         begins[1:] |= own[1:] != own[:-1]
     return FrameSequences(np.maximum.accumulate(np.where(begins, rows, 0)), length)
+
+
+def stretch_lengths(names: Sequence[object]) -> list[int]:
+    """How many consecutive rows have the same name, from the first row on; together they are all rows."""
+    return [len(list(rows)) for _, rows in itertools.groupby(names)]
+
+
+def frame_interval_us(manifest: Manifest, rows: np.ndarray) -> int:
+    """Time from one frame to the next of its recording, the median over the given rows.
+
+    Raises:
+        DataError: no recording has two frames.
+    """
+    gaps = _gaps_us(manifest, rows)
+    if not len(gaps) or not (gaps > 0).any():
+        raise DataError(f"{manifest.ref.path}: no two frames follow one another in a recording")
+    return int(np.median(gaps[gaps > 0]))
+
+
+def name_stretches(manifest: Manifest, rows: np.ndarray, interval_us: int) -> tuple[str, ...]:
+    """Names of the stretches of frames that follow one another every `interval_us`, of each row.
+
+    A stretch ends with its recording, and where the next frame neither begins where this one ends nor ends one interval
+    later, give or take a quarter: there a window was left out, or labels jump.
+    """
+    starts, ends = (manifest.table[name].to_numpy()[rows] for name in ("t_start_us", "t_end_us"))
+    gaps_us, between_us = _gaps_us(manifest, rows), starts[1:] - ends[:-1]
+    tolerance_us = interval_us / 4
+    touches = (gaps_us > 0) & (between_us >= 0) & (between_us <= tolerance_us)
+    follows = touches | (np.abs(gaps_us - interval_us) <= tolerance_us)
+    numbers = np.cumsum(np.concatenate([[0], ~follows])) if len(rows) else []
+    return tuple(map(str, numbers))
+
+
+def _gaps_us(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
+    """From the end of each row's window to that of the next row [N - 1]; 0 between recordings."""
+    names = np.array(name_recordings(manifest, rows))
+    return np.where(names[1:] == names[:-1], np.diff(manifest.table["t_end_us"].to_numpy()[rows]), 0)
 
 
 def name_recordings(manifest: Manifest, rows: np.ndarray) -> list[str]:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ctlev_core.diffusion.motion_layers import MotionLayers
 from ctlev_core.diffusion.pretrained.adapters import check_base_model, is_adapter, merge_adapter, read_adapter
 from ctlev_core.diffusion.pretrained.checks import complete_schedule
 from ctlev_core.diffusion.pretrained.components import read_json
@@ -47,6 +48,7 @@ class PretrainedModel:
         image_size: (width, height) px of the images the U-Net was trained on.
         value_table: [256, 256], how values are drawn about those the networks expect; None = they are taken as they
             are.
+        motion: layers that make consecutive frames from one another; None = each frame is made by itself.
     """
 
     tokenizer: Any
@@ -57,6 +59,7 @@ class PretrainedModel:
     scheduler_config: dict[str, Any]
     image_size: tuple[int, int]
     value_table: Any | None = None
+    motion: MotionLayers | None = None
 
     @property
     def scaling_factor(self) -> float:

@@ -7,6 +7,7 @@ one grey level at most; run with the same batch size for bit-identical frames.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -24,6 +25,7 @@ from torch import Tensor
 
 from ctlev_core.diffusion.compilation import SAMPLING_PASSES, compiler_works, pays
 from ctlev_core.diffusion.denoising import Denoiser
+from ctlev_core.diffusion.motion_layers import load_motion_layers
 from ctlev_core.diffusion.pretrained.adapters import ADAPTER_FILE, WEIGHTS_FILE
 from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
@@ -39,9 +41,10 @@ from ctlev_core.diffusion.sampling.devices import device_names, run_on_devices, 
 from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions, noise_seeds
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from ctlev_core.diffusion.sampling.schedulers import make_scheduler as make_scheduler
-from ctlev_core.diffusion.sampling.shards import SHARD, Shard, plan_shards
+from ctlev_core.diffusion.sampling.shards import SHARD, Shard, plan_shards, whole_stretches
 from ctlev_core.diffusion.sampling.value_table import draw_values, nearest_values, read_value_table
 from ctlev_core.progress import ProgressBar
+from ctlev_core.supervised.frame_sequences import stretch_lengths
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
@@ -62,6 +65,7 @@ def sample_latents(
     conditions: Tensor | None,
     seeds: Sequence[int],
     options: SamplingOptions,
+    lengths: Sequence[int] | None = None,
 ) -> Tensor:
     """Clean latents [B, C, h, w] float32, still multiplied by the scaling factor.
 
@@ -72,6 +76,7 @@ def sample_latents(
         conditions: [B, 3, H, W] in [0, 1], or None.
         seeds: B non-negative integers, of the images' noise streams; equal seeds give equal noise.
         options: solver, number of steps, guidance.
+        lengths: of stretches that lie behind one another, whose frames are made from one another; None = none are.
     Raises:
         FloatingPointError: latents are not finite, because the networks' precision does not reach.
     """
@@ -85,7 +90,8 @@ def sample_latents(
     state = torch.stack([torch.randn(shape, generator=stream) for stream in streams]).to(device)
     state = state * scheduler.init_noise_sigma
     further = {"generator": streams} if options.scheduler in STOCHASTIC else {}
-    with guided_predictions(base_model, embeddings, empty_embedding, conditions, options) as predict:
+    motion = contextlib.nullcontext() if base_model.motion is None else base_model.motion.of(lengths)
+    with guided_predictions(base_model, embeddings, empty_embedding, conditions, options) as predict, motion:
         for timestep in scheduler.timesteps:
             predicted = predict(scheduler.scale_model_input(state, timestep), timestep)
             state = scheduler.step(predicted, timestep, state, **further).prev_sample
@@ -228,11 +234,22 @@ def sample_shards(
         if compiled_rows:
             sample = functools.partial(_compiled_if_whole, sample, batches, compiled_rows)
         parts = []
-        for rows, latents in batches.map(sample, len(shard)):
+        for rows, latents in _sampled(sample, batches, shard):
             decode = functools.partial(_decode_rows, base_model, latents, options, shard.seeds[rows])
             parts += [frames for _, frames in decoded.map(decode, len(latents))]
             report(rows.stop - rows.start)
         shard.write(np.concatenate(parts))
+
+
+def _sampled(
+    sample: Callable[[slice], Tensor], batches: ShrinkingBatches, shard: Shard
+) -> Iterator[tuple[slice, Tensor]]:
+    """Batches of rows and their latents; where rows have stretches, batches of whole stretches."""
+    if shard.conditions.stretches is None:
+        yield from batches.map(sample, len(shard))
+        return
+    for rows in whole_stretches(shard.conditions, batches.size):
+        yield rows, sample(rows)
 
 
 def _compiled_if_whole(
@@ -255,7 +272,9 @@ def _sample_rows(
     images = None
     if shard.conditions.images is not None:
         images = conditions_to_tensor(shard.conditions.images[rows])
-    return sample_latents(base_model, embeddings[rows], empty_embedding, images, shard.seeds[rows], options)
+    stretches = shard.conditions.stretches
+    lengths = None if stretches is None else stretch_lengths(stretches[rows])
+    return sample_latents(base_model, embeddings[rows], empty_embedding, images, shard.seeds[rows], options, lengths)
 
 
 def _decode_rows(
@@ -349,6 +368,7 @@ def load_for_sampling(
 
     place, dtype = choose_device(device), getattr(torch, options.precision)
     base_model = load_base_model(checkpoint, with_controlnet=with_controlnet, dtype=dtype, device=place)
+    base_model = dataclasses.replace(base_model, motion=load_motion_layers(checkpoint, base_model.unet))
     if options.values != "expected":
         table = read_value_table(checkpoint)
         base_model = dataclasses.replace(

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ctlev_core.supervised.frame_sequences import stretch_lengths
 from data_contracts.arrays import load_array, save_compressed
 from data_contracts.compressed_arrays import SUFFIX
 from data_contracts.labels import Conditions
@@ -50,7 +51,7 @@ class Shard:
 
 
 def plan_shards(conditions: Conditions, seeds: Sequence[int], settings: str, work: Path) -> list[Shard]:
-    """All rows as shards of `SHARD` rows.
+    """All rows as shards of `SHARD` rows, or of whole stretches with as many.
 
     Args:
         conditions: N prompts, with N condition images or none.
@@ -60,11 +61,23 @@ def plan_shards(conditions: Conditions, seeds: Sequence[int], settings: str, wor
     """
     work.mkdir(parents=True, exist_ok=True)
     shards = []
-    for start in range(0, len(conditions), SHARD):
-        rows = slice(start, start + SHARD)
+    for rows in whole_stretches(conditions, SHARD):
         part, own = conditions.take(rows), [int(seed) for seed in seeds[rows]]
         shards.append(Shard(work / f"shard_{_digest(settings, part, own)}{SUFFIX}", part, own))
     return shards
+
+
+def whole_stretches(conditions: Conditions, count: int) -> list[slice]:
+    """Consecutive rows, `count` at a time; where rows have stretches whole ones, up to `count` rows or one stretch."""
+    if conditions.stretches is None:
+        return [slice(start, start + count) for start in range(0, len(conditions), count)]
+    found, start, stop = [], 0, 0
+    for length in stretch_lengths(conditions.stretches):
+        if stop > start and stop + length - start > count:
+            found.append(slice(start, stop))
+            start = stop
+        stop += length
+    return [*found, slice(start, stop)] if stop > start else found
 
 
 def _digest(settings: str, conditions: Conditions, seeds: list[int]) -> str:
@@ -72,4 +85,6 @@ def _digest(settings: str, conditions: Conditions, seeds: list[int]) -> str:
     digest.update(json.dumps([list(conditions.prompts), seeds]).encode())
     if conditions.images is not None:
         digest.update(np.ascontiguousarray(conditions.images).data)
+    if conditions.stretches is not None:
+        digest.update(json.dumps(stretch_lengths(conditions.stretches)).encode())
     return digest.hexdigest()[:24]
