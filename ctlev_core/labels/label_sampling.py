@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -77,14 +77,11 @@ def choose_stretches(
     """
     stretches, offset = [], 0
     for _, group in itertools.groupby(recordings):
-        times = t_us[offset : (offset := offset + len(list(group)))]
-        wanted = np.arange(times[0], times[-1] + interval_us // 2, interval_us)
-        nearest = np.abs(times[:, None] - wanted).argmin(axis=0)
-        kept = np.abs(times[nearest] - wanted) <= interval_us / 10
-        runs = np.split(np.arange(len(wanted)), np.flatnonzero(~kept))
-        for run in (run[kept[run]] for run in runs):
-            for start in range(0, len(run) - length + 1, length):
-                stretches.append(offset - len(times) + nearest[run[start : start + length]])
+        size = len(list(group))
+        for run in _runs(t_us[offset : offset + size], interval_us):
+            whole = len(run) // length * length
+            stretches += [offset + run[start : start + length] for start in range(0, whole, length)]
+        offset += size
     if not stretches:
         raise DataError(
             f"no recording has labels for a stretch of {length} frames, one every {interval_us} us as training frames: "
@@ -93,6 +90,22 @@ def choose_stretches(
     needed = -(-count // length)
     chosen = np.sort(np.resize(spread(len(stretches), needed), needed))
     return np.concatenate([stretches[number] for number in chosen])[:count]
+
+
+def _runs(t_us: np.ndarray, interval_us: int) -> Iterator[np.ndarray]:
+    """Positions of moments that follow one another every `interval_us`; after a gap another run begins."""
+    run = [0]
+    while run[-1] < len(t_us) - 1:
+        wanted_us = t_us[run[-1]] + interval_us
+        after = int(np.searchsorted(t_us, wanted_us))
+        near = [position for position in (after - 1, after) if run[-1] < position < len(t_us)]
+        nearest = min(near, key=lambda position: abs(t_us[position] - wanted_us), default=-1)
+        if nearest >= 0 and abs(t_us[nearest] - wanted_us) <= interval_us / 10:
+            run.append(nearest)
+        else:
+            yield np.array(run)
+            run = [run[-1] + 1]
+    yield np.array(run)
 
 
 def spread_choice(groups: Sequence[str], recordings: Sequence[str], count: int, seed: int) -> np.ndarray:
