@@ -217,8 +217,8 @@ class Encoding(Protocol):
 class Condition(Protocol):
     """Labels to what the generator is asked for.
 
-    `NEEDS` is what it is made of beside labels: nothing (""), `intensity` (`ConditionOfPairs`) or `motion`
-    (`ConditionOfMotions`).
+    `NEEDS` is what it is made of beside labels: nothing (""), `intensity` (`ConditionOfPairs`), `motion`
+    (`ConditionOfMotions`) or `displacement` (`ConditionOfDisplacements`).
     """
 
     VERSION: int
@@ -275,6 +275,24 @@ class ConditionOfMotions(Protocol):
         self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int], motions: BodyMotions
     ) -> Conditions:
         """As `Condition.render`; row i of `motions` is the body of row i of `labels`."""
+        ...
+
+
+@runtime_checkable
+class ConditionOfDisplacements(Protocol):
+    """A condition that shows where joints come from and go to: `NEEDS = "displacement"`."""
+
+    VERSION: int
+    NEEDS: str
+    Options: type[Frozen]
+
+    def render(
+        self, labels: Labels, image_size: tuple[int, int], options: Any, seeds: Sequence[int], displacements: np.ndarray
+    ) -> Conditions:
+        """As `Condition.render`; `displacements` [N, 2, J, 2] px to `options.reach_us` before and after, NaN = unknown.
+
+        Images are in the pixels of the labels.
+        """
         ...
 
 
@@ -536,7 +554,7 @@ BY_KIND: dict[str, tuple[type, ...]] = {
     "formats": (Format,),
     "motions": (MotionFormat,),
     "encodings": (Encoding,),
-    "conditions": (Condition, ConditionOfPairs, ConditionOfMotions),
+    "conditions": (Condition, ConditionOfPairs, ConditionOfMotions, ConditionOfDisplacements),
     "generators": (Generator, EventGenerator),
     "downstream": (Downstream,),
     "metrics": (Metric,),

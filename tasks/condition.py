@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
+from ctlev_core.labels.displacements import read_displacements
 from ctlev_core.labels.rows_to_sample import choose_rows_to_sample
 from ctlev_core.labels.sources import LabelledRows, image_size_of, read_motions, read_pairs, rows_of_frames
 from ctlev_core.plugins import Plugin
@@ -132,6 +133,9 @@ def _render(
     labels, seeds = rows.labels, sample_seeds(seed, len(rows.labels))
     needs = plugin.module.NEEDS
     motions = read_motions(rows, recordings, frames, encoding) if needs == "motion" else None
+    moved = None
+    if needs == "displacement":
+        moved = read_displacements(rows, recordings, encoding, plugin.options.reach_us)
     prompts: list[str] = []
     with ExitStack() as opened:
         written: dict[str, CompressedArrayWriter] = {}
@@ -142,6 +146,8 @@ def _render(
                 further = [read_pairs(rows.take(some), frames, encoding)]
             elif motions is not None:
                 further = [motions.take(some)]
+            elif moved is not None:
+                further = [moved[some]]
             own = seeds[start : start + BLOCK_ROWS]
             rendered = plugin.module.render(labels.take(some), image_size_of(frames), plugin.options, own, *further)
             prompts += rendered.prompts

@@ -1,6 +1,7 @@
-"""Motion layers compute what diffusers' `UNetMotionModel` computes, change nothing before they have learnt, and learn."""
+"""Motion layers compute what diffusers' `UNetMotionModel` does, change nothing before they have learnt, and learn."""
 
 import dataclasses
+import itertools
 import json
 import shutil
 
@@ -147,7 +148,7 @@ def test_windows_cover_every_frame_and_overlap_by_half(context, more):
     covered = {frame for start in starts for frame in range(start, start + context)}
     assert covered == set(range(length))
     assert starts[0] == 0 and starts[-1] == length - context
-    assert all(0 < after - before <= context // 2 for before, after in zip(starts, starts[1:], strict=False))
+    assert all(0 < after - before <= context // 2 for before, after in itertools.pairwise(starts))
     weights = pyramid(context)
     assert len(weights) == context and weights.min() == 1 and torch.equal(weights, weights.flip(0))
 
