@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -17,10 +18,11 @@ from ctlev_core.events.decoding import event_chunks
 from ctlev_core.events.image_grid import check_whole_counts, count_size, pixel_bins
 from ctlev_core.events.windows import spread
 from ctlev_core.plugin_contracts import FormatWithWriter
-from ctlev_core.postprocessing.event_streams import TimeModel, fit_times, sample_streams
+from ctlev_core.postprocessing.event_streams import TimeModel, fit_times, join_windows, sample_streams
 from ctlev_core.postprocessing.image_counts import CountModel, estimate_counts, fit_counts
 from ctlev_core.progress import ProgressBar
 from ctlev_core.recordings.stored_events import StoredEvents, stored_events
+from ctlev_core.supervised.frame_sequences import frame_interval_us, name_stretches, stretch_lengths
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
@@ -47,10 +49,11 @@ def export_events(
     encoding: EncodingChoice,
     export: EventExport,
 ) -> pa.Table:
-    """An event stream for every generated frame, under `events/`; the table says where each lies, with its label.
+    """Event streams of all generated frames, under `events/`; the table says where each frame lies, with its label.
 
     Counts and times are drawn as in the training windows of `frames`, which were cut from `recordings`; each row from
-    its own seed.
+    its own seed. A stream is one frame; or, asked for stretches, all frames whose labels follow one another in time,
+    each in the window that it would have in a recording.
     """
     plugin, writer = plugins.load_options(encoding), plugins.load("formats", export.format)
     if plugin.name != _ENCODING:
@@ -61,15 +64,22 @@ def export_events(
     folder = out.folder / "events"
     folder.mkdir()
     rows: list[dict[str, Any]] = []
-    made = _streams(generated, counts, times, export, rows)
-    streams = iter(ProgressBar(made, "export events", len(generated), unit="stream"))
+    interval_us, lengths = None, [1] * len(generated)
+    if export.streams == "stretches":
+        interval_us = frame_interval_us(frames, frames.rows_where(split="train"))
+        lengths = stretch_lengths(name_stretches(generated, np.arange(len(generated)), interval_us))
+    windows = _window_events(generated, counts, times, export, rows, interval_us)
+    joined = _streams(windows, lengths, interval_us or 0, times.least_gap_us)
+    streams = iter(ProgressBar(joined, "export events", len(lengths), unit="stream"))
     if export.one_file:
         _write_together(folder / f"events{_suffix(export.format, writer)}", streams, rows, export, writer)
     else:
-        for number, events in enumerate(streams):
+        first = 0
+        for number, stream in enumerate(streams):
             path = folder / f"{number:06d}{_suffix(export.format, writer)}"
-            event_files.write_event_chunks(path, [events], export.format)
-            rows[number] |= _place(path, events, 0)
+            event_files.write_event_chunks(path, [stream.events], export.format)
+            _place(rows[first : first + len(stream.starts_us)], path, stream)
+            first += len(stream.starts_us)
     table = pa.Table.from_pylist(rows)
     for name in ("sample_id", "class_name", "joint_set", *LABEL_COLUMNS.values()):
         table = table.append_column(name, generated.table[name])
@@ -158,19 +168,33 @@ def _events_between(stored: StoredEvents, start: int, stop: int, start_us: int, 
     return found
 
 
-def _streams(
-    generated: Manifest, counts: CountModel, times: TimeModel, export: EventExport, rows: list[dict[str, Any]]
+class _Stream(NamedTuple):
+    """Events, where the windows of its rows start, and where the last one ends."""
+
+    events: Events
+    starts_us: list[int]
+    end_us: int
+
+
+def _window_events(
+    generated: Manifest,
+    counts: CountModel,
+    times: TimeModel,
+    export: EventExport,
+    rows: list[dict[str, Any]],
+    interval_us: int | None,
 ) -> Iterator[Events]:
-    """The stream of each row, from 0 us; what is known of it is appended to `rows` before it comes."""
+    """The events of each row's window, from 0 us; what is known of it is appended to `rows` before it comes."""
     frames, seeds = generated.array("frames"), generated.column("seed")
+    duration_us = None if interval_us is None else interval_us - 1
     for start in range(0, len(generated), BLOCK_ROWS):
         block = range(start, min(start + BLOCK_ROWS, len(generated)))
         made = estimate_counts(
             np.asarray(frames[start : block.stop]), counts, seeds=[_seed(seeds[row], _COUNT_STREAM) for row in block]
         )
         time_seeds = [_seed(seeds[row], _TIME_STREAM) for row in block]
-        streams = sample_streams(made.counts, times, seeds=time_seeds, spread=export.spread)
-        for number, events in enumerate(streams):
+        windows = sample_streams(made.counts, times, seeds=time_seeds, spread=export.spread, duration_us=duration_us)
+        for number, events in enumerate(windows):
             rows.append(
                 {
                     "has_polarity": made.counts.shape[1] == 2,
@@ -182,38 +206,51 @@ def _streams(
             yield events
 
 
+def _streams(windows: Iterator[Events], lengths: list[int], interval_us: int, least_gap_us: int) -> Iterator[_Stream]:
+    """Windows joined to streams of so many each."""
+    for length in lengths:
+        starts_us = [interval_us * number for number in range(length)]
+        parts = list(itertools.islice(windows, length))
+        events = parts[0] if length == 1 else join_windows(parts, interval_us, least_gap_us)
+        last_us = int(events.t[-1]) if len(events) else 0
+        yield _Stream(events, starts_us, max(length * interval_us, last_us))
+
+
 def _seed(seed: int, stream: int) -> int:
     return int(np.random.SeedSequence([seed, stream]).generate_state(1)[0])
 
 
 def _write_together(
-    path: Path, streams: Iterator[Events], rows: list[dict[str, Any]], export: EventExport, writer: FormatWithWriter
+    path: Path, streams: Iterator[_Stream], rows: list[dict[str, Any]], export: EventExport, writer: FormatWithWriter
 ) -> None:
     """All streams in one file, one after another on one clock."""
 
     def shifted() -> Iterator[Events]:
-        start_us, event_start = 0, 0
-        for number, events in enumerate(streams):
-            moved = replace(events, t=events.t + start_us)
-            rows[number] |= _place(path, moved, event_start) | {"t_start_us": start_us}
-            rows[number]["t_end_us"] = max(rows[number]["t_end_us"], start_us)
-            start_us = rows[number]["t_end_us"] + export.gap_us
-            event_start += len(events)
+        start_us, event_start, first = 0, 0, 0
+        for stream in streams:
+            moved = replace(stream.events, t=stream.events.t + start_us)
+            own = rows[first : first + len(stream.starts_us)]
+            starts_us, end_us = [start_us + each for each in stream.starts_us], start_us + stream.end_us
+            _place(own, path, _Stream(moved, starts_us, end_us), event_start)
+            start_us = end_us + export.gap_us
+            event_start, first = event_start + len(moved), first + len(own)
             yield moved
 
     event_files.write_event_chunks(path, shifted(), export.format)
 
 
-def _place(path: Path, events: Events, event_start: int) -> dict[str, Any]:
-    last_us = int(events.t[-1]) if len(events) else 0
-    file = f"{path.parent.name}/{path.name}"
-    return {
-        "file": file,
-        "t_start_us": 0,
-        "t_end_us": last_us,
-        "event_start": event_start,
-        "num_events": len(events),
-    }
+def _place(rows: list[dict[str, Any]], path: Path, stream: _Stream, event_start: int = 0) -> None:
+    """Say of the rows of a stream, whose first event is the `event_start`-th of a file, where they lie."""
+    t_us = stream.events.t
+    bounds = [0, *np.searchsorted(t_us, stream.starts_us[1:]).tolist(), len(t_us)]
+    for row, start_us, (first, last) in zip(rows, stream.starts_us, itertools.pairwise(bounds), strict=True):
+        row |= {
+            "file": f"{path.parent.name}/{path.name}",
+            "t_start_us": start_us,
+            "t_end_us": int(t_us[last - 1]) if last > first else start_us,
+            "event_start": event_start + first,
+            "num_events": last - first,
+        }
 
 
 def _suffix(name: str, writer: FormatWithWriter) -> str:

@@ -95,3 +95,27 @@ def _draw_polarities(positive: int, uniforms: np.ndarray, keep_polarity: float, 
         if is_positive:
             positive -= 1
         p[i] = 1 if is_positive else 0
+
+
+@njit(cache=True, nogil=True)
+def put_off(t: np.ndarray, pixels: np.ndarray, windows: np.ndarray, interval_us: int, least_gap_us: int) -> None:
+    """Keep the events of a pixel apart where one window follows another.
+
+    Args:
+        t: [E] int64, us, ascending within a pixel; changed in place.
+        pixels: [E] int64, ascending.
+        windows: [E] int64, which window an event belongs to.
+        interval_us: window k lasts from k times the interval on, until the next begins.
+        least_gap_us: an event that follows one of the window before sooner is put off until so much time has passed,
+            and those behind it that it comes too near to; none beyond the end of its window.
+    """
+    put_off_one = False
+    for event in range(1, len(t)):
+        if pixels[event] != pixels[event - 1]:
+            put_off_one = False
+            continue
+        is_first = windows[event] != windows[event - 1]
+        earliest = t[event - 1] + least_gap_us
+        put_off_one = (is_first or put_off_one) and t[event] < earliest
+        if put_off_one:
+            t[event] = max(t[event], min(earliest, (windows[event] + 1) * interval_us - 1))

@@ -56,6 +56,7 @@ class TimeModel:
         length_px: of the field of starts.
         scatter: share of the starts' variance that neighbours do not share, 0 .. 1.
         keep_polarity: 0 = random order, 1 = a pixel changes polarity at most once.
+        least_gap_us: shortest time between two events of a pixel; 0 where no pixel fired twice.
     """
 
     num_events: np.ndarray
@@ -66,6 +67,7 @@ class TimeModel:
     length_px: float
     scatter: float
     keep_polarity: float
+    least_gap_us: int = 0
 
 
 def fit_times(windows: Iterable[Events]) -> TimeModel:
@@ -86,11 +88,18 @@ def fit_times(windows: Iterable[Events]) -> TimeModel:
     keep_polarity = max(0.0, 1 - changes / expected) if expected else 0.0
     sizes = np.array([(of.num_events, of.duration_us) for of in found], np.int64)
     sizes = sizes[np.lexsort((sizes[:, 1], sizes[:, 0]))]
-    return TimeModel(sizes[:, 0], sizes[:, 1], *gaps, length_px, scatter, keep_polarity)
+    shortest = [of.duration_us * pixel.min() for of in found for pixel in of.gaps]
+    least_gap_us = round(min(shortest, default=0))
+    return TimeModel(sizes[:, 0], sizes[:, 1], *gaps, length_px, scatter, keep_polarity, least_gap_us)
 
 
 def sample_streams(
-    counts: np.ndarray, model: TimeModel, *, seeds: Sequence[int], spread: Spread = "field"
+    counts: np.ndarray,
+    model: TimeModel,
+    *,
+    seeds: Sequence[int],
+    spread: Spread = "field",
+    duration_us: int | None = None,
 ) -> Iterator[Events]:
     """One event stream for each histogram; counting its events gives the histogram again.
 
@@ -99,6 +108,7 @@ def sample_streams(
         model: from `fit_times`.
         seeds: N seeds; a stream depends on its own counts and seed alone.
         spread: see the head of this file.
+        duration_us: of every window; None = as long as recorded ones with as many events.
     Yields:
         Events on a sensor of W x H px, from 0 to the window's duration in us. Where all of a row's counts are 0, no
         events.
@@ -112,9 +122,35 @@ def sample_streams(
     if len(seeds) != len(counts):
         raise ValueError(f"expected one seed a row, got {len(seeds)} seeds for {len(counts)} rows")
     return (
-        _sample(np.ascontiguousarray(row), model, np.random.default_rng(seed), spread)
+        _sample(np.ascontiguousarray(row), model, np.random.default_rng(seed), spread, duration_us)
         for row, seed in zip(counts, seeds, strict=True)
     )
+
+
+def join_windows(windows: Sequence[Events], interval_us: int, least_gap_us: int) -> Events:
+    """The streams of consecutive windows as one, the k-th from k times the interval on.
+
+    Where a pixel fires at the end of a window and again at once in the next, the later event is put off until
+    `least_gap_us` have passed, but not beyond its window, and events behind it likewise: each window keeps its events.
+
+    Args:
+        windows: of one sensor, from 0 us each, shorter than the interval.
+        interval_us: from the start of one window to that of the next.
+        least_gap_us: see `TimeModel`.
+    """
+    from ctlev_core.postprocessing import event_stream_kernels as kernels
+
+    width = windows[0].sensor_size[0]
+    numbers = np.repeat(np.arange(len(windows)), [len(window) for window in windows])
+    t = np.concatenate([window.t for window in windows]) + numbers * interval_us
+    x, y, p = (np.concatenate([getattr(window, name) for window in windows]) for name in "xyp")
+    pixels = y.astype(np.int64) * width + x
+    order = np.lexsort((t, pixels))
+    moved = t[order]
+    kernels.put_off(moved, pixels[order], numbers[order], interval_us, least_gap_us)
+    t[order] = moved
+    order = np.argsort(t, kind="stable")
+    return Events(t[order], x[order], y[order], p[order], windows[0].sensor_size)
 
 
 def sample_duration_us(num_events: int, model: TimeModel, rng: np.random.Generator) -> int:
@@ -126,12 +162,15 @@ def sample_duration_us(num_events: int, model: TimeModel, rng: np.random.Generat
     return int(model.durations_us[alike[rng.integers(len(alike))]])
 
 
-def _sample(counts: np.ndarray, model: TimeModel, rng: np.random.Generator, spread: Spread) -> Events:
+def _sample(
+    counts: np.ndarray, model: TimeModel, rng: np.random.Generator, spread: Spread, duration_us: int | None
+) -> Events:
     from ctlev_core.postprocessing import event_stream_kernels as kernels
 
     height, width = counts.shape[1:]
     num_events = int(counts.sum(dtype=np.int64))
-    duration_us = sample_duration_us(num_events, model, rng)
+    if duration_us is None:
+        duration_us = sample_duration_us(num_events, model, rng)
     is_active = np.asarray(counts.any(axis=0))
     places = _sample_places(is_active, model, rng) if spread == "field" else rng.random(np.count_nonzero(is_active))
     t, p = np.empty(num_events, np.int64), np.empty(num_events, np.uint8)

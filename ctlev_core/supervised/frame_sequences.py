@@ -82,8 +82,13 @@ def name_stretches(manifest: Manifest, rows: np.ndarray, interval_us: int) -> tu
     """Names of the stretches of frames that follow one another every `interval_us`, of each row.
 
     A stretch ends with its recording, and where the next frame neither begins where this one ends nor ends one interval
-    later, give or take a quarter: there a window was left out, or labels jump.
+    later, give or take a quarter: there a window was left out, or labels jump. Of synthetic frames, which have no
+    window, the label's moment counts.
     """
+    if "t_end_us" not in manifest.table.column_names:
+        steps = _source_steps(manifest, rows)
+        follows = (steps == 1) | (np.abs(steps - interval_us) <= interval_us / 4)
+        return tuple(map(str, np.cumsum(np.concatenate([[0], ~follows])))) if len(rows) else ()
     starts, ends = (manifest.table[name].to_numpy()[rows] for name in ("t_start_us", "t_end_us"))
     gaps_us, between_us = _gaps_us(manifest, rows), starts[1:] - ends[:-1]
     tolerance_us = interval_us / 4
@@ -91,6 +96,15 @@ def name_stretches(manifest: Manifest, rows: np.ndarray, interval_us: int) -> tu
     follows = touches | (np.abs(gaps_us - interval_us) <= tolerance_us)
     numbers = np.cumsum(np.concatenate([[0], ~follows])) if len(rows) else []
     return tuple(map(str, numbers))
+
+
+def _source_steps(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
+    """From each row's label to the next [N - 1]: us, or 1 for the next frame; 0 between recordings."""
+    sources = manifest.column("source_id")
+    named = [sources[row].rpartition(":") for row in rows]
+    places = np.array([(int(place) if place.isdecimal() else 0) for _, _, place in named])
+    names = np.array([name for name, _, _ in named])
+    return np.where((names[1:] == names[:-1]) & (names[1:] != ""), np.diff(places), 0)
 
 
 def _gaps_us(manifest: Manifest, rows: np.ndarray) -> np.ndarray:

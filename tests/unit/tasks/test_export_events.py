@@ -10,6 +10,7 @@ import pytest
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
 from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
+from ctlev_core.supervised.frame_sequences import frame_interval_us
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
@@ -87,7 +88,7 @@ def write_frames(folder, polarity: bool, num_events: int | None = None) -> Manif
     return read_manifest(write_manifest(folder, table.select(tables.FRAMES.arrow().names), tables.FRAMES))
 
 
-def write_generated(folder, frames: np.ndarray) -> Manifest:
+def write_generated(folder, frames: np.ndarray, sources: list[str] | None = None) -> Manifest:
     folder.mkdir()
     count = len(frames)
     np.save(folder / "frames.npy", frames)
@@ -98,6 +99,7 @@ def write_generated(folder, frames: np.ndarray) -> Manifest:
         "rejected": "",
     }  # fmt: skip
     ids = {name: names for name in ("sample_id", "recording_id", "condition_id", "source_id")}
+    ids |= {} if sources is None else {"source_id": sources}
     columns = {**ids, **{name: [value] * count for name, value in same.items()}, "seed": list(range(count))}
     columns |= labels_of_rows(count)
     table = pa.table({name: pa.array(columns[name]) for name in tables.SYNTHETIC.arrow().names})
@@ -154,6 +156,29 @@ def test_files_hold_the_frames(tmp_path, polarity, name, one_file):
     if one_file:
         starts, ends = made.column("t_start_us"), made.column("t_end_us")
         assert [b - a for a, b in zip(ends, starts[1:], strict=False)] == [100_000] * (len(frames) - 1)
+
+
+@pytest.mark.parametrize("one_file", [True, False])
+def test_stretches_are_streams_that_encode_to_their_frames(tmp_path, one_file):
+    """Six frames, of labels that follow one another as training frames do, but for one jump and one other recording."""
+    interval_us = frame_interval_us(write_frames(tmp_path / "learnt", True), np.arange(4 * PER_RECORDING))
+    sources = [f"a:{number * interval_us}" for number in (0, 1, 2, 7, 8)] + ["b:0"]
+    frames = real_frames(tmp_path)[:6]
+    generated = write_generated(tmp_path / "generated", frames, sources)
+    made = export(tmp_path, generated, one_file=one_file, streams="stretches", gap_us=123)
+    rows = made.table.to_pylist()
+    assert len({row["file"] for row in rows}) == (1 if one_file else 3)
+    for stretch in ([0, 1, 2], [3, 4], [5]):
+        begin_us = rows[stretch[0]]["t_start_us"]
+        events = event_files.read_events_file(made.path(rows[stretch[0]]["file"]))
+        assert (np.diff(events.t) >= 0).all()
+        for number, row in enumerate(stretch):
+            assert rows[row]["t_start_us"] == begin_us + number * interval_us
+            window = np.searchsorted(events.t, [rows[row]["t_start_us"], rows[row]["t_start_us"] + interval_us])
+            counts = ENCODING.encode(events, window[None], ENCODING.Options())
+            assert np.array_equal(ENCODING.render_image(counts, ENCODING.Options())[0], frames[row])
+            assert rows[row]["event_start"] == window[0] or not rows[row]["num_events"]
+            assert rows[row]["num_events"] == window[1] - window[0]
 
 
 def test_a_row_depends_on_its_own_seed_alone(tmp_path):
