@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sys
 
+from ctlev_core import plugins
+from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.options import MotionOptions
-from ctlev_core.plugins import validate_options
+from ctlev_core.plugins import PluginError, validate_options
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.labels import HeldOut
@@ -163,11 +165,22 @@ def motion_options(experiment: Experiment) -> MotionOptions | None:
     """The options of the experiment's motion layers, checked; None where it asks for none.
 
     Raises:
-        PluginError: an option is unknown or wrong.
+        PluginError: an option is unknown or wrong, the generator has no place for such layers, or windows are too few.
     """
     if experiment.motion_layers is None:
         return None
-    return validate_options(MotionOptions, experiment.motion_layers, "motion_layers")
+    options = validate_options(MotionOptions, experiment.motion_layers, "motion_layers")
+    generator, most = experiment.generator, experiment.windows.max_windows
+    if not isinstance(plugins.load_options(experiment.sampling_choice).options, SamplingOptions):
+        raise PluginError(f"motion_layers: expected a diffusion generator, got {generator.name!r}")
+    if getattr(plugins.load_options(generator).options, "lora_rank", None) is not None:
+        raise PluginError("motion_layers: expected a generator that is trained whole, got generator.options.lora_rank")
+    if most is not None and most < options.context:
+        raise PluginError(
+            f"motion_layers.context: stretches of {options.context} frames, but windows.max_windows keeps {most} of a "
+            "recording"
+        )
+    return options
 
 
 def _of_part(label: str, part: str | None) -> str:

@@ -88,12 +88,13 @@ def train_motion_layers(
         return replace(cache.batch(rows, generator_for(seed, *entropy), 0.0, device), num_frames=options.context)
 
     def fetch(number: int) -> Batch:
-        count = options.batch_size // options.context
-        return batch_of(learnt[sample_rows(seed, number, count, len(learnt))], LATENT_STREAM, number)
+        starts = learnt[sample_rows(seed, number, options.stretches_at_a_time, len(learnt))]
+        return batch_of(starts, LATENT_STREAM, number)
 
     def validate() -> tuple[float, float]:
         batch = batch_of(held_back, LATENT_STREAM)
-        return validation_losses(denoiser, schedule, batch, seed=seed, batch_size=options.batch_size)
+        whole = options.stretches_at_a_time * options.context
+        return validation_losses(denoiser, schedule, batch, seed=seed, batch_size=whole)
 
     with layers.of([options.context]):
         history = run_training(

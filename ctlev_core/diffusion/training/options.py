@@ -205,7 +205,7 @@ class MotionOptions(TrainingOptions):
         default=16, ge=2, le=32, description="consecutive frames that are made from one another; 16 as AnimateDiff's"
     )
     num_steps: int = Field(default=600, gt=0, description="optimiser steps")
-    batch_size: int = Field(default=32, gt=0, description="frames in memory at a time, whole stretches of `context`")
+    batch_size: int = Field(default=32, gt=0, description="frames in memory at a time, as whole stretches")
     learning_rate: float = Field(default=1e-3, gt=0, description="peak")
     validation_every: int = Field(default=200, gt=0, description="steps between two points of the validation curve")
     num_validation: int = Field(
@@ -214,11 +214,10 @@ class MotionOptions(TrainingOptions):
     optimizer: Literal["adamw", "muon"] = Field(default="adamw", description="as of fine-tuning")
     device: str = Field(default="auto", json_schema_extra=RUN_SETTING, description="auto, cpu, cuda, cuda:1 ...")
 
-    @model_validator(mode="after")
-    def _batches_hold_stretches(self) -> Self:
-        if self.batch_size % self.context:
-            raise ValueError(f"batch_size must be a multiple of context, {self.context} frames, got {self.batch_size}")
-        return self
+    @property
+    def stretches_at_a_time(self) -> int:
+        """Whole stretches that `batch_size` frames have room for, one at least."""
+        return max(1, self.batch_size // self.context)
 
 
 class LatentOptions(Frozen):
