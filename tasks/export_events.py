@@ -66,8 +66,8 @@ def export_events(
     rows: list[dict[str, Any]] = []
     interval_us, lengths = None, [1] * len(generated)
     if export.streams == "stretches":
-        interval_us = frame_interval_us(frames, frames.rows_where(split="train"))
-        lengths = stretch_lengths(name_stretches(generated, np.arange(len(generated)), interval_us))
+        interval_us = frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
+        lengths = stretch_lengths(name_stretches(generated.table, np.arange(len(generated)), interval_us))
     windows = _window_events(generated, counts, times, export, rows, interval_us)
     joined = _streams(windows, lengths, interval_us or 0, times.least_gap_us)
     streams = iter(ProgressBar(joined, "export events", len(lengths), unit="stream"))

@@ -44,8 +44,8 @@ def train_motion_layers(
     if not (folder / "model_index.json").is_file():
         raise DataError(f"{folder}: motion layers need a diffusion generator that was trained whole, without lora_rank")
     rows = matching_rows(frames, conditions)
-    interval_us = frame_interval_us(frames, rows)
-    asked = replace(conditions_of(conditions), stretches=name_stretches(frames, rows, interval_us))
+    interval_us = frame_interval_us(frames.table, rows, frames.ref.path)
+    asked = replace(conditions_of(conditions), stretches=name_stretches(frames.table, rows, interval_us))
     history = train(
         folder,
         frames.images(rows),

@@ -81,7 +81,7 @@ def sample(
     folder = checkpoint.ref.path / "checkpoint"
     if has_motion_layers(folder):
         interval_us = read_settings(folder).interval_us
-        asked = replace(asked, stretches=name_stretches(conditions, np.arange(len(asked)), interval_us))
+        asked = replace(asked, stretches=name_stretches(conditions.table, np.arange(len(asked)), interval_us))
         max_attempts = 1  # a frame that was made anew would be of another stretch
 
     def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:

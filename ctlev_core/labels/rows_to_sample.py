@@ -84,7 +84,7 @@ def choose_rows_to_sample(
         inner = surrounded(moments["recording_id"].to_pylist(), moments["t_us"].to_numpy(), half_us)
         allowed = np.flatnonzero(inner) if order == "random" else np.arange(moments.num_rows)
         if order == "stretches":
-            interval_us = frame_interval_us(frames, frames.rows_where(split="train"))
+            interval_us = frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
             rows_of_stretches = choose_stretches(
                 moments["recording_id"].to_pylist(), moments["t_us"].to_numpy(), count, length, interval_us
             )
@@ -111,7 +111,7 @@ def choose_rows_to_sample(
         learnt = frames.rows_where(split="train")
         if order == "stretches":
             names, times = frames.column("recording_id"), frames.table["t_end_us"].to_numpy()[learnt]
-            interval_us = frame_interval_us(frames, learnt)
+            interval_us = frame_interval_us(frames.table, learnt, frames.ref.path)
             learnt = learnt[choose_stretches([names[row] for row in learnt], times, count, length, interval_us)]
             rows = rows_of_frames(recordings, frames, learnt)
         else:

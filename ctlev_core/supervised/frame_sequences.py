@@ -11,9 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 
 from data_contracts.errors import DataError
 from data_contracts.manifest import Manifest
+
+_WINDOW = {"t_start_us", "t_end_us"}
+"""Columns of recorded frames, and of conditions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,51 +70,50 @@ def stretch_lengths(names: Sequence[object]) -> list[int]:
     return [len(list(rows)) for _, rows in itertools.groupby(names)]
 
 
-def frame_interval_us(manifest: Manifest, rows: np.ndarray) -> int:
-    """Time from one frame to the next of its recording, the median over the given rows.
+def frame_interval_us(table: pa.Table, rows: np.ndarray, where: object) -> int:
+    """Time from one frame to the next of its recording, the lower median over rows of a table of frames.
+
+    Synthetic frames have no windows: of them it is the time between labels, or 1 where labels are those of frames.
 
     Raises:
-        DataError: no recording has two frames.
+        DataError: no recording has two frames; `where` says of what.
     """
-    gaps = _gaps_us(manifest, rows)
-    if not len(gaps) or not (gaps > 0).any():
-        raise DataError(f"{manifest.ref.path}: no two frames follow one another in a recording")
-    return int(np.median(gaps[gaps > 0]))
+    steps = _steps(table, rows)
+    if not (steps > 0).any():
+        raise DataError(f"{where}: no two frames follow one another in a recording")
+    return int(np.quantile(steps[steps > 0], 0.5, method="lower"))
 
 
-def name_stretches(manifest: Manifest, rows: np.ndarray, interval_us: int) -> tuple[str, ...]:
-    """Names of the stretches of frames that follow one another every `interval_us`, of each row.
+def name_stretches(table: pa.Table, rows: np.ndarray, interval_us: int) -> tuple[str, ...]:
+    """Names of the stretches of frames that follow one another every `interval_us`, of each row of a table of frames.
 
     A stretch ends with its recording, and where the next frame neither begins where this one ends nor ends one interval
     later, give or take a quarter: there a window was left out, or labels jump. Of synthetic frames, which have no
     window, the label's moment counts.
     """
-    if "t_end_us" not in manifest.table.column_names:
-        steps = _source_steps(manifest, rows)
-        follows = (steps == 1) | (np.abs(steps - interval_us) <= interval_us / 4)
-        return tuple(map(str, np.cumsum(np.concatenate([[0], ~follows])))) if len(rows) else ()
-    starts, ends = (manifest.table[name].to_numpy()[rows] for name in ("t_start_us", "t_end_us"))
-    gaps_us, between_us = _gaps_us(manifest, rows), starts[1:] - ends[:-1]
-    tolerance_us = interval_us / 4
-    touches = (gaps_us > 0) & (between_us >= 0) & (between_us <= tolerance_us)
-    follows = touches | (np.abs(gaps_us - interval_us) <= tolerance_us)
-    numbers = np.cumsum(np.concatenate([[0], ~follows])) if len(rows) else []
-    return tuple(map(str, numbers))
+    if not len(rows):
+        return ()
+    steps, tolerance_us = _steps(table, rows), interval_us / 4
+    follows = np.abs(steps - interval_us) <= tolerance_us
+    if set(table.column_names) >= _WINDOW:
+        starts, ends = (table[name].to_numpy()[rows] for name in ("t_start_us", "t_end_us"))
+        between_us = starts[1:] - ends[:-1]
+        follows |= (steps > 0) & (between_us >= 0) & (between_us <= tolerance_us)
+    else:
+        follows |= steps == 1
+    return tuple(map(str, np.cumsum(np.concatenate([[0], ~follows]))))
 
 
-def _source_steps(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
-    """From each row's label to the next [N - 1]: us, or 1 for the next frame; 0 between recordings."""
-    sources = manifest.column("source_id")
-    named = [sources[row].rpartition(":") for row in rows]
-    places = np.array([(int(place) if place.isdecimal() else 0) for _, _, place in named])
-    names = np.array([name for name, _, _ in named])
-    return np.where((names[1:] == names[:-1]) & (names[1:] != ""), np.diff(places), 0)
-
-
-def _gaps_us(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
-    """From the end of each row's window to that of the next row [N - 1]; 0 between recordings."""
-    names = np.array(name_recordings(manifest, rows))
-    return np.where(names[1:] == names[:-1], np.diff(manifest.table["t_end_us"].to_numpy()[rows]), 0)
+def _steps(table: pa.Table, rows: np.ndarray) -> np.ndarray:
+    """From each row to the next [N - 1], 0 between recordings: us, or, of labels of frames, how many frames."""
+    if set(table.column_names) >= _WINDOW:
+        names, moments = np.array(_recordings(table, rows)), table["t_end_us"].to_numpy()[rows]
+    else:
+        sources = table["source_id"].to_pylist()
+        named = [sources[row].rpartition(":") for row in rows]
+        names = np.array([name or f"row {row}" for row, (name, *_) in enumerate(named)])
+        moments = np.array([int(moment) if moment.isdecimal() else 0 for *_, moment in named])
+    return np.where(names[1:] == names[:-1], np.diff(moments), 0)
 
 
 def name_recordings(manifest: Manifest, rows: np.ndarray) -> list[str]:
@@ -119,10 +122,14 @@ def name_recordings(manifest: Manifest, rows: np.ndarray) -> list[str]:
     Recorded frames are named by their recording. Synthetic ones are made one by one, but of labels that may follow one
     another in time (`temporal_order: true`): those are named by the recording of the labels, the others each by itself.
     """
-    if "source_id" not in manifest.table.column_names:
-        names = manifest.column("recording_id")
+    return _recordings(manifest.table, rows)
+
+
+def _recordings(table: pa.Table, rows: np.ndarray) -> list[str]:
+    if "source_id" not in table.column_names:
+        names = table["recording_id"].to_pylist()
         return [names[row] for row in rows]
-    sources = manifest.column("source_id")
+    sources = table["source_id"].to_pylist()
     named, before, number = [], ("", -1), 0
     for row in rows:
         name, _, time = sources[row].rpartition(":")

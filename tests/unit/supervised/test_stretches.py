@@ -11,58 +11,56 @@ from ctlev_core.supervised.frame_sequences import frame_interval_us, name_stretc
 from data_contracts.errors import DataError
 
 
-class Frames:
-    """What the functions read of a manifest: names, and starts and ends of windows."""
-
-    def __init__(self, names, starts, ends, **further):
-        self.table = pa.table({"recording_id": names, "t_start_us": starts, "t_end_us": ends, **further})
-        self.ref = type("Ref", (), {"path": "frames"})
-
-    def column(self, name):
-        return self.table[name].to_pylist()
+def frames_of(names, starts, ends, **further):
+    return pa.table({"recording_id": names, "t_start_us": starts, "t_end_us": ends, **further})
 
 
-def lengths_of(frames, interval_us=None):
-    rows = np.arange(len(frames.table))
-    interval_us = interval_us or frame_interval_us(frames, rows)
-    return stretch_lengths(name_stretches(frames, rows, interval_us))
+def lengths_of(table, interval_us=None):
+    rows = np.arange(len(table))
+    return stretch_lengths(name_stretches(table, rows, interval_us or frame_interval_us(table, rows, "frames")))
 
 
 def test_windows_without_a_gap_follow_one_another():
     starts = np.array([3, 20, 40, 60, 0, 20, 40])
-    frames = Frames(["a"] * 4 + ["b"] * 3, starts, starts + 19)
-    assert frame_interval_us(frames, np.arange(7)) == 20
+    frames = frames_of(["a"] * 4 + ["b"] * 3, starts, starts + 19)
+    assert frame_interval_us(frames, np.arange(7), "frames") == 20
     assert lengths_of(frames) == [4, 3]
 
 
 def test_a_window_left_out_ends_a_stretch():
     starts = np.array([0, 20, 60, 80, 100])
-    assert lengths_of(Frames(["a"] * 5, starts, starts + 20)) == [2, 3]
+    assert lengths_of(frames_of(["a"] * 5, starts, starts + 20)) == [2, 3]
 
 
 def test_windows_of_equal_count_follow_one_another_whatever_they_last():
     starts, ends = np.array([0, 10, 50, 70]), np.array([10, 50, 69, 140])
-    assert lengths_of(Frames(["a"] * 4, starts, ends)) == [4]
+    assert lengths_of(frames_of(["a"] * 4, starts, ends)) == [4]
 
 
 @pytest.mark.parametrize(("step", "expected"), [(20, [4]), (24, [4]), (26, [1] * 4), (10, [1] * 4), (45, [1] * 4)])
 def test_labels_follow_one_another_at_the_interval_of_frames(step, expected):
     """Labels to sample from have windows around them that overlap, or leave gaps."""
     times = step * np.arange(4)
-    frames = Frames(["c"] * 4, np.maximum(times - 10, 0), times + 10, source_id=[f"pose:{t}" for t in times])
+    frames = frames_of(["c"] * 4, np.maximum(times - 10, 0), times + 10, source_id=[f"pose:{t}" for t in times])
     assert lengths_of(frames, 20) == expected
 
 
 def test_time_that_goes_back_begins_another_stretch():
     times = np.array([0, 20, 40, 0, 20])
-    frames = Frames(["c"] * 5, times, times + 20, source_id=[f"pose:{t}" for t in times])
+    frames = frames_of(["c"] * 5, times, times + 20, source_id=[f"pose:{t}" for t in times])
     assert lengths_of(frames, 20) == [3, 2]
 
 
+def test_synthetic_frames_follow_one_another_as_their_labels_do():
+    """Labels of moments in us, or of frames that are numbered; what has no such label is by itself."""
+    sources = ["a:0", "a:20", "a:40", "a:90", "b:train:00003", "b:train:00004", "b:train:00006", "prompt", "prompt"]
+    assert lengths_of(pa.table({"source_id": sources}), 20) == [3, 1, 2, 1, 1, 1]
+
+
 def test_single_frames_have_no_interval():
-    frames = Frames(["a", "b"], [0, 0], [20, 20])
+    frames = frames_of(["a", "b"], [0, 0], [20, 20])
     with pytest.raises(DataError, match="no two frames follow one another"):
-        frame_interval_us(frames, np.arange(2))
+        frame_interval_us(frames, np.arange(2), "frames")
 
 
 def test_chosen_stretches_keep_the_interval():

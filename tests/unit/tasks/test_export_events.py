@@ -161,7 +161,9 @@ def test_files_hold_the_frames(tmp_path, polarity, name, one_file):
 @pytest.mark.parametrize("one_file", [True, False])
 def test_stretches_are_streams_that_encode_to_their_frames(tmp_path, one_file):
     """Six frames, of labels that follow one another as training frames do, but for one jump and one other recording."""
-    interval_us = frame_interval_us(write_frames(tmp_path / "learnt", True), np.arange(4 * PER_RECORDING))
+    interval_us = frame_interval_us(
+        write_frames(tmp_path / "learnt", True).table, np.arange(4 * PER_RECORDING), "frames"
+    )
     sources = [f"a:{number * interval_us}" for number in (0, 1, 2, 7, 8)] + ["b:0"]
     frames = real_frames(tmp_path)[:6]
     generated = write_generated(tmp_path / "generated", frames, sources)
