@@ -7,11 +7,19 @@ recordings are found in the same way, by the recording of their labels and the t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ctlev_core.events.windows import spread
+from ctlev_core.labels.source_moments import source_moment
+from data_contracts.errors import DataError
+from data_contracts.manifest import Manifest
 
+SHUFFLED = "recorded shuffled"
+"""What recorded stretches in shuffled order are called in tables."""
+STACKED_SIDE_PX = 32
+"""Larger frames are made smaller, by a whole factor, before they are stacked."""
 MIN_LENGTH = 3
 """Frames of a stretch, at least: with two, time can be shuffled in one way only, which is to turn it round."""
 
@@ -46,27 +54,81 @@ def find_stretches(names: Sequence[str], times_us: np.ndarray, step_us: int, len
     return found[:, None] + np.arange(length)
 
 
-def choose_stretches(rows: np.ndarray, names: Sequence[str], wanted: int) -> np.ndarray:
-    """At most `wanted` stretches [S, L] of all, from as many recordings as there can be, evenly spread.
+@dataclass(frozen=True, eq=False)
+class Stretches:
+    """Stretches of a set of frames.
+
+    Attributes:
+        rows: [S, L] int64, rows of the frames, those of a recording together.
+        names: [S] recording of each; of synthetic ones that of their labels.
+    """
+
+    rows: np.ndarray
+    names: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def spread(self, wanted: int) -> Stretches:
+        """At most `wanted` of them, of as many recordings as there can be, evenly spread over these."""
+        if len(self) <= wanted:
+            return self
+        begins = np.concatenate([[True], self.names[1:] != self.names[:-1]])
+        number = np.arange(len(self))
+        turn = number - np.maximum.accumulate(np.where(begins, number, 0))
+        # The first stretches of all recordings, then the second ones, ...: of the last that fit, some.
+        of_turn = np.bincount(turn)
+        last = int(np.searchsorted(of_turn.cumsum(), wanted))
+        kept, some = np.flatnonzero(turn < last), np.flatnonzero(turn == last)
+        chosen = np.sort(np.concatenate([kept, some[spread(len(some), wanted - len(kept))]]))
+        return Stretches(self.rows[chosen], self.names[chosen])
+
+
+def recorded_stretches(frames: Manifest, split: str, step_us: int, length: int) -> Stretches:
+    """Those of recorded frames of a split; see `find_stretches`."""
+    rows = frames.rows_where(split=split)
+    names, times = np.array(frames.column("recording_id"), str)[rows], frames.table["t_start_us"].to_numpy()[rows]
+    found = find_stretches(names.tolist(), times, step_us, length)
+    return Stretches(rows[found], names[found[:, 0]])
+
+
+def labelled_stretches(made: Manifest, frames: Manifest, step_us: int, length: int) -> Stretches:
+    """Those of synthetic frames, or of conditions, whose labels follow one another in time.
 
     Args:
-        rows: [S, L], of which those of a recording lie together.
-        names: [N] recording of each frame.
-        wanted: stretches.
+        made: has a column `source_id`: a moment, `RECORDING:TIME`, or the recorded frame whose labels they are.
+        frames: recorded ones.
+        step_us: as for `find_stretches`.
+        length: likewise.
     """
-    if len(rows) <= wanted:
-        return rows
-    own = np.asarray(names, str)[rows[:, 0]]
-    _, recording = np.unique(own, return_inverse=True)
-    # The first stretches of all recordings, then the second ones: where there are too few turns, some recordings.
-    begins = np.concatenate([[True], recording[1:] != recording[:-1]])
-    turn = np.arange(len(rows)) - np.maximum.accumulate(np.where(begins, np.arange(len(rows)), 0))
-    order = np.argsort(turn, kind="stable")
-    full = int(np.searchsorted(np.bincount(turn).cumsum(), wanted, side="right"))
-    kept = order[: np.count_nonzero(turn < full)]
-    last = order[len(kept) :][: np.count_nonzero(turn == full)]
-    chosen = np.concatenate([kept, last[spread(len(last), wanted - len(kept))]])
-    return rows[np.sort(chosen)]
+    moments = zip(frames.column("recording_id"), frames.column("t_start_us"), strict=True)
+    of_frame = dict(zip(frames.column("sample_id"), moments, strict=True))
+    sources = [of_frame.get(source) or source_moment(source) for source in made.column("source_id")]
+    names = [name if t_us >= 0 else "" for name, t_us in sources]
+    rows = find_stretches(names, np.array([t_us for _, t_us in sources], np.int64), step_us, length)
+    return Stretches(rows, np.array(names, str)[rows[:, 0]])
+
+
+def check_stretches(frames: Manifest, conditions: Manifest, step_us: int, length: int) -> None:
+    """Raise `DataError` where recorded training frames, or the labels to sample from, have no stretch.
+
+    Args:
+        frames: recorded ones.
+        conditions: labels to sample from.
+        step_us: as for `find_stretches`.
+        length: likewise.
+    """
+    wanted = f"sequence_length: expected {length} frames in a row, each {step_us} us after the one before"
+    if not len(recorded_stretches(frames, "train", step_us, length)):
+        raise DataError(
+            f"{wanted}; no recording in {frames.ref.path} has so many training frames. Choose a shorter length or "
+            "longer recordings; a window without events ends a row"
+        )
+    if not len(labelled_stretches(conditions, frames, step_us, length)):
+        raise DataError(
+            f"{wanted}; labels to sample from in {conditions.ref.path} do not follow one another so. They must be one "
+            "window apart (of the studio: condition_rate_hz), and num_synthetic must take all of a recording"
+        )
 
 
 def shuffle_time(stretches: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -95,13 +157,24 @@ def used_channels(frames: np.ndarray) -> slice:
     return slice(0, 1) if is_grey else slice(0, 3)
 
 
-def stack_frames(stretches: np.ndarray) -> np.ndarray:
+def stack_frames(frames: np.ndarray) -> np.ndarray:
     """The frames of a stretch as the channels of one image, for the two-sample test.
 
+    They are made smaller: what changes from frame to frame is larger than a pixel, and the network then tells shuffled
+    time better, and in a third of the time. The finest noise is what the test of single frames sees.
+
     Args:
-        stretches: [S, L, H, W, C] uint8.
+        frames: [L, H, W, C] uint8.
     Returns:
-        [S, H, W, L * C] uint8, the channels of a frame side by side.
+        [h, w, L * C] uint8, the channels of a frame side by side.
     """
-    count, length, height, width, channels = stretches.shape
-    return np.ascontiguousarray(np.moveaxis(stretches, 1, 3)).reshape(count, height, width, length * channels)
+    import cv2
+
+    height, width = frames.shape[1:3]
+    factor = -(-max(height, width) // STACKED_SIDE_PX)
+    size = max(1, round(width / factor)), max(1, round(height / factor))
+    stacked = np.ascontiguousarray(np.moveaxis(frames, 0, 2)).reshape(height, width, -1)
+    if factor == 1:
+        return stacked
+    planes = [cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in np.moveaxis(stacked, 2, 0)]
+    return np.stack(planes, axis=2)
