@@ -130,9 +130,8 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         oracle=dataset.more_frames,
         target=dataset.target_frames,
         nearest=nearest,
-        sequences=in_time,
     )
-    return report(made, openings=evaluation.openings, label=experiment.name)
+    return report(made, in_time, openings=evaluation.openings, label=experiment.name)
 
 
 def _study(study: Study) -> ManifestRef:

@@ -88,7 +88,7 @@ class _Measured:
     """A set of stretches.
 
     Attributes:
-        images: [S, h, w, L * C] uint8, the frames of each as channels.
+        images: [S, h, w, C'] uint8, each stretch as one image (`stack_frames`).
         names: [S] recordings.
         numbers: of all.
         digest: of the manifest of the frames.
@@ -120,9 +120,7 @@ def _measure(
     return _Measured(stacked, stretches.names, numbers, manifest.ref.digest)
 
 
-def _compare(
-    sets: Mapping[str, _Measured], split: str, names: Sequence[str]
-) -> dict[str, two_sample.TwoSampleTest]:
+def _compare(sets: Mapping[str, _Measured], split: str, names: Sequence[str]) -> dict[str, two_sample.TwoSampleTest]:
     """The floors, the control, and each generator against both sets of recorded stretches."""
     tests = {
         f"{name} against {name}": two_sample.compare_halves(sets[name].images, sets[name].names)
