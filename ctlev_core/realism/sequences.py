@@ -26,6 +26,7 @@ Sources: 1 - D / (2 V) is the autocorrelation of a variogram, as von Neumann's r
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -74,7 +75,7 @@ def measure_stretch(frames: np.ndarray, labelled: LabelledJoints | None = None) 
     values = frames.max(axis=-1)
     active = values >= ACTIVE_VALUE
     sums = _rate_correlations(active) | {"persistent_share": _persistence(active)}
-    flows = [_flow(first, second) for first, second in zip(values[:-1], values[1:], strict=True)]
+    flows = [_flow(first, second) for first, second in itertools.pairwise(values)]
     if frames.shape[-1] == 2:
         sums["polarity_kept_share"] = _kept_polarity(frames, active, flows)
     if labelled is not None:

@@ -45,7 +45,7 @@ def find_stretches(names: Sequence[str], times_us: np.ndarray, step_us: int, len
         raise ValueError(f"times must be [{len(names)}], one a frame, got {times.shape}")
     if length < MIN_LENGTH or step_us <= 0:
         raise ValueError(
-            f"stretches need {MIN_LENGTH} frames or more, a step above 0 us apart, got {length}, {step_us}"
+            f"stretches need {MIN_LENGTH} frames, a step above 0 us apart, or more; got {length}, {step_us} us"
         )
     own = np.asarray(names, str)
     follows = (own[1:] == own[:-1]) & (own[1:] != "") & (2 * np.abs(np.diff(times) - step_us) < step_us)

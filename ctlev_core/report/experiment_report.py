@@ -97,6 +97,7 @@ def write_report(
     in_time: Sequence[Section] = []
     if sequences is not None:
         in_time = sequence_sections(sequences, made.frames, made.conditions, shown, colours)
+    alone = [] if in_time else moving
     page = render_report(
         title=made.title,
         lead=notice,
@@ -108,9 +109,7 @@ def write_report(
         colours=colours,
         sections=[
             Chapter("Did it help?", [*results, *charts, *_folded("Class by class", by_class)]),
-            Chapter(
-                "What the frames look like", [grid, *other_grids, *([] if in_time else moving), *_recorded_frames(made)]
-            ),
+            Chapter("What the frames look like", [grid, *other_grids, *alone, *_recorded_frames(made)]),
             Chapter("Sequences", in_time),
             Chapter("How good are they?", quality.sections()),
             Chapter("How they were made", _origins(made, records)),
