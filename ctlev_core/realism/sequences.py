@@ -180,7 +180,7 @@ def _flow(first: np.ndarray, second: np.ndarray) -> _Flow:
         smooth = cv2.GaussianBlur(small.astype(np.float32), (0, 0), FLOW_BLUR_PX)
         blurred.append(np.minimum(2 * smooth, 255).astype(np.uint8))
     start = np.zeros((*blurred[0].shape, 2), np.float32)
-    vectors = cv2.calcOpticalFlowFarneback(*blurred, start, 0.5, 3, FLOW_WINDOW_PX, 3, 5, 1.1, 0)
+    vectors = cv2.calcOpticalFlowFarneback(blurred[0], blurred[1], start, 0.5, 3, FLOW_WINDOW_PX, 3, 5, 1.1, 0)
     return _Flow(vectors, factor)
 
 

@@ -6,6 +6,7 @@ recordings are found in the same way, by the recording of their labels and the t
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -49,10 +50,9 @@ def find_stretches(names: Sequence[str], times_us: np.ndarray, step_us: int, len
         )
     own = np.asarray(names, str)
     follows = (own[1:] == own[:-1]) & (own[1:] != "") & (2 * np.abs(np.diff(times) - step_us) < step_us)
-    starts = np.flatnonzero(np.concatenate([[True], ~follows])) if len(own) else np.zeros(0, np.int64)
-    stops = np.append(starts[1:], len(own))
-    first = [np.arange(start, stop - length + 1, length) for start, stop in zip(starts, stops, strict=True)]
-    found = np.concatenate([np.zeros(0, np.int64), *first])
+    breaks = [*np.flatnonzero(~follows) + 1, len(own)]
+    first = [np.arange(start, stop - length + 1, length) for start, stop in itertools.pairwise([0, *breaks])]
+    found = np.concatenate(first)
     return found[:, None] + np.arange(length)
 
 

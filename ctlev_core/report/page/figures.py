@@ -21,8 +21,6 @@ def image_grid_png(rows: Sequence[Sequence[np.ndarray]], min_cell_px: int = 128,
     Raises:
         ValueError: there is no image, or one has another shape or dtype.
     """
-    import cv2
-
     images = [[_to_rgb(image) for image in row] for row in rows]
     shapes = [image.shape for row in images for image in row]
     if not shapes:

@@ -290,17 +290,8 @@ def _templates() -> Environment:
         keep_trailing_newline=True,
     )  # fmt: skip
     filters = (
-        _inline,
-        _paragraphs,
-        _grid_png,
-        _webp,
-        _film,
-        _code_of,
-        shown_cells,
-        charts.draw,
-        charts.series_class,
-        quote,
-    )
+        _inline, _paragraphs, _grid_png, _webp, _film, _code_of, shown_cells, charts.draw, charts.series_class, quote,
+    )  # fmt: skip
     found.filters |= {one.__name__.lstrip("_"): one for one in filters}
     found.tests["picture"] = lambda value: isinstance(value, np.ndarray)
     return found

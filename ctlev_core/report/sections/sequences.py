@@ -1,4 +1,4 @@
-"""The sections of the report on time: do synthetic frames follow one another as recorded ones do? Numbers, and films."""
+"""The sections of the report on time: do synthetic frames follow one another as recorded ones do?"""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _CAPTION = (
     "resampling of recordings. Recorded stretches say what is real; with their frames in shuffled order (labels stay "
     "where they are) they say what a number is worth without any order in time. Activity one (two, four) frames later: "
     "correlation of the number of active pixels within a stretch, 0 without order. Active pixels that stay: with an "
-    "active pixel within 1 px in the next frame. Still pixels: far from the skeleton in the whole stretch; active again, "
-    "against chance: 1 where noise strikes at random, more where the same pixels fire again. Motion: cosine between the "
-    "optical flow of two frames and the labelled motion of joints, 1 = along, -1 = backwards. Polarity: active pixels "
-    "whose events, followed along the flow, keep their sign."
+    "active pixel within 1 px in the next frame. Still pixels: far from the skeleton in the whole stretch; active "
+    "again, against chance: 1 where noise strikes at random, more where the same pixels fire again. Motion: cosine "
+    "between the optical flow of two frames and the labelled motion of joints, 1 = along, -1 = backwards. Polarity: "
+    "active pixels whose events, followed along the flow, keep their sign."
 )
 
 
@@ -124,11 +124,10 @@ def _films(
             label = set_name(name) if same else f"{set_name(name)}, asked for other labels"
             clips += [] if of_made is None else [(label, np.asarray(made.array("frames")[of_made]))]
         rows.append((class_name or f"example {number + 1}", clips))
-    slower = 1e6 / step_us / SHOWN_RATE_HZ
     caption = (
-        f"Stretches of {length} frames, each {step_us / 1000:.3g} ms after the one before, {slower:.2g} times slower than "
-        "they were; evenly spread, none chosen by eye. What is recorded shows another person in the same class of "
-        "motion, where there is one. The pointer stops a film."
+        f"Stretches of {length} frames, each {step_us / 1000:.3g} ms after the one before, "
+        f"{1e6 / step_us / SHOWN_RATE_HZ:.2g} times slower than they were; evenly spread, none chosen by eye. What is "
+        "recorded shows another person in the same class of motion, where there is one. The pointer stops a film."
     )
     return [Films("Sequences in motion", rows, SHOWN_RATE_HZ, caption, colours)]
 

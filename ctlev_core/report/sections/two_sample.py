@@ -63,7 +63,5 @@ def _name(subject: str, many: str) -> str:
     if subject in _NAMES:
         return _NAMES[subject].format(many=many)
     first, _, second = subject.partition(" against ")
-    against = {RECORDED: "recorded training"} | {split: f"recorded {split}" for split in HELD_OUT_SPLITS}
-    return (
-        f"{set_name(first)} from {against[second]} {many}" if second in against else f"{set_name(first)} from {second}"
-    )
+    against = {RECORDED: f"recorded training {many}"} | {split: f"recorded {split} {many}" for split in HELD_OUT_SPLITS}
+    return f"{set_name(first)} from {against.get(second, second)}"
