@@ -106,17 +106,18 @@ def _measure(
     """Stretch by stretch, so that large frames take no memory; in shuffled order labels stay where they are."""
     frames, labels = manifest.array("frames"), manifest.labels
     order = shuffle_time(stretches.rows) if shuffled else stretches.rows
-    images, sums = [], []
-    for rows, labelled_rows in ProgressBar(
-        list(zip(order, stretches.rows, strict=True)), f"stretches: {name}", unit="stretch"
-    ):
+    pairs = list(zip(order, stretches.rows, strict=True))
+    # What a set without a stretch is compared as: too small, rather than of another size.
+    blank = np.zeros((stretches.rows.shape[1], *frames.shape[1:]), np.uint8)[..., channels]
+    images, sums = [stack_frames(blank)], []
+    for rows, labelled_rows in ProgressBar(pairs, f"stretches: {name}", unit="stretch"):
         pictures = np.asarray(frames[rows])[..., channels]
         joints = labels.joints2d
         labelled = None if joints is None else LabelledJoints(joints[labelled_rows], labels.joint_set)
         sums.append(measure_stretch(pictures, labelled))
         images.append(stack_frames(pictures))
     numbers = estimate_numbers(sums, stretches.names.tolist())
-    stacked = np.stack(images) if images else np.zeros((0, 1, 1, 1), np.uint8)
+    stacked = np.stack(images)[1:]
     return _Measured(stacked, stretches.names, numbers, manifest.ref.digest)
 
 
