@@ -123,7 +123,7 @@ def _films(
             of_made = stretch if same else (others[number % len(others)] if len(others) else None)
             label = set_name(name) if same else f"{set_name(name)}, asked for other labels"
             clips += [] if of_made is None else [(label, np.asarray(made.array("frames")[of_made]))]
-        rows.append((class_name or f"example {number + 1}", clips))
+        rows.append((class_name.replace("_", " ") or f"example {number + 1}", clips))
     caption = (
         f"Stretches of {length} frames, each {step_us / 1000:.3g} ms after the one before, "
         f"{1e6 / step_us / SHOWN_RATE_HZ:.2g} times slower than they were; evenly spread, none chosen by eye. What is "
@@ -151,5 +151,6 @@ class _Recorded:
             return []
         number = self._shown[class_name] = self._shown.get(class_name, -1) + 1
         rows = stretches[number % len(stretches)]
-        label = "recorded" if same else f"recorded, {self._frames.column('class_name')[rows[0]]}"
+        own = self._frames.column("class_name")[rows[0]].replace("_", " ")
+        label = "recorded" if same else f"recorded, {own}"
         return [(label, np.asarray(self._frames.array("frames")[rows]))]
