@@ -207,6 +207,14 @@ class Experiment(Frozen):
         min_length=1,
         description="metrics of the features of two sets of frames",
     )
+    sequence_length: int | None = Field(
+        None,
+        ge=3,
+        le=64,
+        json_schema_extra=ADDED_LATER,
+        description="frames of a stretch: recorded and synthetic stretches of consecutive frames are compared, and "
+        "shown in motion; needs temporal_order and windows of equal duration, all of them; null = none",
+    )
     export: EventExport | None = Field(None, description="also write the synthetic frames as event streams")
     realism_reference: DatasetChoice | None = Field(
         None, description="recordings that the experiment's own are compared with, number by number, in the report"
@@ -251,6 +259,22 @@ class Experiment(Frozen):
     def _stretches_are_asked_for(self) -> Experiment:
         if self.motion_layers is not None and not self.temporal_order:
             raise ValueError("motion_layers make frames that follow one another: set temporal_order to true")
+        return self
+
+    @model_validator(mode="after")
+    def _sequences_are_consecutive(self) -> Experiment:
+        if self.sequence_length is None:
+            return self
+        wrong = {
+            "temporal_order must be true": not self.temporal_order,
+            "windows.method must be 'duration'": self.windows.method != "duration",
+            "windows.max_windows must be null": self.windows.max_windows is not None,
+            "windows.anchor must be 'first_event'": self.windows.anchor != "first_event",
+            "num_recorded must be null": self.num_recorded is not None,
+        }
+        if any(wrong.values()):
+            told = ", ".join(name for name, is_wrong in wrong.items() if is_wrong)
+            raise ValueError(f"sequence_length compares consecutive frames: {told}")
         return self
 
     @model_validator(mode="after")

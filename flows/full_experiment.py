@@ -11,10 +11,11 @@ from functools import partial
 
 from ctlev_core import plugins
 from ctlev_core.plugin_contracts import GeneratorOfNames
+from ctlev_core.realism.stretches import check_stretches
 from ctlev_core.report.inputs import GeneratedFrames, Named, ReportInputs
 from ctlev_core.report.page.report_files import publish_report, read_verdict
 from data_contracts.experiment import Experiment
-from data_contracts.manifest import ManifestRef
+from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.study import Study
 from data_contracts.training_sets import SYNTHETIC
 from flows.baselines import baselines
@@ -33,6 +34,7 @@ from tasks.memorisation import memorisation
 from tasks.nearest_seen import nearest_seen
 from tasks.realism import realism
 from tasks.report import report
+from tasks.sequence_realism import sequence_realism
 from tasks.stage import call_flow, call_together
 from tasks.store import home_folder
 from tasks.study_report import study_report
@@ -47,6 +49,13 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
     if isinstance(experiment, Study):
         return _study(experiment)
     dataset = call_flow(prepare_dataset, experiment)
+    if experiment.sequence_length is not None and dataset.frames.digest:  # planned ones cannot be looked at
+        check_stretches(
+            read_manifest(dataset.frames),
+            read_manifest(dataset.sample_conditions),
+            experiment.windows.duration_us,
+            experiment.sequence_length,
+        )
     *own, compared = call_together(
         *(partial(_own_frames, experiment, dataset, number) for number in range(experiment.num_generators)),
         lambda: call_flow(baselines, experiment, dataset),
@@ -68,6 +77,16 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         names=list(generated),
         label=f"training frames and {', '.join(generated)}",
     )
+    in_time = None
+    if experiment.sequence_length is not None:
+        in_time = sequence_realism(
+            dataset.frames,
+            list(generated.values()),
+            names=list(generated),
+            length=experiment.sequence_length,
+            step_us=experiment.windows.duration_us,
+            label=f"training frames and {', '.join(generated)}",
+        )
     shown = [
         GeneratedFrames(
             name,
@@ -112,7 +131,7 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         target=dataset.target_frames,
         nearest=nearest,
     )
-    return report(made, openings=evaluation.openings, label=experiment.name)
+    return report(made, in_time, openings=evaluation.openings, label=experiment.name)
 
 
 def _study(study: Study) -> ManifestRef:

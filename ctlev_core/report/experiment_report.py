@@ -42,6 +42,7 @@ from ctlev_core.report.sections.score_tables import (
     score_tables,
     trained_rows,
 )
+from ctlev_core.report.sections.sequences import sequence_sections
 from ctlev_core.report.sections.training_curves import base_model_figures, loss_curves
 from ctlev_core.report.sections.usefulness import usefulness_of, usefulness_sections
 from ctlev_core.report.sections.verdict import Verdict, verdict
@@ -63,20 +64,23 @@ TABLES = ("scores", "samples", "realism", "recordings")
 """Written as Parquet beside the page."""
 
 
-def write_report(made: ReportInputs[Manifest], folder: Path, openings: int | None = None) -> None:
+def write_report(
+    made: ReportInputs[Manifest], folder: Path, openings: int | None = None, sequences: Manifest | None = None
+) -> None:
     """Write `report.html`, `tables.tex`, `tables.md`, `TABLES`, `provenance.json` and `summary.json`.
 
     Args:
         made: what is shown.
         folder: to write to.
         openings: experiments that were scored on the same test frames so far; None = not known.
+        sequences: stretches of consecutive frames, recorded and generated, in numbers; None leaves them out.
     """
     tested = made.target or made.frames
     told = [made.notice]
     if made.target is None:  # whose recordings are others
         told.append(told_split(made.recordings.column("splits"), tested.held_out))
     notice = " ".join(filter(None, [*told, told_openings(tested.held_out, openings)]))
-    records = read_records(_artefacts(made))
+    records = read_records([*_artefacts(made), *([("sequences", sequences.ref.path)] if sequences else [])])
     traced = trace_lineage([(one.ref.key, one.table) for one in made.scores], records)
     shown = {one.name: one.frames for one in made.generated}
     recorded = [made.frames, *(one for one in (made.oracle, made.target) if one is not None)]
@@ -90,6 +94,10 @@ def write_report(made: ReportInputs[Manifest], folder: Path, openings: int | Non
     charts, moving = _charts(rows, _learnt_with(records)), pictures.motion(made.conditions, own)
     results, by_class = _results(rows, made.training_sets, list(shown), paired)
     quality = _Quality.of(made, rows, paired)
+    in_time: Sequence[Section] = []
+    if sequences is not None:
+        in_time = sequence_sections(sequences, made.frames, made.conditions, shown, colours)
+    alone = [] if in_time else moving
     page = render_report(
         title=made.title,
         lead=notice,
@@ -101,7 +109,8 @@ def write_report(made: ReportInputs[Manifest], folder: Path, openings: int | Non
         colours=colours,
         sections=[
             Chapter("Did it help?", [*results, *charts, *_folded("Class by class", by_class)]),
-            Chapter("What the frames look like", [grid, *other_grids, *moving, *_recorded_frames(made)]),
+            Chapter("What the frames look like", [grid, *other_grids, *alone, *_recorded_frames(made)]),
+            Chapter("Sequences", in_time),
             Chapter("How good are they?", quality.sections()),
             Chapter("How they were made", _origins(made, records)),
             Chapter(
@@ -115,7 +124,9 @@ def write_report(made: ReportInputs[Manifest], folder: Path, openings: int | Non
     )
     (folder / PAGE).write_text(page, encoding="utf-8")
     kept = [
-        table for table in (*results, *quality.about_frames, *by_class, *quality.others) if isinstance(table, Table)
+        table
+        for table in (*results, *quality.about_frames, *by_class, *in_time, *quality.others)
+        if isinstance(table, Table)
     ]
     (folder / LATEX).write_text(render_latex(kept, title=made.title, lead=notice), encoding="utf-8")
     (folder / MARKDOWN).write_text(

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ctlev_core.realism.distances import DISTRIBUTIONS
+from ctlev_core.realism.stretches import SHUFFLED
 from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from ctlev_core.report.inputs import GeneratedFrames, Named, ReportInputs
 from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
@@ -18,6 +19,8 @@ from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest, ManifestRef, label_columns, read_manifest, write_manifest
 
 SIDE, COUNT, METRIC = 12, 12, "mpjpe2d_px"
+STRETCH, STEP_US = 4, 1
+"""Labels to sample from are 1 us apart."""
 CLASSES = ["walk", "run"] * (COUNT // 2)
 TRAINING_SETS = {
     "recorded": 0.0,
@@ -47,6 +50,9 @@ class Experiment:
         beside = {DISTRIBUTIONS.name: _distributions(), TWO_SAMPLE_TESTS.name: _tests()}
         self.realism = self._put("realism", _realism(), tables.SCORES, beside)
         self.memorisation = [self._memorisation(name) for name in ("synthetic", "gan")]
+        arguments = {"length": STRETCH, "step_us": STEP_US}
+        beside = {TWO_SAMPLE_TESTS.name: _stretch_tests()}
+        self.sequences = self._put("sequence_realism", _sequences(), tables.SCORES, beside, (), arguments)
 
     @property
     def inputs(self) -> ReportInputs[Manifest]:
@@ -225,3 +231,38 @@ def _tests() -> pa.Table:
     unknown = dict.fromkeys(("value", "low", "high", "deviation"))
     row = {"group": "frames", "subject": "synthetic against recorded", "num_first": 12, "num_second": 6, **unknown}
     return pa.Table.from_pylist([{**row, "note": "too few frames"}], schema=TWO_SAMPLE_TESTS.arrow())
+
+
+def _sequences() -> pa.Table:
+    same = {"task": "realism", "seed": 0, "num_samples": 6, "num_train": 0, "model_digest": "", "data_digest": ""}
+    numbers = {
+        "recorded": {"rate_correlation_lag1": 0.75, "persistent_share": 0.5},
+        SHUFFLED: {"rate_correlation_lag1": 0.0, "persistent_share": 0.25},
+        "test": {"rate_correlation_lag1": 0.5},
+        "synthetic": {"rate_correlation_lag1": 0.125, "persistent_share": 0.375},
+        "gan": {"persistent_share": 0.125},
+    }
+    rows = [
+        {**same, "group": "sequences", "subject": name, "metric": metric, "value": value, "low": low, "high": high}
+        for name, of_set in numbers.items()
+        for metric, value in of_set.items()
+        for low, high in [(None, None) if name == "gan" else (value - 0.125, value + 0.125)]
+    ]
+    area = {**same, "group": "sequences", "subject": "synthetic against test", "metric": "c2st", "value": 0.75}
+    rows.append({**area, "low": 0.625, "high": 0.875})
+    return pa.Table.from_pylist(rows, schema=tables.SCORES.arrow())
+
+
+def _stretch_tests() -> pa.Table:
+    same = {"group": "sequences", "num_first": 50, "num_second": 50, "note": ""}
+    areas = {
+        f"{SHUFFLED} against recorded": (0.875, 0.75, 1.0, 0.0625),
+        "synthetic against test": (0.75, 0.625, 0.875, 0.0625),
+        "gan against test": (None, None, None, None),
+    }
+    rows = [
+        {**same, "subject": name, **dict(zip(("value", "low", "high", "deviation"), area, strict=True))}
+        for name, area in areas.items()
+    ]
+    rows[-1]["note"] = "fewer than 40 frames in a set"
+    return pa.Table.from_pylist(rows, schema=TWO_SAMPLE_TESTS.arrow())

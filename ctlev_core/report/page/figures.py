@@ -1,4 +1,4 @@
-"""Pictures of the report: grids of images as PNG, animations as WebP."""
+"""Pictures of the report: grids of images and strips of films as PNG, animations as WebP."""
 
 from __future__ import annotations
 
@@ -21,8 +21,6 @@ def image_grid_png(rows: Sequence[Sequence[np.ndarray]], min_cell_px: int = 128,
     Raises:
         ValueError: there is no image, or one has another shape or dtype.
     """
-    import cv2
-
     images = [[_to_rgb(image) for image in row] for row in rows]
     shapes = [image.shape for row in images for image in row]
     if not shapes:
@@ -38,10 +36,43 @@ def image_grid_png(rows: Sequence[Sequence[np.ndarray]], min_cell_px: int = 128,
             cell = canvas[top : top + height, left : left + width]
             cell[..., 3] = 255
             _paste_enlarged(image, cell[..., :3])
-    encoded, data = cv2.imencode(".png", cv2.cvtColor(canvas, cv2.COLOR_RGBA2BGRA))
+    return image_png(canvas)
+
+
+def image_png(image: np.ndarray) -> bytes:
+    """An image [H, W, 3 or 4] uint8, RGB or RGBA, as a PNG file.
+
+    Raises:
+        ValueError: it is too large for one.
+    """
+    import cv2
+
+    order = cv2.COLOR_RGBA2BGRA if image.shape[-1] == 4 else cv2.COLOR_RGB2BGR
+    encoded, data = cv2.imencode(".png", cv2.cvtColor(image, order))
     if not encoded:
-        raise ValueError(f"a grid of {canvas.shape[1]} x {canvas.shape[0]} px does not fit into a PNG")
+        raise ValueError(f"an image of {image.shape[1]} x {image.shape[0]} px does not fit into a PNG")
     return data.tobytes()
+
+
+def film_strip(frames: np.ndarray, max_side_px: int = 256) -> np.ndarray:
+    """The frames of a film side by side.
+
+    Args:
+        frames: [T, H, W, 3] uint8 RGB.
+        max_side_px: larger frames are made smaller, by a whole factor.
+    Returns:
+        [h, T * w, 3] uint8.
+    Raises:
+        ValueError: no frames, or another shape or dtype.
+    """
+    import cv2
+
+    _check_frames(frames)
+    factor = math.ceil(max(frames.shape[1:3]) / max_side_px)
+    if factor > 1:
+        height, width = (max(1, round(side / factor)) for side in frames.shape[1:3])
+        frames = np.stack([cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA) for frame in frames])
+    return np.concatenate(list(frames), axis=1)
 
 
 def animation_webp(frames: np.ndarray, rate_hz: float, min_side_px: int = 192) -> bytes:
@@ -58,8 +89,7 @@ def animation_webp(frames: np.ndarray, rate_hz: float, min_side_px: int = 192) -
     """
     import cv2
 
-    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or 0 in frames.shape:
-        raise ValueError(f"frames must be [T, H, W, 3] uint8 with something in them, got {frames.shape} {frames.dtype}")
+    _check_frames(frames)
     if not 0 < rate_hz < math.inf:
         raise ValueError(f"rate_hz must be positive, got {rate_hz}")
     factor = max(1, math.ceil(min_side_px / min(frames.shape[1:3])))
@@ -73,6 +103,11 @@ def animation_webp(frames: np.ndarray, rate_hz: float, min_side_px: int = 192) -
     if not encoded:
         raise ValueError(f"{len(frames)} frames of {frames.shape[2]} x {frames.shape[1]} px do not fit into a WebP")
     return data.tobytes()
+
+
+def _check_frames(frames: np.ndarray) -> None:
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or 0 in frames.shape:
+        raise ValueError(f"frames must be [T, H, W, 3] uint8 with something in them, got {frames.shape} {frames.dtype}")
 
 
 def _to_rgb(image: np.ndarray) -> np.ndarray:

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import base64
 import functools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -22,6 +24,8 @@ from ctlev_core.report.page import charts, figures
 from ctlev_core.report.page.report_files import FACTS
 from ctlev_core.report.page.tables import Table, shown_cells
 
+MIN_FILM_PX = 128
+"""Films are enlarged by the smallest whole factor that makes their longer side at least this."""
 Colours = Sequence[tuple[str, str]]
 """(CSS colour or gradient, meaning) of each entry of a legend."""
 
@@ -96,6 +100,27 @@ class Animation:
 
 
 @dataclass(frozen=True)
+class Films:
+    """Stretches of frames that play side by side for ever, drawn by the style sheet alone.
+
+    Where a reader wants no motion, and on paper, the frames of each lie side by side.
+
+    Attributes:
+        title: heading of the section.
+        rows: (label, clips) of each row; a clip is (label, frames [T, H, W, 3] uint8).
+        rate_hz: frames a second.
+        caption: what the reader sees.
+        colours: legend.
+    """
+
+    title: str
+    rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]
+    rate_hz: float
+    caption: str = ""
+    colours: Colours = ()
+
+
+@dataclass(frozen=True)
 class Links:
     """Pages beside this one: (text, relative address) of each."""
 
@@ -135,7 +160,7 @@ class Diagram:
     caption: str = ""
 
 
-Section = Text | Table | ImageGrid | Curves | Animation | Links | Diagram
+Section = Text | Table | ImageGrid | Curves | Animation | Films | Links | Diagram
 
 
 @dataclass(frozen=True)
@@ -264,7 +289,9 @@ def _templates() -> Environment:
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         keep_trailing_newline=True,
     )  # fmt: skip
-    filters = (_inline, _paragraphs, _grid_png, _webp, _code_of, shown_cells, charts.draw, charts.series_class, quote)
+    filters = (
+        _inline, _paragraphs, _grid_png, _webp, _film, _code_of, shown_cells, charts.draw, charts.series_class, quote,
+    )  # fmt: skip
     found.filters |= {one.__name__.lstrip("_"): one for one in filters}
     found.tests["picture"] = lambda value: isinstance(value, np.ndarray)
     return found
@@ -299,3 +326,20 @@ def _grid_png(grid: ImageGrid | np.ndarray, min_cell_px: int = 128) -> str:
 def _webp(frames: np.ndarray, rate_hz: float) -> str:
     webp = figures.animation_webp(frames, rate_hz)
     return f"data:image/webp;base64,{base64.b64encode(webp).decode('ascii')}"
+
+
+def _film(frames: np.ndarray, rate_hz: float) -> dict[str, Any]:
+    """What the template needs of a clip: the strip as a data address, how many frames, their size, and the seconds."""
+    if not 0 < rate_hz < math.inf:
+        raise ValueError(f"rate_hz must be positive, got {rate_hz}")
+    strip = figures.film_strip(frames)
+    png = base64.b64encode(figures.image_png(strip)).decode("ascii")
+    width, height = strip.shape[1] // len(frames), strip.shape[0]
+    factor = max(1, math.ceil(MIN_FILM_PX / max(width, height)))
+    return {
+        "source": f"data:image/png;base64,{png}",
+        "count": len(frames),
+        "width": width * factor,
+        "height": height * factor,
+        "seconds": round(len(frames) / rate_hz, 3),
+    }

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ctlev_core.events.windows import spread
+from ctlev_core.labels.source_moments import source_moment
 from ctlev_core.report.page.display_names import set_name
 from ctlev_core.report.page.html import Animation, Colours, ImageGrid, Step
 from data_contracts.manifest import Manifest
@@ -201,7 +202,7 @@ def _same_moments(source_ids: list[str], real: list[Manifest]) -> list[np.ndarra
             members.setdefault(name, []).append(row)
         starts, ends = (np.array(manifest.column(name), np.int64) for name in ("t_start_us", "t_end_us"))
         for index, source_id in enumerate(source_ids):
-            name, t_us = _moment(source_id)
+            name, t_us = source_moment(source_id)
             row = names.get(source_id)
             if row is None and t_us >= 0:
                 around = [r for r in members.get(name, ()) if starts[r] <= t_us <= ends[r]]
@@ -209,12 +210,6 @@ def _same_moments(source_ids: list[str], real: list[Manifest]) -> list[np.ndarra
             if row is not None and found[index] is None:
                 found[index] = np.asarray(manifest.array("frames")[row])
     return found
-
-
-def _moment(source_id: str) -> tuple[str, int]:
-    """Recording and time in us of a source; -1 where it names no time."""
-    name, _, time = source_id.rpartition(":")
-    return name, int(time) if time.isdecimal() else -1
 
 
 def real_grid(frames: Manifest, target: Manifest | None = None) -> ImageGrid:
@@ -251,7 +246,7 @@ def runs(source_ids: list[str]) -> list[tuple[str, np.ndarray, float]]:
     """Rows that follow one another in the time of one recording: its name, the rows, the median step in us."""
     found: list[tuple[str, list[int], list[int]]] = []
     for row, source_id in enumerate(source_ids):
-        name, t_us = _moment(source_id)
+        name, t_us = source_moment(source_id)
         if found and found[-1][0] == name and 0 <= found[-1][2][-1] < t_us:
             found[-1][1].append(row)
             found[-1][2].append(t_us)

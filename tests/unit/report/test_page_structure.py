@@ -62,7 +62,7 @@ def reports(tmp_path_factory) -> Path:
     alone, both, pooled = (experiment.home / name for name in ("alone", "both", "pooled"))
     for folder in (alone, both, pooled):
         folder.mkdir()
-    report.function(Output(alone, alone), experiment.inputs)
+    report.function(Output(alone, alone), experiment.inputs, experiment.sequences)
     study_report.function(
         Output(both, both), [Manifest(ManifestRef(key="k", path=alone), None, (), ())] * 2, title="both",
         notice="Made up.", names=("first_one", "second_one"), training_sets=[list(TRAINING_SETS)] * 2,

@@ -55,7 +55,7 @@ def page(tmp_path_factory):
     experiment = Experiment(tmp_path_factory.mktemp("home"))
     folder = experiment.home / "made"
     folder.mkdir()
-    report.function(Output(folder, folder), experiment.inputs)
+    report.function(Output(folder, folder), experiment.inputs, experiment.sequences)
     return (folder / "report.html").read_text()
 
 
