@@ -21,21 +21,25 @@ SHUFFLED = "recorded shuffled"
 """What recorded stretches in shuffled order are called in tables."""
 STACKED_SIDE_PX = 32
 """Larger frames are made smaller for the two-sample test."""
+WINDOW_TOLERANCE, LABEL_TOLERANCE = 0.5, 0.1
+"""Of a step: the time of a window is that of its first event, and varies; that of a label does not."""
 MIN_LENGTH = 3
 """Frames of a stretch, at least: with two, time can be shuffled in one way only, which is to turn it round."""
 
 
-def find_stretches(names: Sequence[str], times_us: np.ndarray, step_us: int, length: int) -> np.ndarray:
+def find_stretches(
+    names: Sequence[str], times_us: np.ndarray, step_us: int, length: int, tolerance: float = WINDOW_TOLERANCE
+) -> np.ndarray:
     """Rows of frames that follow one another.
 
-    Frames follow one another where they lie side by side, are of one recording, and their times differ by one step,
-    give or take less than half of one: the time of a window is that of its first event.
+    Frames follow one another where they lie side by side, are of one recording, and their times differ by one step.
 
     Args:
         names: [N] recording of each frame; an empty one is that of no other frame.
         times_us: [N] int64, time of each frame in its recording.
         step_us: from a frame to the next, > 0.
         length: frames of a stretch, at least `MIN_LENGTH`.
+        tolerance: times may differ by less than this share of a step more or less.
     Returns:
         [S, length] int64 rows, in order; S may be 0.
     Raises:
@@ -49,7 +53,7 @@ def find_stretches(names: Sequence[str], times_us: np.ndarray, step_us: int, len
             f"stretches need {MIN_LENGTH} frames, a step above 0 us apart, or more; got {length}, {step_us} us"
         )
     own = np.asarray(names, str)
-    follows = (own[1:] == own[:-1]) & (own[1:] != "") & (2 * np.abs(np.diff(times) - step_us) < step_us)
+    follows = (own[1:] == own[:-1]) & (own[1:] != "") & (np.abs(np.diff(times) - step_us) < tolerance * step_us)
     breaks = [*np.flatnonzero(~follows) + 1, len(own)]
     first = [np.arange(start, stop - length + 1, length) for start, stop in itertools.pairwise([0, *breaks])]
     found = np.concatenate(first)
@@ -107,7 +111,9 @@ def labelled_stretches(made: Manifest, frames: Manifest, step_us: int, length: i
     of_frame = dict(zip(frames.column("sample_id"), moments, strict=True))
     sources = [of_frame.get(source) or source_moment(source) for source in made.column("source_id")]
     names = [name if t_us >= 0 else "" for name, t_us in sources]
-    rows = find_stretches(names, np.array([t_us for _, t_us in sources], np.int64), step_us, length)
+    times = np.array([t_us for _, t_us in sources], np.int64)
+    tolerance = LABEL_TOLERANCE if of_frame.keys().isdisjoint(made.column("source_id")) else WINDOW_TOLERANCE
+    rows = find_stretches(names, times, step_us, length, tolerance)
     return Stretches(rows, np.array(names, str)[rows[:, 0]])
 
 

@@ -108,26 +108,30 @@ def _films(
     if not len(shown):
         return []
     own, recorded = generated[own_name], _Recorded(frames, step_us, length)
-    class_names, asked = own.column("class_name"), own.column("condition_id")
+    class_names, asked, sources = (own.column(name) for name in ("class_name", "condition_id", "source_id"))
+    alike = {name: made.column("source_id") == sources for name, made in generated.items()}
+    others = {name: found[name].spread(NUM_FILMS).rows for name, same in alike.items() if not same}
     condition_rows = {name: row for row, name in enumerate(conditions.column("sample_id"))}
     rows = []
     for number, stretch in enumerate(shown.rows):
         class_name = class_names[stretch[0]]
-        clips = recorded.clip(class_name)
+        clips = recorded.clip(class_name, [sources[row] for row in stretch])
         if conditions.has_array("images"):
             of_stretch = np.array([condition_rows[asked[row]] for row in stretch])
             clips.append(("condition", np.asarray(conditions.array("images")[of_stretch])))
         for name, made in generated.items():
-            same = made.column("source_id") == own.column("source_id")
-            others = found[name].spread(NUM_FILMS).rows
-            of_made = stretch if same else (others[number % len(others)] if len(others) else None)
-            label = set_name(name) if same else f"{set_name(name)}, asked for other labels"
-            clips += [] if of_made is None else [(label, np.asarray(made.array("frames")[of_made]))]
+            images = made.array("frames")
+            if alike[name]:
+                clips.append((set_name(name), np.asarray(images[stretch])))
+            elif len(others[name]):
+                chosen = others[name][number % len(others[name])]
+                clips.append((f"{set_name(name)}, asked for other labels", np.asarray(images[chosen])))
         rows.append((class_name.replace("_", " ") or f"example {number + 1}", clips))
     caption = (
         f"Stretches of {length} frames, each {step_us / 1000:.3g} ms after the one before, "
         f"{1e6 / step_us / SHOWN_RATE_HZ:.2g} times slower than they were; evenly spread, none chosen by eye. What is "
-        "recorded shows another person in the same class of motion, where there is one. The pointer stops a film."
+        "recorded shows the same moments, or else another person in the same class of motion, where there are such. "
+        "The pointer stops a film."
     )
     return [Films("Sequences in motion", rows, SHOWN_RATE_HZ, caption, colours)]
 
@@ -139,12 +143,16 @@ class _Recorded:
         self._frames, self._shown = frames, {}
         parts = [recorded_stretches(frames, split, step_us, length) for split in (frames.held_out, "train")]
         names = frames.column("class_name")
+        self._row_of = {name: row for row, name in enumerate(frames.column("sample_id"))}
         self._by_class: dict[str, list[np.ndarray]] = {}
         for rows in (row for part in parts for row in part.rows):
             self._by_class.setdefault(names[rows[0]], []).append(rows)
 
-    def clip(self, class_name: str) -> list[tuple[str, np.ndarray]]:
-        """The next stretch of a class, else of any; nothing where there is none."""
+    def clip(self, class_name: str, sources: Sequence[str]) -> list[tuple[str, np.ndarray]]:
+        """The frames that the labels are of, else the next stretch of a class, else of any; nothing without any."""
+        if all(source in self._row_of for source in sources):
+            own_rows = np.array([self._row_of[source] for source in sources])
+            return [("recorded, same moments", np.asarray(self._frames.array("frames")[own_rows]))]
         same = self._by_class.get(class_name)
         stretches = same or [rows for of_class in self._by_class.values() for rows in of_class]
         if not stretches:

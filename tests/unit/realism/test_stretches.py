@@ -170,6 +170,14 @@ def test_labels_follow_one_another_by_their_moments_or_by_the_frames_they_are_of
     assert found.rows.tolist() == [[0, 1, 2], [5, 6, 7]] and found.names.tolist() == ["pose/x", "b"]
 
 
+@pytest.mark.parametrize(("step", "count"), [(100, 1), (91, 1), (89, 0), (109, 1), (111, 0)])
+def test_labels_keep_the_step_of_windows_more_closely_than_windows_do(step, count):
+    moments = asked([f"x:{number * step}" for number in range(3)])
+    assert len(labelled_stretches(moments, FRAMES_IN_TIME, STEP, 3)) == count
+    late = recorded_frames(["a"] * 3, [0, step, 2 * step], ["train"] * 3)
+    assert len(recorded_stretches(late, "train", STEP, 3)) == 1
+
+
 def test_what_has_no_stretch_is_refused_with_what_to_change():
     in_time = asked([f"x:{time}" for time in (0, 100, 200)])
     check_stretches(FRAMES_IN_TIME, in_time, STEP, 3)

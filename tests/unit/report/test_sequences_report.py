@@ -2,17 +2,20 @@
 
 import base64
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pytest
 from browser import CHROMIUM, run_in_browser
-from report_artefacts import STRETCH, Experiment
+from report_artefacts import COUNT, STRETCH, Experiment
 
 from ctlev_core.report.page.figures import film_strip
 from ctlev_core.report.page.html import Films, render_report
 from ctlev_core.report.page.tables import Table
 from ctlev_core.report.sections.sequences import SHOWN_RATE_HZ, sequence_sections
+from data_contracts.manifest import Manifest
 from tasks.report import report
 from tasks.stage import Output
 
@@ -69,6 +72,36 @@ def test_films_are_conditions_and_the_frames_made_for_them(experiment, sections)
         (first, conditions), (second, synthetic), (third, _) = clips
         assert (first, second, third) == ("condition", "synthetic", "GAN")
         assert np.array_equal(conditions, asked[rows]) and np.array_equal(synthetic, made[rows])
+
+
+def test_recorded_films_show_the_same_moments_or_the_same_class(experiment):
+    def shown(sources):
+        made = replaced(experiment.generated[0], source_id=sources)
+        films, *_ = sequence_sections(experiment.sequences, frames, experiment.conditions, {"synthetic": made})
+        assert isinstance(films, Films)
+        return [clips[0] for _, clips in films.rows]
+
+    names, times = ["r"] * COUNT, pa.array(range(COUNT), pa.int64())
+    classes = ["walk"] * COUNT
+    frames = replaced(experiment.frames, recording_id=names, t_start_us=times, class_name=classes)
+    images = experiment.frames.array("frames")
+    # Training frames are the first six, held-out ones the others; a stretch has four.
+    moments = shown(experiment.frames.column("sample_id"))
+    assert [label for label, _ in moments] == ["recorded, same moments"] * 3
+    for number, (_, film) in enumerate(moments):
+        assert np.array_equal(film, images[STRETCH * number : STRETCH * (number + 1)])
+    others = shown([f"elsewhere:{number}" for number in range(COUNT)])
+    assert [label for label, _ in others] == ["recorded"] * 3, "the first frame of each is of the class walk"
+    for (_, film), first in zip(others, (6, 0, 6), strict=True):
+        assert np.array_equal(film, images[first : first + STRETCH])
+
+
+def replaced(manifest: Manifest, **columns) -> Manifest:
+    """A manifest with some columns of its table changed."""
+    table = manifest.table
+    for name, values in columns.items():
+        table = table.set_column(table.column_names.index(name), name, pa.array(values))
+    return replace(manifest, table=table)
 
 
 def test_a_film_is_a_strip_that_the_style_sheet_moves_frame_by_frame():
