@@ -39,12 +39,14 @@ class Batch:
         conditions: [K, 3, H, W] condition images in [0, 1] of the first K <= B rows, or None; the other rows go through
             the U-Net alone.
         num_frames: of each stretch, whose rows lie behind one another and are equally noisy; 1 = images.
+        shared_noise: share of the noise's variance that the frames of a stretch have in common.
     """
 
     latents: Tensor
     embeddings: Tensor
     conditions: Tensor | None = None
     num_frames: int = 1
+    shared_noise: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,11 +152,22 @@ def denoising_loss(
     num_draws = len(batch.latents) // batch.num_frames
     timesteps = emphasis.draw(num_draws, schedule.num_timesteps, generator).repeat_interleave(batch.num_frames)
     noise = torch.randn(batch.latents.shape, generator=generator)
+    if batch.shared_noise:
+        shared = torch.randn((num_draws, *noise.shape[1:]), generator=generator)
+        noise = mix_noise(noise, shared.repeat_interleave(batch.num_frames, 0), batch.shared_noise)
     device = batch.latents.device
     noisy, target = schedule.noised(batch.latents, noise.to(device), timesteps.to(device))
     predicted = denoiser.predict(noisy, timesteps.to(device), batch.embeddings, batch.conditions)
     error = (predicted.float() - target.float()).square().mean(dim=(1, 2, 3))
     return (schedule.loss_weights(timesteps, emphasis).to(device) * error).mean()
+
+
+def mix_noise(own: Tensor, shared: Tensor, share: float) -> Tensor:
+    """Standard normal noise [B, C, h, w]; rows with the same `shared` have this share of the variance in common.
+
+    Source: Ge et al., Preserve Your Own Correlation, ICCV 2023 (mixed noise; their alpha^2 / (1 + alpha^2) is `share`).
+    """
+    return share**0.5 * shared + (1 - share) ** 0.5 * own
 
 
 def validation_losses(
@@ -178,7 +191,7 @@ def validation_losses(
         for start in range(0, count, batch_size):
             rows = slice(start, start + batch_size)
             images = None if conditions is None else conditions[rows]
-            part = Batch(batch.latents[rows], embeddings[rows], images, num_frames)
+            part = Batch(batch.latents[rows], embeddings[rows], images, num_frames, batch.shared_noise)
             with torch.no_grad():
                 loss = denoising_loss(denoiser, schedule, part, generator_for(seed, start))
             total += float(loss) * len(part.latents)

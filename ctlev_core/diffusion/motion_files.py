@@ -18,10 +18,17 @@ _SETTINGS_FILE = "ctlev_motion.json"
 
 
 class MotionSettings(NamedTuple):
-    """What the layers learnt: frames that attend to one another at most, and the time from one to the next."""
+    """What the layers learnt.
+
+    Attributes:
+        context: frames that attend to one another at most.
+        interval_us: from one frame to the next.
+        shared_noise: share of the noise's variance that the frames of a stretch have in common.
+    """
 
     context: int
     interval_us: int
+    shared_noise: float
 
 
 def has_motion_layers(checkpoint: Path) -> bool:
@@ -49,4 +56,7 @@ def read_settings(checkpoint: Path) -> MotionSettings:
         if type(value) is not int or value < 1 or (most is not None and value > most):
             upper = "" if most is None else f" to {most}"
             raise DataError(f"{path}: {name} must be a whole number from 1{upper}, got {value!r}")
-    return MotionSettings(found["context"], found["interval_us"])
+    share = found.get("shared_noise")
+    if type(share) not in (int, float) or not 0 <= share < 1:
+        raise DataError(f"{path}: shared_noise must be a number from 0 to below 1, got {share!r}")
+    return MotionSettings(found["context"], found["interval_us"], float(share))

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.compilation import SAMPLING_PASSES, compiler_works, pays
-from ctlev_core.diffusion.denoising import Denoiser
+from ctlev_core.diffusion.denoising import Denoiser, generator_for, mix_noise
 from ctlev_core.diffusion.motion_layers import load_motion_layers
 from ctlev_core.diffusion.pretrained.adapters import ADAPTER_FILE, WEIGHTS_FILE
 from ctlev_core.diffusion.pretrained.loading import (
@@ -51,8 +51,8 @@ from data_contracts.labels import Conditions
 
 logger = logging.getLogger(__name__)
 
-VALUE_STREAM = 1
-"""Entropy that keeps the values drawn apart from the noise of the same seed."""
+VALUE_STREAM, SHARED_STREAM = 1, 2
+"""Entropy that keeps the values drawn, and the noise of a stretch, apart from the noise of the same seed."""
 SHARDS_A_PROCESS = 4
 """Fewer are sampled before another process has started, which takes some ten seconds of imports."""
 
@@ -87,8 +87,10 @@ def sample_latents(
     streams = [torch.Generator().manual_seed(int(seed)) for seed in seeds]
     side = base_model.unet.config.sample_size
     shape = (base_model.unet.config.in_channels, side, side)
-    state = torch.stack([torch.randn(shape, generator=stream) for stream in streams]).to(device)
-    state = state * scheduler.init_noise_sigma
+    state = torch.stack([torch.randn(shape, generator=stream) for stream in streams])
+    if lengths is not None and base_model.motion is not None:
+        state = mix_noise(state, _noise_of_stretches(shape, seeds, lengths), base_model.motion.settings.shared_noise)
+    state = state.to(device) * scheduler.init_noise_sigma
     further = {"generator": streams} if options.scheduler in STOCHASTIC else {}
     motion = contextlib.nullcontext() if base_model.motion is None else base_model.motion.of(lengths)
     with guided_predictions(base_model, embeddings, empty_embedding, conditions, options) as predict, motion:
@@ -101,6 +103,13 @@ def sample_latents(
             "float16 overflows beyond 65504, bfloat16 and float32 do not"
         )
     return state
+
+
+def _noise_of_stretches(shape: Sequence[int], seeds: Sequence[int], lengths: Sequence[int]) -> Tensor:
+    """Noise [B, C, h, w] that is the same for all frames of a stretch, from the seed of its first."""
+    firsts = np.cumsum([0, *lengths[:-1]]).tolist()
+    noise = [torch.randn(tuple(shape), generator=generator_for(int(seeds[row]), SHARED_STREAM)) for row in firsts]
+    return torch.stack(noise).repeat_interleave(torch.tensor(list(lengths)), 0)
 
 
 @contextmanager

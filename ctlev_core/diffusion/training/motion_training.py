@@ -1,7 +1,8 @@
 """Train motion layers in a fine-tuned image generator: nothing else learns, so that each frame stays as good as it was.
 
 Source: Guo et al., AnimateDiff, ICLR 2024. Differences: the layers learn from event frames of the same camera as the
-generator, all frames of a stretch are equally noisy at a time, and the generator's ControlNet steers each of them.
+generator, all frames of a stretch are equally noisy at a time and share some of their noise, and the generator's
+ControlNet steers each of them.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def train_motion_layers(
     check_training_data(frames, conditions, base_model.image_size)
     state = int(np.random.SeedSequence([seed, WEIGHT_STREAM]).generate_state(1)[0])
     adapter = new_adapter(base_model.unet, state).train()
-    layers = MotionLayers(base_model.unet, adapter, MotionSettings(options.context, interval_us))
+    layers = MotionLayers(base_model.unet, adapter, MotionSettings(options.context, interval_us, options.shared_noise))
     cache = cache_latents(base_model, frames, conditions, folder=work)
     check_cache(cache, conditions)
     base_model.text_encoder.to("cpu")
@@ -85,7 +86,8 @@ def train_motion_layers(
 
     def batch_of(starts: np.ndarray, *entropy: int) -> Batch:
         rows = (starts[:, None] + np.arange(options.context)).ravel()
-        return replace(cache.batch(rows, generator_for(seed, *entropy), 0.0, device), num_frames=options.context)
+        batch = cache.batch(rows, generator_for(seed, *entropy), 0.0, device)
+        return replace(batch, num_frames=options.context, shared_noise=options.shared_noise)
 
     def fetch(number: int) -> Batch:
         starts = learnt[sample_rows(seed, number, options.stretches_at_a_time, len(learnt))]

@@ -204,6 +204,13 @@ class MotionOptions(TrainingOptions):
     context: int = Field(
         default=16, ge=2, le=32, description="consecutive frames that are made from one another; 16 as AnimateDiff's"
     )
+    shared_noise: float = Field(
+        default=0.5,
+        ge=0,
+        lt=1,
+        description="share of the noise's variance that the frames of a stretch have in common, in training and in "
+        "sampling: what does not change from frame to frame then begins alike",
+    )
     num_steps: int = Field(default=600, gt=0, description="optimiser steps")
     batch_size: int = Field(default=32, gt=0, description="frames in memory at a time, as whole stretches")
     learning_rate: float = Field(default=1e-3, gt=0, description="peak")

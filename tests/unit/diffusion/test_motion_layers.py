@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_base_model import SIDE, make_base_model, make_data
 
+from ctlev_core.diffusion.denoising import mix_noise
 from ctlev_core.diffusion.motion_files import MotionSettings, has_motion_layers, read_settings
 from ctlev_core.diffusion.motion_layers import (
     MotionLayers,
@@ -33,7 +34,7 @@ from ctlev_core.generators import controlnet
 from ctlev_core.supervised.checkpoints import read_training_state
 from data_contracts.errors import DataError
 
-SETTINGS = MotionSettings(context=4, interval_us=20_000)
+SETTINGS = MotionSettings(context=4, interval_us=20_000, shared_noise=0.0)
 FAST = SamplingOptions(num_inference_steps=3, batch_size=8, black_threshold=0)
 COUNT, LENGTH = 24, 6
 
@@ -178,8 +179,11 @@ def test_damaged_files_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"block_out_channels must be \(32, 32\) for this U-Net, got \[32, 64\]"):
         load_motion_layers(tmp_path, make_base_model().unet)
     settings = tmp_path / "motion_adapter" / "ctlev_motion.json"
-    settings.write_text(json.dumps({"context": 64, "interval_us": 1}))
+    settings.write_text(json.dumps({"context": 64, "interval_us": 1, "shared_noise": 0}))
     with pytest.raises(DataError, match="context must be a whole number from 1 to 32, got 64"):
+        load_motion_layers(tmp_path, make_unet())
+    settings.write_text(json.dumps({"context": 4, "interval_us": 1, "shared_noise": 1}))
+    with pytest.raises(DataError, match="shared_noise must be a number from 0 to below 1, got 1"):
         load_motion_layers(tmp_path, make_unet())
     settings.unlink()
     with pytest.raises(DataError, match=r"ctlev_motion\.json"):
@@ -341,6 +345,22 @@ def test_without_stretches_frames_are_those_of_the_image_generator(tmp_path, che
     expected = sample(checkpoint, tmp_path / "a", single, seeds)
     assert np.array_equal(sample(with_motion, tmp_path / "b", single, seeds), expected)
     assert not np.array_equal(sample(with_motion, tmp_path / "c", conditions, seeds), expected)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_frames_of_a_stretch_share_noise(share):
+    """Each value stays standard normal; those of one stretch are correlated by the share, others not at all."""
+    noise = []
+    for seed in range(40):
+        seeds = [100 * seed + row for row in range(6)]
+        stretches = sampling._noise_of_stretches((4, 8, 8), seeds, [4, 2])
+        own = torch.stack([torch.randn(4, 8, 8, generator=torch.Generator().manual_seed(each)) for each in seeds])
+        noise.append(mix_noise(own, stretches, share).flatten(1))
+    values = torch.stack(noise, dim=1).flatten(1)
+    correlations = torch.corrcoef(values)
+    expected = torch.block_diag(torch.full((4, 4), share), torch.full((2, 2), share)).fill_diagonal_(1.0)
+    assert (correlations - expected).abs().max() < 0.05  # 10,240 pairs of values each: sd .01
+    assert (values.var(dim=1) - 1).abs().max() < 0.06
 
 
 def test_a_trajectory_is_that_of_the_motion_model_of_diffusers():
