@@ -21,7 +21,7 @@ from pydantic import Field
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.supervised.augmentation import draw_flips, draw_shifts
-from ctlev_core.supervised.frame_sequences import find_sequences, find_training_sequences
+from ctlev_core.supervised.frame_sequences import ages_in, find_sequences, find_training_sequences
 from ctlev_core.supervised.image_shifts import shift_images
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import ADDED_LATER, RUN_SETTING, cache_material
@@ -176,7 +176,7 @@ def train_sequences(
                 images, points, seen = _flip_half(images, points, seen, mirror, sequence, generator)
         inside = seen & _inside(points, frames.shape[1:3])
         with models.mixed_precision(options, device):
-            heatmaps = model(_to_input(torch.from_numpy(images).to(device)), torch.from_numpy(lengths))
+            heatmaps = model(_to_input(torch.from_numpy(images).to(device)), torch.from_numpy(ages_in(lengths)))
         points_tensor = torch.from_numpy(np.where(inside[..., None], points, 0).astype(np.float32)).to(device)
         return _heatmap_loss(heatmaps.float(), points_tensor, torch.from_numpy(inside).to(device), options)
 
@@ -241,12 +241,13 @@ def predict_sequences(model: Path, frames: Images, recordings: Sequence[str]) ->
     sequences = find_sequences(len(frames), options.sequence_length, recordings)
 
     def joints(rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        chosen, lengths, places = sequences.joined_ending_at(rows.cpu().numpy())
-        first = chosen.min()
-        images = torch.from_numpy(frames[first : chosen.max() + 1]).to(rows.device)
+        chosen, lengths = (torch.from_numpy(array) for array in sequences.ending_at(rows.cpu().numpy()))
+        # Sequences of rows that follow one another overlap: their frames are one stretch.
+        start, stop = int(chosen.min()), int(chosen.max()) + 1
+        images = torch.from_numpy(frames[start:stop]).to(rows.device)
         features = network.features(_to_input(images.amax(dim=-1)))
-        known = network.over_time(features[chosen - first], torch.from_numpy(lengths))
-        return _decode(network.heatmaps(known[places], frames.shape[1:3]), options)
+        firsts = rows.cpu() - lengths + 1 - start
+        return _decode(network.heatmaps(network.over_time(features, firsts, lengths), frames.shape[1:3]), options)
 
     batches = models.predict_in_batches(network, joints, np.arange(len(frames)))
     joints2d = [points.cpu().numpy() for points, _ in batches] or [np.zeros((0, config["num_joints"], 2), np.float32)]

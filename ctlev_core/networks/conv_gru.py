@@ -33,26 +33,29 @@ class ConvGRU(nn.Module):
             self.of_features.bias.zero_()  # pyright: ignore[reportOptionalMemberAccess]
             self.new_of_state.weight.zero_()
 
-    def forward(self, features: torch.Tensor, lengths: torch.Tensor) -> torch.Tensor:
-        """The state [M, C, H, W] at each frame.
+    def forward(self, features: torch.Tensor, firsts: torch.Tensor, lengths: torch.Tensor) -> torch.Tensor:
+        """The states [S, C, H, W] at the end of S sequences; those that begin with the same frame are run as one.
 
         Args:
-            features: [M, C, H, W] of S sequences, one after the other.
-            lengths: [S] of the sequences, at least 1 each; on the CPU, int64.
+            features: [N, C, H, W] of frames.
+            firsts: [S] int64, on the CPU: the first frame of each sequence, which the others follow in `features`.
+            lengths: [S] int64, on the CPU: frames of each, at least 1.
         """
-        # The longest first: those that have a frame `moment` are the first so many, and none is filled up.
-        order = lengths.argsort(descending=True, stable=True)
-        firsts = (lengths.cumsum(0) - lengths)[order]
-        alive = [int((lengths > moment).sum()) for moment in range(int(lengths.max()))]
+        begins, run = firsts.unique(return_inverse=True)
+        longest = torch.zeros_like(begins).scatter_reduce(0, run, lengths, "amax")
+        # The longest first: those that go on are then the first so many.
+        order = longest.argsort(descending=True, stable=True)
+        begins, longest, run = begins[order], longest[order], order.argsort()[run]
         of_features = self.of_features(features)
-        state = torch.zeros_like(features[: len(lengths)])
-        rows, states = [], []
-        for moment, count in enumerate(alive):
-            now = firsts[:count] + moment
-            state = self._step(of_features[now.to(features.device)], state[:count])
-            rows.append(now)
-            states.append(state)
-        return torch.cat(states)[torch.cat(rows).argsort().to(features.device)]
+        state = torch.zeros_like(features[: len(begins)])
+        states, ends = [], []
+        for moment in range(int(longest[0])):
+            going_on = int((longest > moment).sum())
+            state = self._step(of_features[begins[:going_on] + moment], state[:going_on])
+            ending = (lengths == moment + 1).nonzero()[:, 0]
+            states.append(state[run[ending]])
+            ends.append(ending)
+        return torch.cat(states)[torch.cat(ends).argsort()]
 
     def _step(self, of_features: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
         """The next state, from the convolved features [S, 3C, H, W] of a frame and the state before it."""

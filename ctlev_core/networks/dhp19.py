@@ -111,35 +111,33 @@ class DHP19Network(nn.Module):
             functional.pad(images, (0, -width % DOWNSAMPLING, 0, -height % DOWNSAMPLING))
         )
 
-    def over_time(self, features: torch.Tensor, lengths: torch.Tensor) -> torch.Tensor:
-        """Feature maps that know the earlier ones of their sequence.
+    def over_time(self, features: torch.Tensor, firsts: torch.Tensor, lengths: torch.Tensor) -> torch.Tensor:
+        """Feature maps [S, C, H, W] of the last frames of S sequences, which know the earlier ones.
 
-        Args:
-            features: [M, C, H, W] of S sequences, one after the other.
-            lengths: [S] of the sequences, at least 1 each, on the CPU.
-        Returns:
-            [M, C, H, W]; the features themselves without a recurrent unit.
+        Arguments as in `ConvGRU.forward`; without a recurrent unit the feature maps of the last frames themselves.
         """
-        return features if self.recurrent is None else features + self.recurrent(features, lengths)
+        last = features[firsts + lengths - 1]
+        return last if self.recurrent is None else last + self.recurrent(features, firsts, lengths)
 
     def heatmaps(self, features: torch.Tensor, image_size: tuple[int, int]) -> torch.Tensor:
         """Heatmaps as `forward` gives them, of feature maps of images of (height, width)."""
         height, width = (-(-side // self.output_stride) for side in image_size)
         return self.layers[self.encoder_depth :](features)[..., :height, :width]
 
-    def forward(self, images: torch.Tensor, lengths: torch.Tensor | None = None) -> torch.Tensor:
+    def forward(self, images: torch.Tensor, ages: torch.Tensor | None = None) -> torch.Tensor:
         """One heatmap a joint.
 
         Args:
-            images: [M, 1, H, W] in [0, 1] of S sequences, one after the other.
-            lengths: [S] of the sequences, on the CPU; None = each image is a sequence of its own.
+            images: [N, 1, H, W] in [0, 1], those of a sequence one after another.
+            ages: [N] int64, on the CPU: how many images of its sequence are before each; None = none.
         Returns:
-            [M, J, ceil(H / output_stride), ceil(W / output_stride)].
+            [N, J, ceil(H / output_stride), ceil(W / output_stride)].
         """
-        if lengths is None:
-            lengths = torch.ones(len(images), dtype=torch.int64)
-        height, width = images.shape[-2:]
-        return self.heatmaps(self.over_time(self.features(images), lengths), (height, width))
+        features, (height, width) = self.features(images), images.shape[-2:]
+        if self.recurrent is not None:
+            ages = torch.zeros(len(images), dtype=torch.int64) if ages is None else ages
+            features = self.over_time(features, torch.arange(len(images)) - ages, ages + 1)
+        return self.heatmaps(features, (height, width))
 
 
 def load_published(network: DHP19Network, path: Path) -> None:

@@ -34,25 +34,13 @@ class FrameSequences:
         Returns:
             Rows [M] of the sequences, one sequence after the other, and the lengths [S] of the sequences.
         """
-        lengths = self._lengths(rows)
-        return _stretches(rows - lengths + 1, lengths), lengths
+        lengths = np.minimum(rows - self.starts[rows] + 1, self.length)
+        return np.repeat(rows - lengths + 1, lengths) + ages_in(lengths), lengths
 
-    def joined_ending_at(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The sequences of some rows, those that begin with the same row as one: all but the longest are parts of it.
 
-        Args:
-            rows: [S] last rows, in any order.
-        Returns:
-            Rows [M] and lengths as `ending_at` gives them, but of fewer sequences, and where [S] in M each of `rows` is.
-        """
-        lengths = self._lengths(rows)
-        firsts, number = np.unique(rows - lengths + 1, return_inverse=True)
-        longest = np.zeros(len(firsts), np.int64)
-        np.maximum.at(longest, number, lengths)
-        return _stretches(firsts, longest), longest, (np.cumsum(longest) - longest)[number] + lengths - 1
-
-    def _lengths(self, rows: np.ndarray) -> np.ndarray:
-        return np.minimum(rows - self.starts[rows] + 1, self.length)
+def ages_in(lengths: np.ndarray) -> np.ndarray:
+    """How many frames of its sequence are before each, [M], of sequences of the lengths [S], one after the other."""
+    return np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
 def find_sequences(count: int, length: int, *names: Sequence[object]) -> FrameSequences:
@@ -91,12 +79,6 @@ def find_training_sequences(
     """
     sets = [number for number, size in enumerate(parts) for _ in range(size)]
     return find_sequences(count, length, recordings, *[names for names in (groups, sets) if names])
-
-
-def _stretches(firsts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Rows [M] of stretches, one after the other, by their first rows [S] and lengths [S]."""
-    within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    return np.repeat(firsts, lengths) + within
 
 
 def name_recordings(manifest: Manifest, rows: np.ndarray) -> list[str]:
