@@ -66,10 +66,11 @@ class Amounts:
         return self._rows[key]
 
     def work(self, key: str) -> float:
-        """Steps times batch of a training, frames times steps of a sampling, rows elsewhere."""
+        """Steps times frames of a batch of a training, frames times steps of a sampling, rows elsewhere."""
         numbers = dict(_numbers(self._stages[key].arguments)) if key in self._stages else {}
         if "num_steps" in numbers:
-            return math.prod(numbers.get(name, 1.0) for name in ("num_steps", "batch_size", "gradient_accumulation"))
+            factors = "num_steps", "batch_size", "sequence_length", "gradient_accumulation"
+            return math.prod(numbers.get(name, 1.0) for name in factors)
         guided = 2.0 if numbers.get("guidance_scale", 1.0) > 1 else 1.0
         return self.rows(key).total * numbers.get("num_inference_steps", 1.0) * guided
 

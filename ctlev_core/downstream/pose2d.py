@@ -1,8 +1,12 @@
-"""2D human pose from one event image: DHP19's heatmap network.
+"""2D human pose from event images: DHP19's heatmap network, which sees one, or several with `sequence_length`.
 
 Source: Calabrese et al., DHP19, CVPR Workshops 2019 (network, targets, mean square loss, argmax decoding). The
 defaults are DHP19's. Batch normalisation, the cross-entropy loss and sub-pixel decoding are ours and train far faster
 from scratch; AdamW takes the place of RMSprop, and targets sit at the joint rather than at its pixel.
+
+With `sequence_length` a convolutional gated recurrent unit (Ballas et al., ICLR 2016) lies where the feature maps are
+smallest. Sequences are what `smpl_regressor` makes of frames: in training every frame is the last of one, and the loss
+is the mean over all frames of the sequences; in prediction every frame is again the last of its own sequence.
 """
 
 from __future__ import annotations
@@ -16,9 +20,11 @@ import numpy as np
 from pydantic import Field
 
 from ctlev_core.geometry.joint_sets import JOINT_SETS
+from ctlev_core.supervised.augmentation import draw_flips, draw_shifts
+from ctlev_core.supervised.frame_sequences import ages_in, find_sequences, find_training_sequences
 from ctlev_core.supervised.image_shifts import shift_images
 from ctlev_core.supervised.options import SupervisedOptions
-from data_contracts.config import RUN_SETTING, cache_material
+from data_contracts.config import ADDED_LATER, RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels, check_labels
@@ -63,6 +69,13 @@ class Options(SupervisedOptions):
     shift_px: int = Field(
         default=0, ge=0, description="move training images by up to so many px in x and y; black moves in"
     )
+    sequence_length: int = Field(
+        default=1,
+        ge=1,
+        json_schema_extra=ADDED_LATER,
+        description="frames of a recording, one after another, that a recurrent unit looks back over; batch_size then "
+        "counts sequences; 1 = no such unit",
+    )
 
 
 def input_files(options: Options) -> list[Path]:
@@ -95,21 +108,43 @@ def train(
     parts: Sequence[int] = (),
     groups: Sequence[str] = (),
 ) -> History:
+    """`train_sequences` on frames that follow from no others: each is a recording of its own."""
+    return train_sequences(
+        frames, labels, options, seed=seed, out=out, work=work, parts=parts, groups=groups, recordings=()
+    )
+
+
+def train_sequences(
+    frames: Images,
+    labels: Labels,
+    options: Options,
+    *,
+    seed: int,
+    out: Path,
+    work: Path,
+    parts: Sequence[int],
+    groups: Sequence[str],
+    recordings: Sequence[str],
+) -> History:
     """Train on labelled frames and write `model.safetensors` and `config.json` to `out`.
 
     Args:
-        frames: [N, H, W, 3] uint8; the network sees the largest of the three channels.
+        frames: [N, H, W, 3] uint8, those of a recording in time order; the network sees the largest of the three
+            channels.
         labels: N rows with `joints2d` in image px; joints that are not visible or outside the image carry no loss.
         options: see `Options`.
         seed: of the initial weights, the order of the samples and the augmentation.
         out: model folder.
         work: folder of the resumable state.
         parts: rows of each training set, in order; empty = one set.
-        groups: N subjects or recordings, held back whole for validation; empty = each row is its own.
+        groups: N subjects or recordings, held back whole for validation; empty = the recordings.
+        recordings: N names; no sequence crosses from one recording, group or training set to the next. Empty = each
+            frame is a recording of its own.
     Returns:
         The training loss per logged step, and the loss of rows held back.
     Raises:
         DataError: shapes disagree, no joint of any row is visible inside the image, or the weights do not fit.
+        ValueError: `parts`, `groups` or `recordings` do not fit the number of rows.
     """
     from ctlev_core.networks.dhp19 import load_published
     from ctlev_core.supervised import models
@@ -118,7 +153,10 @@ def train(
 
     joints2d, visible = _check_training_set(frames, labels, options)
     weights = models.file_digests(input_files(options))
-    rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups)
+    rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups or recordings)
+    sequences = find_training_sequences(
+        len(frames), options.sequence_length, recordings=recordings, groups=groups, parts=parts
+    )
     device = models.resolve_device(options.device)
     model: Any = models.build_seeded(lambda: _build(joints2d.shape[1], options), seed)
     if options.weights:
@@ -129,17 +167,22 @@ def train(
     def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
         import torch
 
-        images, points, seen = _grey(frames[rows]), joints2d[rows], visible[rows]
+        chosen, lengths = sequences.ending_at(rows)
+        images, points, seen = _grey(frames[chosen]), joints2d[chosen], visible[chosen]
         if generator is not None:
-            images, points = _shift(images, points, options.shift_px, generator)
+            sequence = np.repeat(np.arange(len(rows)), lengths)
+            images, points = _shift(images, points, options.shift_px, sequence, generator)
             if mirror is not None:
-                images, points, seen = _flip_half(images, points, seen, mirror, generator)
+                images, points, seen = _flip_half(images, points, seen, mirror, sequence, generator)
         inside = seen & _inside(points, frames.shape[1:3])
         with models.mixed_precision(options, device):
-            heatmaps = model(_to_input(torch.from_numpy(images).to(device)))
+            heatmaps = model(_to_input(torch.from_numpy(images).to(device)), torch.from_numpy(ages_in(lengths)))
         points_tensor = torch.from_numpy(np.where(inside[..., None], points, 0).astype(np.float32)).to(device)
         return _heatmap_loss(heatmaps.float(), points_tensor, torch.from_numpy(inside).to(device), options)
 
+    identity = [NAME, VERSION, cache_material(options), weights, seed, frames, joints2d, visible]
+    if options.sequence_length > 1:
+        identity.append(sequences.starts)
     history, record = train_model(
         model,
         compute_loss,
@@ -147,7 +190,7 @@ def train(
         options,
         seed=seed,
         work=work,
-        run_digest=models.digest(NAME, VERSION, cache_material(options), weights, seed, frames, joints2d, visible),
+        run_digest=models.digest(*identity),
         description="train pose2d",
     )
     models.write_model(
@@ -167,15 +210,26 @@ def train(
 
 
 def predict(model: Path, frames: Images) -> Mapping[str, np.ndarray]:
-    """Joints of each frame.
+    """`predict_sequences` of frames that follow from no others: each is a recording of its own."""
+    return predict_sequences(model, frames, ())
+
+
+def predict_sequences(model: Path, frames: Images, recordings: Sequence[str]) -> Mapping[str, np.ndarray]:
+    """Joints of each frame, from it and, with `sequence_length`, the frames of its recording just before it.
 
     Args:
         model: folder written by `train`.
-        frames: [N, H, W, 3] uint8, of the scale the model was trained on.
+        frames: [N, H, W, 3] uint8, of the scale the model was trained on, those of a recording in time order.
+        recordings: N names; empty = each frame is a recording of its own.
     Returns:
         `joints2d` [N, J, 2] float32, px, pixel centres at integer + 0.5, and `confidence` [N, J] float32, the highest
         value of the heatmap (of its softmax with the cross-entropy loss).
+    Raises:
+        DataError: the folder has no such model, or frames are no images.
+        ValueError: `recordings` do not fit the number of frames.
     """
+    import torch
+
     from ctlev_core.supervised import models
 
     models.check_frames(frames, "predict pose2d")
@@ -184,9 +238,18 @@ def predict(model: Path, frames: Images) -> Mapping[str, np.ndarray]:
     network = _build(config["num_joints"], options)
     models.read_weights(model, network)
     network.to(models.resolve_device("auto"))
-    batches = models.predict_in_batches(
-        network, lambda images: _decode(network(_to_input(images.amax(dim=-1))), options), frames
-    )
+    sequences = find_sequences(len(frames), options.sequence_length, recordings)
+
+    def joints(rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        chosen, lengths = (torch.from_numpy(array) for array in sequences.ending_at(rows.cpu().numpy()))
+        # Sequences of rows that follow one another overlap: their frames are one stretch.
+        start, stop = int(chosen.min()), int(chosen.max()) + 1
+        images = torch.from_numpy(frames[start:stop]).to(rows.device)
+        features = network.features(_to_input(images.amax(dim=-1)))
+        firsts = rows.cpu() - lengths + 1 - start
+        return _decode(network.heatmaps(network.over_time(features, firsts, lengths), frames.shape[1:3]), options)
+
+    batches = models.predict_in_batches(network, joints, np.arange(len(frames)))
     joints2d = [points.cpu().numpy() for points, _ in batches] or [np.zeros((0, config["num_joints"], 2), np.float32)]
     confidence = [values.cpu().numpy() for _, values in batches] or [np.zeros((0, config["num_joints"]), np.float32)]
     return {"joints2d": np.concatenate(joints2d), "confidence": np.concatenate(confidence)}
@@ -213,7 +276,8 @@ def _check_training_set(frames: Images, labels: Labels, options: Options) -> tup
 def _build(num_joints: int, options: Options) -> Any:
     from ctlev_core.networks.dhp19 import DHP19Network
 
-    return DHP19Network(num_joints, options.width, options.batch_norm, options.output_stride)
+    recurrent = options.sequence_length > 1
+    return DHP19Network(num_joints, options.width, options.batch_norm, options.output_stride, recurrent)
 
 
 def _grey(frames: np.ndarray) -> np.ndarray:
@@ -233,12 +297,12 @@ def _inside(points: np.ndarray, image_shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _shift(
-    images: np.ndarray, points: np.ndarray, shift_px: int, generator: np.random.Generator
+    images: np.ndarray, points: np.ndarray, shift_px: int, sequence: np.ndarray, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shift each image [B, H, W] and its points [B, J, 2] by its own whole number of px."""
+    """Shift the images [B, H, W] and points [B, J, 2] of each sequence by its own whole number of px."""
     if not shift_px:
         return images, points
-    shifts = generator.integers(-shift_px, shift_px + 1, size=(len(images), 2))
+    shifts = draw_shifts(shift_px, sequence, generator)
     return shift_images(images, shifts), points + shifts[:, None].astype(points.dtype)
 
 
@@ -247,10 +311,11 @@ def _flip_half(
     points: np.ndarray,
     visible: np.ndarray,
     mirror: tuple[int, ...],
+    sequence: np.ndarray,
     generator: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mirror each image with probability one half; the left elbow of a mirrored person is their right one."""
-    flip = generator.random(len(images)) < 0.5
+    """Mirror each sequence with probability one half; the left elbow of a mirrored person is their right one."""
+    flip = draw_flips(sequence, generator)
     mirrored = points[:, mirror] * np.array([-1, 1], points.dtype) + np.array([images.shape[2], 0], points.dtype)
     return (
         np.where(flip[:, None, None], images[:, :, ::-1], images),

@@ -25,7 +25,7 @@ from ctlev_core.body.smpl_files import given_body_file
 from ctlev_core.geometry.joint_sets import joint_indices
 from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
 from ctlev_core.supervised.augmentation import BodySamples, mirror_half, shift
-from ctlev_core.supervised.frame_sequences import find_sequences
+from ctlev_core.supervised.frame_sequences import find_sequences, find_training_sequences
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.config import ADDED_LATER, RUN_SETTING, cache_material
 from data_contracts.errors import DataError
@@ -157,9 +157,9 @@ def train_sequences(
     check_batch(options.batch_size, frames.shape[1], frames.shape[2], f"train {NAME}")
     weights = models.file_digests(input_files(options))
     rows = plan_rows(len(frames), options, seed=seed, parts=parts, groups=groups or recordings)
-    sets = [number for number, size in enumerate(parts) for _ in range(size)]
-    apart = [names for names in (groups, sets) if names]
-    sequences = find_sequences(len(frames), options.sequence_length, recordings, *apart)
+    sequences = find_training_sequences(
+        len(frames), options.sequence_length, recordings=recordings, groups=groups, parts=parts
+    )
     device = models.resolve_device(options.device)
     model: Any = models.build_seeded(lambda: _build(options), seed)
     if options.weights:

@@ -1,4 +1,4 @@
-"""Training samples of body regressors, and how they are varied: mirrored and moved together with their bodies.
+"""How training samples are varied, and those of body regressors: mirrored and moved together with their bodies.
 
 Frames of one sequence are all varied alike, so that they still follow from one another.
 """
@@ -32,6 +32,21 @@ class BodySamples(NamedTuple):
     intrinsics: np.ndarray
 
 
+def draw_flips(sequence: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Which frames [N] to mirror: those of every other sequence, by chance.
+
+    Args:
+        sequence: [N] number of the sequence of each frame, from 0 and without gaps.
+        generator: of the choice.
+    """
+    return (generator.random(_count(sequence)) < 0.5)[sequence]
+
+
+def draw_shifts(shift_px: int, sequence: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """How far to move each frame, [N, 2] whole px in x and y of up to `shift_px` either way; arguments as above."""
+    return generator.integers(-shift_px, shift_px + 1, size=(_count(sequence), 2))[sequence]
+
+
 def mirror_half(samples: BodySamples, sequence: np.ndarray, generator: np.random.Generator) -> BodySamples:
     """Mirror each sequence with probability one half: x changes sign, left and right change places.
 
@@ -39,10 +54,10 @@ def mirror_half(samples: BodySamples, sequence: np.ndarray, generator: np.random
 
     Args:
         samples: N frames and bodies.
-        sequence: [N] number of the sequence of each, from 0 and without gaps.
+        sequence: as `draw_flips` takes it.
         generator: of the choice.
     """
-    flip = (generator.random(_count(sequence)) < 0.5)[sequence]
+    flip = draw_flips(sequence, generator)
     mirror = np.diag([-1.0, 1.0, 1.0]).astype(np.float32)
     rotations = mirror @ samples.rotations[:, JOINT_SETS["smpl"].mirror] @ mirror
     intrinsics = samples.intrinsics * np.array([1, 1, -1, 1], np.float32)
@@ -66,12 +81,12 @@ def shift(samples: BodySamples, shift_px: int, sequence: np.ndarray, generator: 
     Args:
         samples: N frames and bodies.
         shift_px: at most so many px in x and y, either way.
-        sequence: as `mirror_half` takes it.
+        sequence: as `draw_flips` takes it.
         generator: of the shifts.
     """
     if not shift_px:
         return samples
-    shifts = generator.integers(-shift_px, shift_px + 1, size=(_count(sequence), 2))[sequence]
+    shifts = draw_shifts(shift_px, sequence, generator)
     transl = samples.transl.copy()
     transl[:, :2] += samples.transl[:, 2:] * shifts.astype(np.float32) / samples.intrinsics[:, :2]
     return samples._replace(frames=shift_images(np.asarray(samples.frames), shifts), transl=transl)

@@ -41,8 +41,12 @@ class FrameSequences:
             Rows [M] of the sequences, one sequence after the other, and the lengths [S] of the sequences.
         """
         lengths = np.minimum(rows - self.starts[rows] + 1, self.length)
-        within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-        return np.repeat(rows - lengths + 1, lengths) + within, lengths
+        return np.repeat(rows - lengths + 1, lengths) + ages_in(lengths), lengths
+
+
+def ages_in(lengths: np.ndarray) -> np.ndarray:
+    """How many frames of its sequence are before each, [M], of sequences of the lengths [S], one after the other."""
+    return np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
 def find_sequences(count: int, length: int, *names: Sequence[object]) -> FrameSequences:
@@ -63,6 +67,24 @@ def find_sequences(count: int, length: int, *names: Sequence[object]) -> FrameSe
         own = np.asarray(each) if len(each) else rows
         begins[1:] |= own[1:] != own[:-1]
     return FrameSequences(np.maximum.accumulate(np.where(begins, rows, 0)), length)
+
+
+def find_training_sequences(
+    count: int, length: int, *, recordings: Sequence[str], groups: Sequence[str], parts: Sequence[int]
+) -> FrameSequences:
+    """Sequences that cross from no recording, group or training set to the next.
+
+    Args:
+        count: N, rows in all.
+        length: rows of a full sequence.
+        recordings: N names; empty = each row is a recording of its own.
+        groups: N names of what is held back whole; empty = the recordings.
+        parts: rows of each training set, in order; empty = one set.
+    Raises:
+        ValueError: one of them does not fit the number of rows.
+    """
+    sets = [number for number, size in enumerate(parts) for _ in range(size)]
+    return find_sequences(count, length, recordings, *[names for names in (groups, sets) if names])
 
 
 def stretch_lengths(names: Sequence[object]) -> list[int]:

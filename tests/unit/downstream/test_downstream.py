@@ -235,9 +235,11 @@ def test_augmentation_moves_images_and_joints_together():
     points[:, 3] = where + 0.5
     visible = np.ones((64, 13), bool)
     visible[:, 9] = False
-    shifted, shifted_points = pose2d._shift(images, points, 3, generator)
+    shifted, shifted_points = pose2d._shift(images, points, 3, np.arange(64), generator)
     mirror = JOINT_SETS["dhp19"].mirror
-    flipped, flipped_points, flipped_visible = pose2d._flip_half(shifted, shifted_points, visible, mirror, generator)
+    flipped, flipped_points, flipped_visible = pose2d._flip_half(
+        shifted, shifted_points, visible, mirror, np.arange(64), generator
+    )
     was_flipped = flipped_visible[:, 9]
     assert 10 < was_flipped.sum() < 54
     joint = np.where(was_flipped, mirror[3], 3)

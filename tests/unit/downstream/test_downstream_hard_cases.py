@@ -242,15 +242,23 @@ def write_keras(path, change=None):
     return network
 
 
-def test_pose_network_starts_from_the_published_file(tmp_path):
+@pytest.mark.parametrize("sequence_length", [1, 3])
+def test_pose_network_starts_from_the_published_file(tmp_path, sequence_length):
     network = write_keras(tmp_path / "DHP_CNN.h5")
     options = pose2d.Options(
-        weights=tmp_path / "DHP_CNN.h5", num_steps=1, batch_size=1, learning_rate=1e-12, device="cpu"
+        weights=tmp_path / "DHP_CNN.h5",
+        num_steps=1,
+        batch_size=1,
+        learning_rate=1e-12,
+        device="cpu",
+        sequence_length=sequence_length,
     )
     assert pose2d.input_files(options) == [tmp_path / "DHP_CNN.h5"]
     model = train(pose2d, frames_of(2), points(2, 13), options, tmp_path)
-    for name, tensor in load_file(model / "model.safetensors").items():
-        torch.testing.assert_close(tensor, network.state_dict()[name])
+    found = load_file(model / "model.safetensors")
+    for name, tensor in network.state_dict().items():
+        torch.testing.assert_close(found.pop(name), tensor)
+    assert bool(found) == (sequence_length > 1) and all(name.startswith("recurrent.") for name in found)
 
 
 def test_other_weights_than_the_published_ones_are_refused(tmp_path):

@@ -14,7 +14,12 @@ from ctlev_core.networks.resnet_files import ARCHITECTURES
 from ctlev_core.networks.smpl_regressor import SmplRegressor
 from ctlev_core.supervised.augmentation import BodySamples, mirror_half, shift
 from ctlev_core.supervised.batches import TrainingRows
-from ctlev_core.supervised.frame_sequences import find_sequences, name_recordings
+from ctlev_core.supervised.frame_sequences import (
+    ages_in,
+    find_sequences,
+    find_training_sequences,
+    name_recordings,
+)
 from data_contracts.config import cache_material
 from data_contracts.labels import Labels
 
@@ -83,6 +88,22 @@ def test_sequences_cross_no_name_at_all():
     assert find_sequences(0, 9, ()).ending_at(np.zeros(0, np.int64))[0].tolist() == []
     with pytest.raises(ValueError, match="expected names of 3 rows, got 2"):
         find_sequences(3, 9, ["a", "b"])
+
+
+def test_training_sequences_cross_into_no_group_and_no_other_set():
+    def starts(groups, parts):
+        return find_training_sequences(6, 9, recordings=["a"] * 6, groups=groups, parts=parts).starts.tolist()
+
+    assert starts((), ()) == [0] * 6
+    assert starts(["x", "x", "y", "y", "y", "y"], ()) == [0, 0, 2, 2, 2, 2]
+    assert starts((), (4, 2)) == [0, 0, 0, 0, 4, 4]
+    assert starts(["x", "x", "y", "y", "y", "y"], (0, 4, 2)) == [0, 0, 2, 2, 4, 4]
+    with pytest.raises(ValueError, match="expected names of 6 rows, got 5"):
+        starts((), (4, 1))
+
+
+def test_ages_count_the_frames_before():
+    assert ages_in(np.array([3, 1, 2])).tolist() == [0, 1, 2, 0, 0, 1]
 
 
 class Table:

@@ -124,12 +124,15 @@ def test_rows_follow_from_the_recordings(tmp_path):
         planned("condition_samples", "e", poses=ref("a"), frames=ref("c"), count=5, windows={"max_windows": 3}),
         planned("sample", "f", checkpoint=ref("x"), frames=ref("c"), conditions=ref("e"),
                 sampling={"options": {"num_inference_steps": 4}}),
+        planned("train_downstream", "g", training_sets=[ref("c")],
+                downstream={"options": {"num_steps": 7, "batch_size": 4, "sequence_length": 3}}),
     ]  # fmt: skip
     amounts = Amounts({stage.key: stage for stage in stages})
     assert [amounts.rows(key) for key in "abcde"] == [
         Rows(8, 12), Rows(24, 36), Rows(10, 22), Rows(10, 10), Rows(5, 5),
     ]  # fmt: skip
     assert amounts.work("f") == 20 and amounts.image_size("f") == SIZE and amounts.image_size("a") is None
+    assert amounts.work("g") == 7 * 4 * 3
     # What is there already is counted and not guessed.
     known = Amounts({stage.key: stage for stage in stages}, {"b": 18, "d": 6})
     assert known.rows("b") == Rows(12, 18) and known.rows("c") == Rows(10, 16) and known.rows("d") == Rows(6, 6)
