@@ -196,7 +196,7 @@ class Experiment(Frozen):
     metrics: tuple[MetricChoice, ...] = Field(min_length=1)
     feature_extractor: DownstreamChoice | None = None
     distances: tuple[MetricChoice, ...] = Field(
-        (MetricChoice(name="frechet"), MetricChoice(name="kid")),
+        (MetricChoice(name="frechet"), MetricChoice(name="kid"), MetricChoice(name="mmd")),
         min_length=1,
         description="metrics of the features of two sets of frames",
     )
