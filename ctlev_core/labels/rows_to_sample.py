@@ -44,6 +44,7 @@ def choose_rows_to_sample(
     views: View,
     needs_pictures: bool,
     seed: int,
+    chosen: np.ndarray | None = None,
 ) -> LabelledRows:
     """Choose labels to sample from.
 
@@ -70,25 +71,27 @@ def choose_rows_to_sample(
         views: `labelled`, or `new` ones.
         needs_pictures: whether the condition is made of the grey pictures at a window's ends.
         seed: of the choice and the views.
+        chosen: [count] rows of `label_moments`, where they are chosen already.
     Raises:
         DataError: there is nothing to choose from, or no body to see from a new side.
     """
     half_us = half_window_us(frames)
     before_us, after_us = (2 * half_us, 0) if windows.anchor == "labels" else (half_us, half_us)
-    moments = _label_only(poses)
+    moments = label_moments(poses)
     if moments.num_rows:
-        inner = surrounded(moments["recording_id"].to_pylist(), moments["t_us"].to_numpy(), half_us)
-        allowed = np.flatnonzero(inner) if order == "random" else np.arange(moments.num_rows)
-        chosen = moments.take(_choose(moments, allowed, count, order, seed))
-        names, times = chosen["recording_id"].to_pylist(), chosen["t_us"].to_numpy()
+        if chosen is None:
+            allowed = inner_moments(moments, frames) if order == "random" else np.arange(moments.num_rows)
+            chosen = choose_in_turn(moments, allowed, count, order, seed)
+        asked = moments.take(chosen)
+        names, times = asked["recording_id"].to_pylist(), asked["t_us"].to_numpy()
         together = np.arange(count) if order == "random" else np.unique(names, return_inverse=True)[1]
         turned = None if views == "labelled" else together
-        labelled = labels_of(chosen)
+        labelled = labels_of(asked)
         rows = LabelledRows(
             source_ids=[f"{name}:{t}" for name, t in zip(names, times.tolist(), strict=True)],
             recordings=poses,
             recording_ids=names,
-            subjects=chosen["subject"].to_pylist(),
+            subjects=asked["subject"].to_pylist(),
             t_start_us=np.maximum(times - before_us, 0),
             t_end_us=times + after_us,
             labelled=labelled,
@@ -98,7 +101,7 @@ def choose_rows_to_sample(
         raise DataError(f"{poses.ref.path}: the dataset of poses has no recording in split 'condition'")
     else:
         learnt = frames.rows_where(split="train")
-        rows = rows_of_frames(recordings, frames, _choose(frames.table, learnt, count, order, seed))
+        rows = rows_of_frames(recordings, frames, choose_in_turn(frames.table, learnt, count, order, seed))
     if needs_pictures:
         if views == "new":
             raise DataError("conditions of pictures show them as they were; set view to 'labelled'")
@@ -107,19 +110,33 @@ def choose_rows_to_sample(
     return rows
 
 
-def _choose(table: pa.Table, rows: np.ndarray, count: int, order: LabelOrder, seed: int) -> np.ndarray:
-    """`count` of the given rows of a table of labels."""
+def choose_in_turn(table: pa.Table, rows: np.ndarray, count: int, order: LabelOrder, seed: int) -> np.ndarray:
+    """`count` of the given rows of a table of labels: classes and recordings in turn, or evenly spread in time."""
     if order == "in_time":
         return rows[np.sort(np.resize(spread(len(rows), count), count))]
     classes, recordings = (np.array(table[name].to_pylist())[rows].tolist() for name in ("class_name", "recording_id"))
     return rows[balanced_choice(classes, recordings, count, seed)]
 
 
-def _label_only(poses: Manifest) -> pa.Table:
+def label_moments(poses: Manifest) -> pa.Table:
     """Every label moment of the recordings of `poses` in split `condition`, in the order of recordings and times."""
     wanted = np.array(poses.column("recording_id"))[poses.rows_where(splits="condition")]
     table = poses.attached(tables.LABELS)
     return table.filter(pc.is_in(table["recording_id"], pa.array(wanted, pa.string())))
+
+
+def inner_moments(moments: pa.Table, frames: Manifest) -> np.ndarray:
+    """The rows of moments half a window or more from both ends of their recording, where it has others."""
+    names, times = moments["recording_id"].to_pylist(), moments["t_us"].to_numpy()
+    return np.flatnonzero(surrounded(names, times, half_window_us(frames)))
+
+
+def moments_in_image(
+    moments: pa.Table, poses: Manifest, recordings: Manifest, frames: Manifest, encoding: EncodingChoice, seed: int
+) -> Labels:
+    """The labels of moments in image pixels, as their own camera, or a virtual one, sees them."""
+    sensors = _sensors(poses, moments["recording_id"].to_pylist())
+    return _seen(labels_of(moments), sensors, recordings, frames, encoding, None, seed)
 
 
 def _sensors(poses: Manifest, names: list[str]) -> np.ndarray:
