@@ -11,7 +11,7 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 
-@stage(version=22, schema=tables.REPORT, aside=("openings",))
+@stage(version=23, schema=tables.REPORT, aside=("openings",))
 def report(out: Output, made: ReportInputs[Manifest], *, openings: int | None = None) -> pa.Table:
     """Write `report.html`, `tables.tex`, `tables.md`, four tables as Parquet, `provenance.json` and `summary.json`.
 
