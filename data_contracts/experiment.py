@@ -34,6 +34,7 @@ from data_contracts.training_sets import (
 TrainedOn = Literal["recorded", "synthetic", "recorded+synthetic"]
 LabelOrder = Literal["random", "in_time", "stretches"]
 View = Literal["labelled", "new"]
+LabelChoice = Literal["random", "coverage", "hard"]
 NAME_PATTERN = r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$"
 
 
@@ -50,6 +51,9 @@ class Baseline(Frozen):
     sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
     poses: DatasetChoice | None = Field(
         None, description="another dataset whose poses it is asked for; None = those of the experiment"
+    )
+    labels: LabelChoice | None = Field(
+        None, description="which labels it is asked for, as `labels` of the experiment; None = as that"
     )
     part: str | None = Field(
         None,
@@ -125,6 +129,14 @@ class Experiment(Frozen):
     view: View = Field(
         "labelled", description="bodies to sample from as their own camera sees them, or from new, random sides"
     )
+    labels: LabelChoice = Field(
+        "random",
+        json_schema_extra=ADDED_LATER,
+        description="which label-only poses are sampled: random ones, classes and recordings in turn; `coverage`, each "
+        "the farthest from the recorded training poses and those chosen before; or `hard`, of the quarter whose "
+        "nearest recorded poses have the largest errors in a two-fold cross-validation of the downstream model on "
+        "training frames",
+    )
     windows: Windows = Windows()
     evaluate_on: HeldOut = Field(
         "test",
@@ -183,7 +195,7 @@ class Experiment(Frozen):
     scaling: tuple[float, ...] = Field(
         (),
         description="train on recorded frames and these shares of the synthetic ones too, as training sets "
-        "`recorded+S@SHARE`",
+        "`recorded+S@SHARE`; also of baselines that are asked for `labels` of their own",
     )
     keep_fraction: float | None = Field(
         None,
@@ -203,7 +215,7 @@ class Experiment(Frozen):
     metrics: tuple[MetricChoice, ...] = Field(min_length=1)
     feature_extractor: DownstreamChoice | None = None
     distances: tuple[MetricChoice, ...] = Field(
-        (MetricChoice(name="frechet"), MetricChoice(name="kid")),
+        (MetricChoice(name="frechet"), MetricChoice(name="kid"), MetricChoice(name="mmd")),
         min_length=1,
         description="metrics of the features of two sets of frames",
     )
@@ -299,6 +311,27 @@ class Experiment(Frozen):
                 raise ValueError(f"baselines.{name}.part: it is asked for labels of that part; leave out other poses")
         return self
 
+    @model_validator(mode="after")
+    def _chosen_labels_are_poses_of_this_experiment(self) -> Experiment:
+        chosen = {"labels": self.labels} | {f"baselines.{n}.labels": b.labels for n, b in self.baselines.items()}
+        for option, labels in chosen.items():
+            if labels in (None, "random"):
+                continue
+            if self.temporal_order or self.view == "new":
+                raise ValueError(f"{option} {labels!r}: leave out temporal_order, and view 'new'")
+            if self.target is not None:
+                raise ValueError(f"{option} {labels!r} goes by recorded frames of the dataset; leave out target")
+        for name, baseline in self.baselines.items():
+            if baseline.part is not None and self.labels_of(name) != "random":
+                raise ValueError(
+                    f"baselines.{name}.part: its labels are chosen at random, got {self.labels_of(name)!r}"
+                )
+        return self
+
+    def labels_of(self, baseline: str) -> LabelChoice:
+        """Which labels a baseline is asked for."""
+        return self.baselines[baseline].labels or self.labels
+
     @property
     def sampling_choice(self) -> SamplingChoice:
         """The generator's sampling options as a plug-in choice."""
@@ -337,6 +370,7 @@ class Experiment(Frozen):
         makers += [LABEL_CONSISTENT] * (self.keep_fraction is not None) + [ORACLE] * (self.oracle is not None)
         asked = [TrainingSet.parse(name) for name in self.training_sets]
         found = [training_set.with_generator(name) for training_set in asked for name in makers]
-        shares = [TrainingSource(SYNTHETIC, share) for share in sorted(self.scaling)]
+        scaled = [SYNTHETIC, *(name for name, baseline in self.baselines.items() if baseline.labels is not None)]
+        shares = [TrainingSource(name, share) for name in scaled for share in sorted(self.scaling)]
         found += [TrainingSet((TrainingSource(RECORDED), source)) for source in shares]
         return list(dict.fromkeys([*found, *map(TrainingSet.parse, self.mixtures)]))

@@ -59,6 +59,12 @@ class Regeneration(Experiment):
     )
 
     @model_validator(mode="after")
+    def _other_poses_can_be_chosen(self) -> Regeneration:
+        if self.new_poses and self.labels == "coverage":
+            raise ValueError("labels 'coverage' chooses the same poses for every version; set new_poses to false")
+        return self
+
+    @model_validator(mode="after")
     def _distances_can_be_measured(self) -> Regeneration:
         measured = self.feature_extractor is not None and any(choice.name == "frechet" for choice in self.distances)
         if self.gates.max_distance_ratio is not None and not measured:

@@ -177,6 +177,23 @@ CONDITIONS = TableSchema(
         *_LABELS,
     ),
 )
+LABEL_CHOICE = TableSchema(
+    "label_choice",
+    1,
+    None,
+    (
+        Column("moment", pa.int64(), "row among the label moments of the split `condition`", minimum=0),
+        _RECORDING,
+        Column("t_us", pa.int64(), "its time", minimum=0),
+        Column(
+            "value",
+            pa.float64(),
+            "coverage: distance to the nearest pose that is recorded or chosen before, root mean square over joints, "
+            "px; hard: the error to expect",
+        ),
+    ),
+)
+"""Labels to sample from, in the order in which they were chosen."""
 TRAINING = TableSchema(
     "training",
     1,
@@ -365,6 +382,7 @@ _ALL = (
     LATENTS,
     SYNTHETIC,
     EVENT_STREAMS,
+    LABEL_CHOICE,
     SCORES,
     SAMPLE_SCORES,
     NEAREST_SEEN,

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 RECORDED, SYNTHETIC, ORACLE, LABEL_CONSISTENT = "recorded", "synthetic", "oracle", "label_consistent"
 SOURCES = (RECORDED, SYNTHETIC, ORACLE, LABEL_CONSISTENT)
 """Sources that are not a baseline's name."""
+HELD_OUT = "held-out recorded"
+"""Subject of scores of the recorded frames that nothing was learnt from: the floor of those of generated frames."""
 
 _SOURCE = re.compile(r"([A-Za-z0-9_-]+)(?:@([0-9.]+(?:e-?\d+)?))?")
 _AGREEMENT = re.compile(r"(shuffled )?label agreement of (.+)")

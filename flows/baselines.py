@@ -53,7 +53,15 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
     poses = dataset.poses
     if baseline.poses is not None:
         poses = ingest(dataset=baseline.poses, label=f"{baseline.poses.name}, poses of {name}")
-    asked = condition_asked_samples(experiment, poses, dataset.recordings, dataset.frames, baseline.condition, part)
+    asked = condition_asked_samples(
+        experiment,
+        poses,
+        dataset.recordings,
+        dataset.frames,
+        baseline.condition,
+        part,
+        labels=experiment.labels_of(name),
+    )
     if isinstance(plugins.load("generators", baseline.generator.name), EventGenerator):
         synthetic = simulate(
             dataset.recordings,

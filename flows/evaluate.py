@@ -11,6 +11,7 @@ from data_contracts.config import DownstreamChoice, Frozen
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
 from data_contracts.training_sets import (
+    HELD_OUT,
     LABEL_CONSISTENT,
     ORACLE,
     RECORDED,
@@ -166,7 +167,7 @@ def _distances(
         [dataset.frames], downstream=feature_extractor, seed=experiment.seed, label="feature extractor"
     )
     frames = dataset.tested_frames
-    compared = [(frames, experiment.evaluate_on, "held-out recorded", 0)]
+    compared = [(frames, experiment.evaluate_on, HELD_OUT, 0)]
     compared += [(made, "train", name, number) for name, sets in generated.items() for number, made in enumerate(sets)]
     scores = [
         score_distance(

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.options import MotionOptions
 from ctlev_core.plugins import PluginError, validate_options
+from ctlev_core.scoring.sensor_pixels import check_in_image
 from data_contracts.config import ConditionChoice, Frozen
-from data_contracts.experiment import Experiment
+from data_contracts.experiment import Experiment, LabelChoice
 from data_contracts.labels import HeldOut
 from data_contracts.manifest import ManifestRef
 from flows.cli import script
 from flows.command_line import Command
 from flows.settings import flow
+from tasks.choose_labels import cover_labels, find_hard_labels
 from tasks.condition import condition_frames, condition_samples
 from tasks.contact_sheet import contact_sheet, publish_contact_sheet
+from tasks.downstream import train_downstream
 from tasks.encode import encode
 from tasks.ingest import ingest
+from tasks.stage import call_together
 from tasks.store import home_folder
-from tasks.subset import take_recorded
+from tasks.subset import take_fold, take_recorded
+
+NUM_FOLDS = 2
+"""Of the cross-validation by which hard labels are found."""
 
 
 class PreparedDataset(Frozen):
@@ -141,13 +149,19 @@ def condition_asked_samples(
     frames: ManifestRef,
     condition: ConditionChoice,
     part: str | None = None,
+    *,
+    labels: LabelChoice | None = None,
 ) -> ManifestRef:
-    """The conditions a generator is asked for; of the same labels for every condition of a `part`, or of all."""
+    """The conditions a generator is asked for; of the same labels for every condition of a `part`, or of all.
+
+    `labels` are those that the experiment asks for, unless they are given.
+    """
     order, motion = "in_time" if experiment.temporal_order else "random", motion_options(experiment)
     return condition_samples(
         poses,
         recordings,
         frames,
+        choose_labels(experiment, poses, recordings, frames, labels or experiment.labels),
         condition=condition,
         encoding=experiment.encoding,
         windows=experiment.windows,
@@ -181,6 +195,43 @@ def motion_options(experiment: Experiment) -> MotionOptions | None:
             "recording"
         )
     return options
+
+
+def choose_labels(
+    experiment: Experiment, poses: ManifestRef, recordings: ManifestRef, frames: ManifestRef, labels: LabelChoice
+) -> ManifestRef | None:
+    """The label moments to sample from; None where `condition_samples` chooses them itself, at random.
+
+    Nothing of it sees a frame that is held out.
+    """
+    count, seed, encoding = experiment.num_synthetic, experiment.seed, experiment.encoding
+    if labels == "random":
+        return None
+    if labels == "coverage":
+        return cover_labels(
+            poses, recordings, frames, encoding=encoding, count=count, seed=seed, label="labels, coverage"
+        )
+    check_in_image(experiment.metrics[0], "labels 'hard'")
+    folds = [
+        take_fold(frames, fold=fold, num_folds=NUM_FOLDS, seed=seed, label=f"fold {fold}") for fold in range(NUM_FOLDS)
+    ]
+    calls = [
+        partial(train_downstream, [fold], downstream=experiment.downstream, seed=seed, label=f"judge of fold {number}")
+        for number, fold in enumerate(folds)
+    ]
+    return find_hard_labels(
+        call_together(*calls),
+        folds,
+        poses,
+        recordings,
+        frames,
+        downstream=experiment.downstream,
+        metric=experiment.metrics[0],
+        encoding=encoding,
+        count=count,
+        seed=seed,
+        label="labels, hard",
+    )
 
 
 def _of_part(label: str, part: str | None) -> str:

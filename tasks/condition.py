@@ -70,12 +70,15 @@ def condition_some_frames(
     return _render(out, chosen.source_ids, chosen, condition, recordings, frames, encoding, seed)
 
 
-@stage(version=9, schema=tables.CONDITIONS, raw_files=input_files_of("condition"), optional=("part", "length"))
+@stage(
+    version=9, schema=tables.CONDITIONS, raw_files=input_files_of("condition"), optional=("part", "choice", "length")
+)
 def condition_samples(
     out: Output,
     poses: Manifest,
     recordings: Manifest,
     frames: Manifest,
+    choice: Manifest | None = None,
     *,
     condition: ConditionChoice,
     encoding: EncodingChoice,
@@ -89,7 +92,8 @@ def condition_samples(
 ) -> pa.Table:
     """Choose `count` labels to sample from, as `choose_rows_to_sample` says, and render them.
 
-    With a `part` of a union they are chosen as if it were all there is. `length` is that of stretches.
+    With a `part` of a union they are chosen as if it were all there is. With a `choice` they are its moments. `length`
+    is that of stretches.
     """
     poses, recordings, frames = (only_part(one, part) for one in (poses, recordings, frames))
     rows = choose_rows_to_sample(
@@ -104,6 +108,7 @@ def condition_samples(
         needs_pictures=plugins.load("conditions", condition.name).NEEDS == "intensity",
         seed=seed,
         length=length or 1,
+        chosen=None if choice is None else choice.table["moment"].to_numpy(),
     )
     sample_ids = [f"condition/{number:06d}" for number in range(count)]
     return _render(out, sample_ids, rows, condition, recordings, frames, encoding, seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from data_contracts.config import DownstreamChoice
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images
 from data_contracts.manifest import Manifest
+from data_contracts.training_sets import HELD_OUT
 from tasks.stage import Output, stage
 
 MAX_OTHER_FRAMES = 5_000
@@ -25,7 +27,7 @@ NUM_PAIRS = 10
 PICTURES = "small pictures"
 
 
-@stage(version=2, schema=tables.SCORES)
+@stage(version=3, schema=tables.SCORES)
 def memorisation(
     out: Output,
     frames: Manifest,
@@ -39,7 +41,9 @@ def memorisation(
     features.
 
     Other recorded frames are the training frames against those of other recordings; where all training frames are of
-    one recording, the held-out frames. The closest pairs lie beside the table.
+    one recording, the held-out frames. Rows of the subject `held-out recorded` are the floor: what held-out frames,
+    which nobody made from training frames, score in the place of generated ones. The closest pairs lie beside the
+    table.
     """
     learnt, made = frames.rows_where(split="train"), generated.rows_where(split="train")
     made = made[spread(len(made), MAX_OTHER_FRAMES)]
@@ -55,19 +59,28 @@ def memorisation(
     if extractor is not None and downstream is not None:
         plugin, folder = plugins.load_options(downstream), extractor.ref.path / "model"
         ways[f"features of {plugin.name}"] = lambda images: plugin.module.features(folder, images)
+    held_out = frames.rows_where(split=frames.held_out)
+    if len(set(recordings[learnt])) == 1:  # frames are compared with those of other recordings
+        held_out = held_out[recordings[held_out] != recordings[learnt[0]]]
+    held_out = held_out[spread(len(held_out), MAX_OTHER_FRAMES)]
     scores: list[dict[str, Any]] = []
     pairs: list[dict[str, Any]] = []
     for name, features_of in ways.items():
-        found = check_memorisation(
-            features_of(generated.images(made)),
-            features_of(frames.images(learnt)),
-            features_of(frames.images(other)),
+        training, real = features_of(frames.images(learnt)), features_of(frames.images(other))
+        check = partial(
+            check_memorisation,
+            training=training,
+            real=real,
             training_recordings=recordings[learnt],
             real_recordings=recordings[other],
         )
+        found = check(features_of(generated.images(made)))
         digest = extractor.ref.digest if extractor is not None and name != PICTURES else ""
-        same = {"subject": subject, "group": name, "num_train": len(learnt), "model_digest": digest}
-        scores += _scores(found, same | {"data_digest": generated.ref.digest})
+        same = {"group": name, "num_train": len(learnt), "model_digest": digest}
+        scores += _scores(found, same | {"subject": subject, "data_digest": generated.ref.digest})
+        if len(held_out):
+            floor = check(features_of(frames.images(held_out)), generated_recordings=recordings[held_out])
+            scores += _scores(floor, same | {"subject": HELD_OUT, "data_digest": frames.ref.digest})
         for of_made, of_learnt, distance in found.closest(NUM_PAIRS):
             rows = int(made[of_made]), int(learnt[of_learnt])
             pairs.append(
@@ -91,6 +104,8 @@ def _scores(found: MemorisationCheck, same: dict[str, Any]) -> list[dict[str, An
         "close_share": (found.close_share, found.low, found.high),
         "duplicates": (float(found.num_duplicates), np.nan, np.nan),
         "nearest_distance_ratio": (found.ratio, np.nan, np.nan),
+        "data_copying_z": (found.copying.value, found.copying.low, found.copying.high),
+        "authentic_share": (found.authentic_share, found.authentic_low, found.authentic_high),
     }
     return [
         {

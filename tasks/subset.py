@@ -41,6 +41,28 @@ def take_recorded(out: Output, frames: Manifest, *, count: int, seed: int) -> pa
     return frames.table.take(rows)
 
 
+@stage(version=1, schema=tables.FRAMES)
+def take_fold(out: Output, frames: Manifest, *, fold: int, num_folds: int, seed: int) -> pa.Table:
+    """The training frames alone, those of every `num_folds`-th recording held out as split `validation`.
+
+    Recordings are in random order, the same for all folds: each training frame is held out in one of them.
+
+    Raises:
+        DataError: there are fewer recordings than folds.
+    """
+    rows = frames.rows_where(split="train")
+    names = np.array(frames.column("recording_id"))[rows]
+    recordings = np.random.default_rng(seed).permutation(np.unique(names))
+    if len(recordings) < num_folds:
+        raise DataError(f"{frames.ref.path}: {num_folds} folds need as many recordings, got {len(recordings)}")
+    held_out = np.isin(names, recordings[fold::num_folds])
+    for name in ("histograms", "frames"):
+        _copy_rows(out, frames, rows, name)
+    table = frames.table.take(rows)
+    splits = pa.array(np.where(held_out, "validation", "train"), pa.string())
+    return table.set_column(table.column_names.index("split"), table.schema.field("split"), splits)
+
+
 @stage(version=2, schema=tables.SYNTHETIC)
 def take_share(out: Output, synthetic: Manifest, *, share: float) -> pa.Table:
     """The first rows, one at least: classes and recordings took turns when the labels were chosen."""

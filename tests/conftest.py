@@ -33,6 +33,21 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
+def at_once(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stages that run where they are called, without Prefect."""
+    from tasks.stage import Stage
+    from tasks.store import Store
+
+    def call(stage, *inputs, label="", **settings):
+        bound = stage.signature.bind(None, *inputs, **settings)
+        bound.apply_defaults()
+        arguments = dict(list(bound.arguments.items())[1:])
+        return stage.run(stage.key(arguments, Store()), arguments)[0]
+
+    monkeypatch.setattr(Stage, "__call__", call)
+
+
+@pytest.fixture
 def real_recordings() -> Path:
     """Three real recordings in class folders; they are not part of the repository."""
     folder = REAL_DATA / "events"

@@ -46,6 +46,7 @@ def choose_rows_to_sample(
     needs_pictures: bool,
     seed: int,
     length: int = 1,
+    chosen: np.ndarray | None = None,
 ) -> LabelledRows:
     """Choose labels to sample from.
 
@@ -74,32 +75,31 @@ def choose_rows_to_sample(
         needs_pictures: whether the condition is made of the grey pictures at a window's ends.
         seed: of the choice and the views.
         length: moments of a stretch, where they are chosen so.
+        chosen: [count] rows of `label_moments`, where they are chosen already.
     Raises:
         DataError: there is nothing to choose from, or no body to see from a new side.
     """
     half_us = half_window_us(frames)
     before_us, after_us = (2 * half_us, 0) if windows.anchor == "labels" else (half_us, half_us)
-    moments = _label_only(poses)
+    moments = label_moments(poses)
     if moments.num_rows:
-        inner = surrounded(moments["recording_id"].to_pylist(), moments["t_us"].to_numpy(), half_us)
-        allowed = np.flatnonzero(inner) if order == "random" else np.arange(moments.num_rows)
-        if order == "stretches":
-            interval_us = frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
-            rows_of_stretches = choose_stretches(
-                moments["recording_id"].to_pylist(), moments["t_us"].to_numpy(), count, length, interval_us
-            )
-            chosen = moments.take(rows_of_stretches)
-        else:
-            chosen = moments.take(_choose(moments, allowed, count, order, seed))
-        names, times = chosen["recording_id"].to_pylist(), chosen["t_us"].to_numpy()
+        if chosen is None:
+            if order == "stretches":
+                names, times = moments["recording_id"].to_pylist(), moments["t_us"].to_numpy()
+                chosen = choose_stretches(names, times, count, length, _interval_us(frames))
+            else:
+                allowed = inner_moments(moments, frames) if order == "random" else np.arange(moments.num_rows)
+                chosen = choose_in_turn(moments, allowed, count, order, seed)
+        asked = moments.take(chosen)
+        names, times = asked["recording_id"].to_pylist(), asked["t_us"].to_numpy()
         together = np.arange(count) if order == "random" else np.unique(names, return_inverse=True)[1]
         turned = None if views == "labelled" else together
-        labelled = labels_of(chosen)
+        labelled = labels_of(asked)
         rows = LabelledRows(
             source_ids=[f"{name}:{t}" for name, t in zip(names, times.tolist(), strict=True)],
             recordings=poses,
             recording_ids=names,
-            subjects=chosen["subject"].to_pylist(),
+            subjects=asked["subject"].to_pylist(),
             t_start_us=np.maximum(times - before_us, 0),
             t_end_us=times + after_us,
             labelled=labelled,
@@ -111,11 +111,11 @@ def choose_rows_to_sample(
         learnt = frames.rows_where(split="train")
         if order == "stretches":
             names, times = frames.column("recording_id"), frames.table["t_end_us"].to_numpy()[learnt]
-            interval_us = frame_interval_us(frames.table, learnt, frames.ref.path)
-            learnt = learnt[choose_stretches([names[row] for row in learnt], times, count, length, interval_us)]
-            rows = rows_of_frames(recordings, frames, learnt)
+            own = [names[row] for row in learnt]
+            learnt = learnt[choose_stretches(own, times, count, length, _interval_us(frames))]
         else:
-            rows = rows_of_frames(recordings, frames, _choose(frames.table, learnt, count, order, seed))
+            learnt = choose_in_turn(frames.table, learnt, count, order, seed)
+        rows = rows_of_frames(recordings, frames, learnt)
     if needs_pictures:
         if views == "new":
             raise DataError("conditions of pictures show them as they were; set view to 'labelled'")
@@ -124,19 +124,38 @@ def choose_rows_to_sample(
     return rows
 
 
-def _choose(table: pa.Table, rows: np.ndarray, count: int, order: LabelOrder, seed: int) -> np.ndarray:
-    """`count` of the given rows of a table of labels."""
+def choose_in_turn(table: pa.Table, rows: np.ndarray, count: int, order: LabelOrder, seed: int) -> np.ndarray:
+    """`count` of the given rows of a table of labels: classes and recordings in turn, or evenly spread in time."""
     if order == "in_time":
         return rows[np.sort(np.resize(spread(len(rows), count), count))]
     classes, recordings = (np.array(table[name].to_pylist())[rows].tolist() for name in ("class_name", "recording_id"))
     return rows[balanced_choice(classes, recordings, count, seed)]
 
 
-def _label_only(poses: Manifest) -> pa.Table:
+def _interval_us(frames: Manifest) -> int:
+    """From one training frame to the next."""
+    return frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
+
+
+def label_moments(poses: Manifest) -> pa.Table:
     """Every label moment of the recordings of `poses` in split `condition`, in the order of recordings and times."""
     wanted = np.array(poses.column("recording_id"))[poses.rows_where(splits="condition")]
     table = poses.attached(tables.LABELS)
     return table.filter(pc.is_in(table["recording_id"], pa.array(wanted, pa.string())))
+
+
+def inner_moments(moments: pa.Table, frames: Manifest) -> np.ndarray:
+    """The rows of moments half a window or more from both ends of their recording, where it has others."""
+    names, times = moments["recording_id"].to_pylist(), moments["t_us"].to_numpy()
+    return np.flatnonzero(surrounded(names, times, half_window_us(frames)))
+
+
+def moments_in_image(
+    moments: pa.Table, poses: Manifest, recordings: Manifest, frames: Manifest, encoding: EncodingChoice, seed: int
+) -> Labels:
+    """The labels of moments in image pixels, as their own camera, or a virtual one, sees them."""
+    sensors = _sensors(poses, moments["recording_id"].to_pylist())
+    return _seen(labels_of(moments), sensors, recordings, frames, encoding, None, seed)
 
 
 def _sensors(poses: Manifest, names: list[str]) -> np.ndarray:

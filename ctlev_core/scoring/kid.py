@@ -10,9 +10,12 @@ is free of the large equal terms which would cancel only to rounding.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from ctlev_core.scoring.gaussians import check_features, check_same_width
+from ctlev_core.scoring.random_subsets import mean_over_subsets
 from data_contracts.errors import DataError
 
 _BLOCK_NUMBERS = 4_000_000
@@ -44,19 +47,10 @@ def compute_kid(
     check_same_width(features_a, features_b)
     origin = features_a[0].astype(np.float64)
     a, b = features_a - origin, features_b - origin
-    if subset_size != 0 and (subset_size < 2 or num_subsets < 1):
-        raise ValueError(f"a mean needs subsets of at least 2 rows, got {num_subsets} of {subset_size}")
-    pairs = len(a) ** 2 + len(b) ** 2 + len(a) * len(b)
     with np.errstate(over="ignore", invalid="ignore"):  # seen in the result
-        if subset_size == 0 or pairs <= 3 * num_subsets * subset_size**2:
-            found = _unbiased(a, b, origin)
-        else:
-            generator = np.random.default_rng(seed)
-            values = []
-            for _ in range(num_subsets):
-                first, second = (rows[generator.permutation(len(rows))[:subset_size]] for rows in (a, b))
-                values.append(_unbiased(first, second, origin))
-            found = float(np.mean(values))
+        found = mean_over_subsets(
+            partial(_unbiased, origin=origin), a, b, subset_size=subset_size, num_subsets=num_subsets, seed=seed
+        )
     if not np.isfinite(found):
         size = max(float(np.abs(features).max()) for features in (features_a, features_b))
         raise DataError(f"features of sizes up to {size:.1e} are too large for KID: their kernel is beyond 1e308")

@@ -45,6 +45,13 @@ def score_text(value: float, low: float | None = None, high: float | None = None
     return f"{shown[0]} [{shown[1]}, {shown[2]}]" if known else shown[0]
 
 
+def rows_of_groups(groups: Sequence[str] | np.ndarray) -> list[np.ndarray]:
+    """The rows of each group, ascending, of the group [N] of each row."""
+    _, index = np.unique(np.asarray(groups), return_inverse=True)
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(index[order])) + 1)
+
+
 def bootstrap_interval(
     values: np.ndarray,
     groups: Sequence[str] | np.ndarray | None = None,

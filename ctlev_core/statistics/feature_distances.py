@@ -26,7 +26,7 @@ import pyarrow as pa
 
 from ctlev_core.plugin_contracts import NamedFeatureExtractor
 from ctlev_core.plugins import Plugin
-from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, rows_of_groups
 from data_contracts.tables import Column, TableSchema
 
 DISTANCE_ESTIMATES = TableSchema(
@@ -173,9 +173,7 @@ def _members(rows: np.ndarray, groups: Sequence[str] | np.ndarray | None) -> lis
     names = np.arange(len(rows)) if groups is None else np.asarray(groups)
     if names.shape != (len(rows),):
         raise ValueError(f"groups must be [{len(rows)}], one a row of features, got {names.shape}")
-    _, index = np.unique(names, return_inverse=True)
-    order = np.argsort(index, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(index[order])) + 1)
+    return rows_of_groups(names)
 
 
 def _halvings(

@@ -21,6 +21,7 @@ from ctlev_core.scoring.subsets import DATASET
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference, Trainings, paired_difference, read_trainings
 from data_contracts.training_sets import (
+    HELD_OUT,
     LABEL_CONSISTENT,
     ORACLE,
     RECORDED,
@@ -35,7 +36,6 @@ ORIGINS = "classes with"
 """Groups that begin so are classes by where they were to be learnt from."""
 SUBJECTS = ("subject ", "subjects ")
 """Groups that begin so are one subject, or subjects by whether they were learnt from."""
-_FLOOR = "held-out recorded"
 _CHANCE, _ONE_CLASS = "chance_", "binary_accuracy_"
 _WIDEST = 7
 """Training sets side by side that fit on a page."""
@@ -104,7 +104,7 @@ def frame_tables(rows: list[Row]) -> list[Table]:
     found = []
     labels = [row for row in rows if row["task"] != "distance" and is_about_labels(row) and row["group"] == "all"]
     if labels:
-        floor = [{**row, "subject": _FLOOR} for row in trained if row["subject"] == RECORDED]
+        floor = [{**row, "subject": HELD_OUT} for row in trained if row["subject"] == RECORDED]
         caption = (
             "The model trained on recorded frames, scored on synthetic frames against the labels they were sampled "
             "from, beside its score on held-out recorded frames, the floor. Shuffled: the same frames against labels "

@@ -26,8 +26,7 @@ from tasks.evaluate import score_model
 from tasks.finetune import finetune
 from tasks.ingest import ingest
 from tasks.sample import sample
-from tasks.stage import Stage, call_flow, planning
-from tasks.store import Store
+from tasks.stage import call_flow, planning
 
 SMALL = {"num_train_recordings": 2, "num_test_recordings": 1, "num_condition_recordings": 2, "label_rate_hz": 60}
 NEAR = {"name": "studio", "options": {**SMALL, "seed": 1}}
@@ -55,19 +54,6 @@ def experiment(part="grey", **changes):
         "export": None,
     } | changes
     return Experiment(**values)
-
-
-@pytest.fixture
-def at_once(home, monkeypatch):
-    """Stages that run where they are called, without Prefect."""
-
-    def call(stage, *inputs, label="", **settings):
-        bound = stage.signature.bind(None, *inputs, **settings)
-        bound.apply_defaults()
-        arguments = dict(list(bound.arguments.items())[1:])
-        return stage.run(stage.key(arguments, Store()), arguments)[0]
-
-    monkeypatch.setattr(Stage, "__call__", call)
 
 
 def test_it_learns_from_and_is_asked_for_its_part_alone(at_once):

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctlev_core.metrics import fd_infinity, frechet, kid, prdc
+from ctlev_core.metrics import fd_infinity, frechet, kid, mmd, prdc
 from ctlev_core.scoring.frechet import frechet_distance
 from ctlev_core.scoring.frechet_extended import refined_frechet_distance
 from ctlev_core.scoring.kid import compute_kid
@@ -178,7 +178,7 @@ def test_fd_infinity_is_a_line_through_the_distances_of_parts():
         fd_infinity.compute(a, b[:5], options)
 
 
-@pytest.mark.parametrize("metric", [frechet, kid, fd_infinity, prdc])
+@pytest.mark.parametrize("metric", [frechet, kid, mmd, fd_infinity, prdc])
 def test_distances_name_bad_rows(metric):
     a = normal(10, 30)
     broken = a.copy()

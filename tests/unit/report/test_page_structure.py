@@ -108,6 +108,7 @@ def test_every_declared_score_has_a_name():
         "pck_torso0.2", "pck3d_pa_25mm", "pckh3d_0.5", "auc3d_pelvis_150mm", "oks_ap50", "oks_mean", "accuracy",
         "macro_f1", "binary_accuracy_mean",
         "fd_event_classifier_d1c3057e", "fid", "fid_infinity", "kid_event_x_0", "fd_infinity_event_x_0",
+        "mmd_event_x_0", "mmd_sigma10_event_x_0",
         "precision_k5_event_x_0", "recall_k5", "density_k5", "coverage_k5", "calibration_error_ece15",
         "chance_accuracy", "macro_recall",
     )  # fmt: skip

@@ -136,3 +136,19 @@ def test_exact_copies_count_even_where_real_frames_are_alike():
     found.append(row("memorisation", "synthetic", "duplicates", 100.0, "small pictures"))
     (judged,) = check({"max_memorised_share": 0.05}, found)
     assert judged.value == 0.1 and judged.value > judged.limit
+
+
+def test_what_held_out_frames_score_as_copies_is_no_gate():
+    found = scores()
+    kept = check({"max_memorised_share": 0.05}, found)
+    assert kept == check(
+        {"max_memorised_share": 0.05},
+        [*found, row("memorisation", "held-out recorded", "close_share", 0.9, "small pictures")],
+    )
+
+
+def test_new_versions_of_covering_poses_have_to_say_that_poses_stay():
+    covering = WITH_FEATURES | {"labels": "coverage"}
+    with pytest.raises(ValidationError, match="the same poses for every version; set new_poses to false"):
+        Regeneration.model_validate(covering)
+    assert Regeneration.model_validate(covering | {"new_poses": False}).labels == "coverage"
