@@ -54,7 +54,7 @@ MAX_FILTER_FRAMES = 2_000
 """Training frames the quality filter is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
-@stage(version=4, schema=tables.SYNTHETIC, optional=("part",))
+@stage(version=5, schema=tables.SYNTHETIC, optional=("part",))
 def sample(
     out: Output,
     checkpoint: Manifest,

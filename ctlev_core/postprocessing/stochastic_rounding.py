@@ -2,8 +2,10 @@
 
 A decoder spreads what it is unsure of: where every other recorded window has one event it gives half of one, and such
 values no recorded image has. Stochastic rounding keeps the expected count of each pixel, so that sparse noise stays as
-dense as it was; the most probable count, which `ctlev_core.postprocessing.image_counts` finds, would remove it. The
-number of events is that of a recorded window drawn at random: normalised images say nothing about it.
+dense as it was; the most probable count, which `ctlev_core.postprocessing.image_counts` finds, would remove it.
+
+Images that are normalised one by one say nothing about the number of events: it is that of a recorded window drawn at
+random. Where the same count has the same value in every image (normalisation `count`) the image says it itself.
 """
 
 from __future__ import annotations
@@ -19,7 +21,12 @@ from data_contracts.manifest import Manifest
 
 
 def round_stochastically(
-    frames: np.ndarray, num_events: np.ndarray, *, polarity: bool, seeds: Sequence[int]
+    frames: np.ndarray,
+    num_events: np.ndarray,
+    *,
+    polarity: bool,
+    seeds: Sequence[int],
+    events_a_level: float | None = None,
 ) -> np.ndarray:
     """Counts of each image: floor(expected count + u), u uniform between 0 and 1.
 
@@ -29,6 +36,7 @@ def round_stochastically(
         num_events: [R] events in each of R >= 1 recorded windows.
         polarity: of the event histogram.
         seeds: N seeds; a row depends on its own alone.
+        events_a_level: of a grey level, the same in every image; None = as many as make the number of events drawn.
     Returns:
         [N, C, H, W] uint16, two channels with polarity. A black image stays without events.
     Raises:
@@ -49,7 +57,7 @@ def round_stochastically(
         total = values.sum(dtype=np.float64)
         if total == 0:
             continue
-        expected = values * (rng.choice(num_events) / total)
+        expected = values * (rng.choice(num_events) / total if events_a_level is None else events_a_level)
         counts[row] = np.minimum(expected + rng.random(expected.shape), 65535).transpose(2, 0, 1)
     return counts
 
@@ -81,5 +89,10 @@ def round_frames(frames: np.ndarray, num_events: np.ndarray, encoder: Plugin, se
         encoder: an event histogram, that of the recorded windows.
         seeds: N seeds; a row depends on its own alone.
     """
-    counts = round_stochastically(frames, num_events, polarity=encoder.options.polarity, seeds=seeds)
+    options, events_a_level = encoder.options, None
+    if options.normalisation == "count":
+        events_a_level = options.full_scale_count / 255
+    counts = round_stochastically(
+        frames, num_events, polarity=options.polarity, seeds=seeds, events_a_level=events_a_level
+    )
     return encoder.module.render_image(counts, encoder.options)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ctlev_core.encodings import event_histogram
-from ctlev_core.postprocessing.stochastic_rounding import round_stochastically
+from ctlev_core.plugins import Plugin
+from ctlev_core.postprocessing.stochastic_rounding import round_frames, round_stochastically
 
 RANDOM = np.random.default_rng(0)
 SEEDS = range(400)
@@ -48,6 +49,17 @@ def test_polarities_keep_their_channels_and_black_stays_black():
     rendered = event_histogram.render_image(counts, event_histogram.Options())
     assert not rendered[..., 1].any()
     assert not round_stochastically(np.zeros_like(image), np.array([300]), polarity=True, seeds=[1]).any()
+
+
+def test_images_of_one_scale_say_their_number_of_events():
+    """A count of 1 is 85 in each: an image twice as bright has twice the events, whatever recorded windows had."""
+    options = event_histogram.Options(normalisation="count", full_scale_count=3)
+    counts = RANDOM.poisson(0.4, (6, 2, 32, 32)).clip(max=3).astype(np.uint16)
+    encoder = Plugin("encodings", "event_histogram", event_histogram, options)
+    images = event_histogram.render_image(counts, options)
+    assert np.array_equal(round_frames(images, np.array([7]), encoder, seeds=range(6)), images)
+    half = round_frames(images // 2, np.array([7]), encoder, seeds=range(6)).sum(axis=(1, 2, 3), dtype=np.int64)
+    np.testing.assert_allclose(half / images.sum(axis=(1, 2, 3), dtype=np.int64), 0.5, atol=0.06)
 
 
 def test_a_row_depends_on_its_own_seed_alone():
