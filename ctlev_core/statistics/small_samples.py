@@ -44,7 +44,9 @@ def t_quantile(freedom: float, level: float = LEVEL) -> float:
 
 
 def satterthwaite(parts: Sequence[tuple[float, float]]) -> float:
-    """Degrees of freedom of a sum of variances, each given with its own."""
+    """Degrees of freedom of a sum of variances, each given with its own; NaN where one is not known, of one value."""
+    if any(math.isnan(variance) or (variance and not freedom) for variance, freedom in parts):
+        return math.nan
     total = sum(variance for variance, _ in parts)
     below = sum(variance**2 / freedom for variance, freedom in parts if variance)
     return total**2 / below if below else math.inf

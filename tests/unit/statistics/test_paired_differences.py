@@ -108,6 +108,10 @@ def test_few_recordings_give_no_interval():
     found = paired_difference(trainings([1.0] * 8, list("aabbccdd")), trainings([2.0] * 8, list("aabbccdd")))
     assert found.value == 1 and np.isnan([found.low, found.high]).all() and not found.is_certain
     assert found.text() == "+1.000"
+    one = paired_difference(trainings([1.0, 2.0], "aa"), trainings([3.0, 3.0], "aa"))
+    assert one.value == 1.5 and np.isnan([one.low, one.high]).all()
+    other = unpaired_difference(trainings([1.0, 2.0], "aa"), trainings([3.0, 3.0], "bb"))
+    assert other.value == 1.5 and np.isnan([other.low, other.high]).all()
 
 
 @pytest.mark.parametrize(
