@@ -6,7 +6,7 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ctlev_core import plugins
+from ctlev_core.diffusion.motion_files import has_motion_layers
 from ctlev_core.diffusion.pretrained.adapters import is_adapter
 from ctlev_core.pixel_decoder.options import DECODER_FOLDER
 from ctlev_core.plugins import validate_options
 from ctlev_core.provenance.records import Record, read_provenance
+from ctlev_core.provenance.scores import GENERATOR_STAGES
 from ctlev_core.seeds import sample_seeds
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
@@ -72,6 +74,7 @@ class TrainedGenerator:
         *,
         images: npt.ArrayLike | None = None,
         seed: int = 0,
+        lengths: Sequence[int] | None = None,
         **options: Any,
     ) -> np.ndarray:
         """Event images, one for each prompt or condition image.
@@ -81,6 +84,8 @@ class TrainedGenerator:
             images: [N, H, W, 3] uint8 condition images, such as those of `skeleton_map` and `normal_map`, or one
                 [H, W, 3]; for generators that are asked by pictures.
             seed: row i has the i-th seed that follows from it.
+            lengths: rows of each stretch whose frames follow one another in time, in order, for a generator with motion
+                layers; None = each frame is made by itself.
             options: the generator's `SampleOptions`, such as `num_inference_steps`, in place of those the run had;
                 `ctlev options NAME` lists them.
         Returns:
@@ -91,6 +96,8 @@ class TrainedGenerator:
             DataError: the checkpoint is broken.
         """
         asked = _conditions(prompts, images)
+        if lengths is not None:
+            asked = replace(asked, stretches=self._stretches(lengths, len(asked)))
         module: Any = plugins.load("generators", self.name)
         defaults = dict(self.defaults)
         if "scheduler" in options:
@@ -103,6 +110,13 @@ class TrainedGenerator:
         with tempfile.TemporaryDirectory(prefix="ctlev_sample_") as work:
             frames = module.sample(self.folder, asked, chosen, seeds=seeds, work=Path(work))
         return frames if self.decoder is None else self._decoded(self.decoder, frames, asked, seeds)
+
+    def _stretches(self, lengths: Sequence[int], count: int) -> tuple[str, ...]:
+        if not has_motion_layers(self.folder):
+            raise ValueError(f"{self.folder}: lengths are for a generator with motion layers; this one has none")
+        if sum(lengths) != count or any(length < 1 for length in lengths):
+            raise ValueError(f"lengths must be 1 or more and add up to the {count} rows, got {list(lengths)}")
+        return tuple(str(number) for number, length in enumerate(lengths) for _ in range(length))
 
     def _decoded(self, choice: DecoderChoice, frames: np.ndarray, asked: Conditions, seeds: list[int]) -> np.ndarray:
         from ctlev_core.pixel_decoder.decoder import open_decoder
@@ -118,7 +132,7 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
 
     Args:
         place: name of a report (its experiment's own generator, with its pixel decoder), the path of an artefact of the
-            stage `finetune`, or of a diffusers folder that training wrote.
+            stage `finetune` or `train_motion_layers`, or of a diffusers folder that training wrote.
         home: folder of all state, where `place` is a name; None = CTLEV_HOME, else `.ctlev`.
     Raises:
         DataError: there is no such run or folder, or it holds no generator.
@@ -135,7 +149,9 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
             f"{', '.join(known) or 'none'}; of a study name the folder of a checkpoint"
         )
     records = read_provenance(report / "provenance.json")
-    own = next((one for one in records if one.role == "checkpoint of synthetic" and one.stage == "finetune"), None)
+    own = next(
+        (one for one in records if one.role == "checkpoint of synthetic" and one.stage in GENERATOR_STAGES), None
+    )
     if own is None:
         raise DataError(f"{report}: no generator was trained in this run")
     decoded = next((one for one in records if one.role == "frames of synthetic" and one.stage == "decode_pixels"), None)
@@ -167,17 +183,20 @@ def _of_folder(
     """The generator of an artefact, or of the checkpoint alone."""
     if not (folder / RUN_FILE).is_file() and (folder.parent / RUN_FILE).is_file() and folder.name == CHECKPOINT:
         folder = folder.parent
-    if (folder / RUN_FILE).is_file():
+    if (folder / RUN_FILE).is_file() and not has_motion_layers(folder / CHECKPOINT):
         try:
             plugin = json.loads((folder / RUN_FILE).read_text())["arguments"]["generator"]["plugin"]
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{folder}: is no artefact of the stage finetune") from error
         return TrainedGenerator(folder / CHECKPOINT, plugin.rpartition("/")[2], decoder, defaults)
+    if (folder / RUN_FILE).is_file():
+        folder = folder / CHECKPOINT
     if not (folder / "model_index.json").is_file() and not is_adapter(folder):
         raise DataError(
             f"{folder}: expected an artefact of the stage finetune or a diffusers folder; no model_index.json"
         )
-    return TrainedGenerator(folder, "controlnet" if (folder / "controlnet").is_dir() else "stable_diffusion")
+    name = "controlnet" if (folder / "controlnet").is_dir() else "stable_diffusion"
+    return TrainedGenerator(folder, name, decoder, defaults)
 
 
 def _conditions(prompts: str | Sequence[str] | None, images: npt.ArrayLike | None) -> Conditions:

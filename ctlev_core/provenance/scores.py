@@ -17,6 +17,8 @@ from data_contracts.tables import Column, TableSchema
 
 Row = dict[str, Any]
 _DIGESTS = pa.list_(pa.string())
+GENERATOR_STAGES = ("finetune", "train_motion_layers")
+"""Stages whose artefacts are generators."""
 SCORE_LINEAGE = TableSchema(
     "score_lineage",
     1,
@@ -67,7 +69,9 @@ def trace_lineage(scores: Sequence[tuple[str, pa.Table]], records: Sequence[Reco
             "score_digest": record.digest,
             "split": str(record.arguments.get("split", "")),
             "training_digests": [one.digest for one in learnt],
-            "checkpoint_digests": sorted({one.digest for set_ in learnt for one in _of(records, set_, "finetune")}),
+            "checkpoint_digests": sorted(
+                {one.digest for set_ in learnt for stage in GENERATOR_STAGES for one in _of(records, set_, stage)}
+            ),
             "recordings_digests": sorted({one.digest for one in _of(records, record, "ingest")}),
             # By text: an option can be a number in one stage and null in another.
             "config_digest": digest_of(
