@@ -122,6 +122,8 @@ def kind_of(stage: str, arguments: Mapping[str, Any], size: tuple[int, int] | No
 def _trained(plan: Mapping[str, PlannedStage], row: PlannedStage) -> Mapping[str, Any]:
     """The arguments of the fine-tuning whose checkpoint a stage samples from."""
     made = [plan[key] for key in inputs_of(row.arguments) if key in plan]
+    with_motion = [one for one in made if one.stage == "train_motion_layers"]
+    made += [plan[key] for one in with_motion for key in inputs_of(one.arguments) if key in plan]
     return next((one.given for one in made if one.stage == "finetune"), {})
 
 
