@@ -181,8 +181,8 @@ def load_motion_layers(checkpoint: Path, unet: Any) -> MotionLayers | None:
         if json.dumps(config.get(name)) != json.dumps(expected):
             raise DataError(f"{folder}: {name} must be {expected} for this U-Net, got {config.get(name)}")
     _load_weights(adapter, folder)
-    adapter = adapter.to(unet.device, unet.dtype).eval().requires_grad_(False)
-    return MotionLayers(unet, adapter, settings)
+    nn.Module.to(adapter, unet.device, unet.dtype)  # diffusers' own `to` warns of modules that there are not
+    return MotionLayers(unet, adapter.eval().requires_grad_(False), settings)
 
 
 def _load_weights(adapter: Any, folder: Path) -> None:
