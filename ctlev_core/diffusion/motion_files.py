@@ -57,6 +57,6 @@ def read_settings(checkpoint: Path) -> MotionSettings:
             upper = "" if most is None else f" to {most}"
             raise DataError(f"{path}: {name} must be a whole number from 1{upper}, got {value!r}")
     share = found.get("shared_noise")
-    if type(share) not in (int, float) or not 0 <= share < 1:
+    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
         raise DataError(f"{path}: shared_noise must be a number from 0 to below 1, got {share!r}")
     return MotionSettings(found["context"], found["interval_us"], float(share))

@@ -114,13 +114,14 @@ def new_adapter(unet: Any, seed: int) -> Any:
 
     config = unet.config
     channels = tuple(config.block_out_channels)
+    heads: Any = tuple(map(_num_heads, channels))  # annotated there as a tuple of one
     layers = config.layers_per_block
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         adapter = MotionAdapter(
             block_out_channels=channels,
             motion_layers_per_block=layers if isinstance(layers, int) else tuple(layers),
-            motion_num_attention_heads=tuple(_num_heads(width) for width in channels),
+            motion_num_attention_heads=heads,
             motion_norm_num_groups=config.norm_num_groups,
             motion_max_seq_length=MAX_CONTEXT,
             use_motion_mid_block=unet.mid_block is not None,
