@@ -16,6 +16,7 @@ CONDITIONS_BY_NEEDS = {
     "": plugin_contracts.Condition,
     "intensity": plugin_contracts.ConditionOfPairs,
     "motion": plugin_contracts.ConditionOfMotions,
+    "displacement": plugin_contracts.ConditionOfDisplacements,
 }
 WITHOUT_OPTIONS = ("formats", "motions")
 ALL = [(kind, name) for kind in plugins.KINDS for name in plugins.names(kind)]

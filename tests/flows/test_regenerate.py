@@ -85,7 +85,7 @@ def test_versions_differ_and_can_be_made_again(home, make_version, tmp_path):
     assert opened.ref.digest == second.synthetic.digest and len(opened) == 3
     assert second.scores["rejected"] == sum(bool(cause) for cause in opened.column("rejected"))
     measured = {name.split("_")[0] for name in second.scores if name.startswith("synthetic, all: ")}
-    assert measured == {"synthetic, all: fd", "synthetic, all: kid"}
+    assert measured == {"synthetic, all: fd", "synthetic, all: kid", "synthetic, all: mmd"}
 
     # Somewhere else, from the first version alone, the second comes out the same.
     elsewhere = tmp_path / "elsewhere"

@@ -108,7 +108,7 @@ def test_each_frame_of_a_union_is_measured_on_its_own_sensor(tmp_path, monkeypat
     sizes = {"part.near/a": DAVIS, "part.far/b": CELEX, "part.far/c": TALL}
     names = ["part.near/a", "part.far/b", "part.near/a", "part.far/c", "part.far/b"]
     labels, found = labelled([sizes[name] for name in names], encoding())
-    monkeypatch.setattr(pose2d, "predict", lambda model, frames: {"joints2d": found})
+    monkeypatch.setattr(pose2d, "predict_sequences", lambda model, frames, recordings: {"joints2d": found})
     data, recordings = frames_of(tmp_path / "frames", names, labels), recordings_of(tmp_path / "recordings", sizes)
     (tmp_path / "out").mkdir()
     table = score_model.function(

@@ -8,7 +8,7 @@ import pytest
 
 from ctlev_core import plugins
 from ctlev_core.labels.body_views import with_joints
-from ctlev_core.labels.rows_to_sample import _choose, _from_new_sides, _on_sensor
+from ctlev_core.labels.rows_to_sample import _from_new_sides, _on_sensor, choose_in_turn
 from ctlev_core.metrics import mpjpe2d, mpjpe3d, oks, pck2d
 from ctlev_core.report.sections.verdict import verdict
 from ctlev_core.scoring.pose import quotients
@@ -25,7 +25,7 @@ from data_contracts.manifest import concat_labels
 )
 def test_in_time_moments_keep_their_order_and_are_evenly_spread(count, expected):
     moments = pa.table({"class_name": list("abacbc"), "t_us": [0, 10, 20, 0, 10, 20]})
-    assert _choose(moments, np.arange(6), count, "in_time", seed=0).tolist() == expected
+    assert choose_in_turn(moments, np.arange(6), count, "in_time", seed=0).tolist() == expected
 
 
 @pytest.mark.parametrize("module", [mpjpe2d, pck2d, mpjpe3d], ids=lambda module: module.__name__.rpartition(".")[2])
