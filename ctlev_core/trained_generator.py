@@ -85,7 +85,7 @@ class TrainedGenerator:
                 [H, W, 3]; for generators that are asked by pictures.
             seed: row i has the i-th seed that follows from it.
             lengths: rows of each stretch whose frames follow one another in time, in order, for a generator with motion
-                layers; None = each frame is made by itself.
+                layers or the option `noise="stretches"`; None = each frame is made by itself.
             options: the generator's `SampleOptions`, such as `num_inference_steps`, in place of those the run had;
                 `ctlev options NAME` lists them.
         Returns:
@@ -96,8 +96,6 @@ class TrainedGenerator:
             DataError: the checkpoint is broken.
         """
         asked = _conditions(prompts, images)
-        if lengths is not None:
-            asked = replace(asked, stretches=self._stretches(lengths, len(asked)))
         module: Any = plugins.load("generators", self.name)
         defaults = dict(self.defaults)
         if "scheduler" in options:
@@ -106,14 +104,20 @@ class TrainedGenerator:
             defaults["black_threshold"] = 0
         options = defaults | options
         chosen = validate_options(module.SampleOptions, options, f"generators {self.name!r}")
+        if lengths is not None:
+            in_time = has_motion_layers(self.folder) or getattr(chosen, "noise", None) == "stretches"
+            asked = replace(asked, stretches=self._stretches(lengths, len(asked), in_time))
         seeds = sample_seeds(seed, len(asked))
         with tempfile.TemporaryDirectory(prefix="ctlev_sample_") as work:
             frames = module.sample(self.folder, asked, chosen, seeds=seeds, work=Path(work))
         return frames if self.decoder is None else self._decoded(self.decoder, frames, asked, seeds)
 
-    def _stretches(self, lengths: Sequence[int], count: int) -> tuple[str, ...]:
-        if not has_motion_layers(self.folder):
-            raise ValueError(f"{self.folder}: lengths are for a generator with motion layers; this one has none")
+    def _stretches(self, lengths: Sequence[int], count: int, in_time: bool) -> tuple[str, ...]:
+        if not in_time:
+            raise ValueError(
+                f"{self.folder}: lengths are for a generator with motion layers, which this one has not, or for the "
+                "option noise='stretches'"
+            )
         if sum(lengths) != count or any(length < 1 for length in lengths):
             raise ValueError(f"lengths must be 1 or more and add up to the {count} rows, got {list(lengths)}")
         return tuple(str(number) for number, length in enumerate(lengths) for _ in range(length))

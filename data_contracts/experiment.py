@@ -49,6 +49,12 @@ class Baseline(Frozen):
     condition: ConditionChoice
     generator: GeneratorChoice
     sampling: dict[str, Any] = Field(default_factory=dict, description="SampleOptions of the generator")
+    motion_layers: dict[str, Any] | None = Field(
+        None,
+        json_schema_extra=ADDED_LATER,
+        description="options of layers that make consecutive frames from one another, as `motion_layers` of the "
+        "experiment, which is not inherited; null = none",
+    )
     poses: DatasetChoice | None = Field(
         None, description="another dataset whose poses it is asked for; None = those of the experiment"
     )
@@ -126,6 +132,13 @@ class Experiment(Frozen):
     temporal_order: bool = Field(
         False, description="labels to sample from follow one another in time; else classes in turn and at random"
     )
+    stretch_length: int | None = Field(
+        None,
+        gt=1,
+        json_schema_extra=ADDED_LATER,
+        description="labels to sample from are stretches of so many consecutive moments each; needs temporal_order; "
+        "null = the context of motion layers, and without them moments evenly spread over all",
+    )
     view: View = Field(
         "labelled", description="bodies to sample from as their own camera sees them, or from new, random sides"
     )
@@ -186,8 +199,7 @@ class Experiment(Frozen):
         None,
         json_schema_extra=ADDED_LATER,
         description="options of layers that make consecutive frames from one another; {} = their defaults; of the "
-        "experiment's own diffusion generator, while baselines make each frame by itself; needs temporal_order; null = "
-        "none",
+        "experiment's own diffusion generator, while baselines may have their own; needs temporal_order; null = none",
     )
     oracle: Oracle | None = Field(
         None, description="recordings of the sampled poses: the most that synthetic frames can give"
@@ -269,8 +281,16 @@ class Experiment(Frozen):
 
     @model_validator(mode="after")
     def _stretches_are_asked_for(self) -> Experiment:
-        if self.motion_layers is not None and not self.temporal_order:
+        if self.temporal_order:
+            return self
+        if any(one.motion_layers is not None for one in (self, *self.baselines.values())):
             raise ValueError("motion_layers make frames that follow one another: set temporal_order to true")
+        if any(one.sampling.get("noise") == "stretches" for one in (self, *self.baselines.values())):
+            raise ValueError(
+                "sampling.noise 'stretches' is for frames that follow one another: set temporal_order to true"
+            )
+        if self.stretch_length is not None:
+            raise ValueError("stretch_length is of labels that follow one another: set temporal_order to true")
         return self
 
     @model_validator(mode="after")

@@ -17,11 +17,12 @@ from flows.prepare_dataset import (
     PreparedDataset,
     condition_asked_samples,
     condition_training_frames,
+    motion_options,
     prepare_dataset,
 )
 from flows.sampling import sample_generator
 from flows.settings import flow
-from flows.train_generator import fine_tuned
+from flows.train_generator import fine_tuned, with_motion_layers
 from tasks.ingest import ingest
 from tasks.sample import simulate
 from tasks.stage import call_flow, call_together, numbered
@@ -85,6 +86,8 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         label=label,
         of_all=part is None,
     )
+    motion = motion_options(experiment, name)
+    checkpoint = with_motion_layers(checkpoint, dataset.frames, learnt, options=motion, seed=seed, label=label)
     synthetic = sample_generator(
         experiment,
         checkpoint,

@@ -156,7 +156,7 @@ def condition_asked_samples(
 
     `labels` are those that the experiment asks for, unless they are given.
     """
-    order, motion = "in_time" if experiment.temporal_order else "random", motion_options(experiment)
+    order, length = "in_time" if experiment.temporal_order else "random", stretch_length(experiment)
     return condition_samples(
         poses,
         recordings,
@@ -166,32 +166,45 @@ def condition_asked_samples(
         encoding=experiment.encoding,
         windows=experiment.windows,
         count=experiment.num_synthetic,
-        order=order if motion is None else "stretches",
+        order=order if length is None else "stretches",
         views=experiment.view,
         seed=experiment.seed,
         part=part,
-        length=None if motion is None else motion.context,
+        length=length,
         label=_of_part(f"{condition.name}, to sample", part),
     )
 
 
-def motion_options(experiment: Experiment) -> MotionOptions | None:
-    """The options of the experiment's motion layers, checked; None where it asks for none.
+def stretch_length(experiment: Experiment) -> int | None:
+    """Moments of each stretch of labels to sample from; None where they are no stretches.
+
+    Raises:
+        PluginError: as `motion_options`.
+    """
+    found = [motion_options(experiment, name) for name in (None, *experiment.baselines)]
+    contexts = [options.context for options in found if options is not None]
+    return experiment.stretch_length or max(contexts, default=None)
+
+
+def motion_options(experiment: Experiment, baseline: str | None = None) -> MotionOptions | None:
+    """The options of the motion layers of the experiment's own generator, or a baseline's; None where it has none.
 
     Raises:
         PluginError: an option is unknown or wrong, the generator has no place for such layers, or windows are too few.
     """
-    if experiment.motion_layers is None:
+    asked = experiment if baseline is None else experiment.baselines[baseline]
+    if asked.motion_layers is None:
         return None
-    options = validate_options(MotionOptions, experiment.motion_layers, "motion_layers")
-    generator, most = experiment.generator, experiment.windows.max_windows
-    if not isinstance(plugins.load_options(experiment.sampling_choice).options, SamplingOptions):
-        raise PluginError(f"motion_layers: expected a diffusion generator, got {generator.name!r}")
-    if getattr(plugins.load_options(generator).options, "lora_rank", None) is not None:
-        raise PluginError("motion_layers: expected a generator that is trained whole, got generator.options.lora_rank")
+    where = "motion_layers" if baseline is None else f"baselines.{baseline}.motion_layers"
+    options = validate_options(MotionOptions, asked.motion_layers, where)
+    if not isinstance(plugins.load_options(asked.sampling_choice).options, SamplingOptions):
+        raise PluginError(f"{where}: expected a diffusion generator, got {asked.generator.name!r}")
+    if getattr(plugins.load_options(asked.generator).options, "lora_rank", None) is not None:
+        raise PluginError(f"{where}: expected a generator that is trained whole, got generator.options.lora_rank")
+    most = experiment.windows.max_windows
     if most is not None and most < options.context:
         raise PluginError(
-            f"motion_layers.context: stretches of {options.context} frames, but windows.max_windows keeps {most} of a "
+            f"{where}.context: stretches of {options.context} frames, but windows.max_windows keeps {most} of a "
             "recording"
         )
     return options

@@ -6,6 +6,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from ctlev_core import plugins
+from ctlev_core.diffusion.training.options import MotionOptions
 from ctlev_core.plugin_contracts import GeneratorOfLatents
 from ctlev_core.plugins import validate_options
 from data_contracts.config import GeneratorChoice
@@ -39,11 +40,13 @@ def train_generator(experiment: Experiment, dataset: PreparedDataset | None = No
         seed=seed,
         label=label,
     )
-    options = motion_options(experiment)
-    if options is None:
-        return checkpoint
-    return train_motion_layers(
-        checkpoint, dataset.frames, dataset.frame_conditions, options=options, seed=seed, label=label
+    return with_motion_layers(
+        checkpoint,
+        dataset.frames,
+        dataset.frame_conditions,
+        options=motion_options(experiment),
+        seed=seed,
+        label=label,
     )
 
 
@@ -78,6 +81,21 @@ def fine_tuned(
         if options is not None and not finetune.is_made(frames, conditions, **asked):
             latents = encode_latents(frames, latents=options, label=f"{generator.name}, autoencoder")
     return finetune(frames, conditions, base_model, latents, label=label, **asked)
+
+
+def with_motion_layers(
+    checkpoint: ManifestRef,
+    frames: ManifestRef,
+    conditions: ManifestRef,
+    *,
+    options: MotionOptions | None,
+    seed: int,
+    label: str,
+) -> ManifestRef:
+    """A fine-tuned generator with motion layers, where options of such layers are given."""
+    if options is None:
+        return checkpoint
+    return train_motion_layers(checkpoint, frames, conditions, options=options, seed=seed, label=label)
 
 
 def base_model_of(experiment: Experiment, generator: GeneratorChoice) -> ManifestRef | None:

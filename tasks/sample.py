@@ -30,8 +30,8 @@ from ctlev_core.postprocessing.quality_filter import (
 from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
 from ctlev_core.progress import ProgressBar
 from ctlev_core.recordings.stored_events import StoredEvents, stored_events
-from ctlev_core.seeds import sample_seeds
-from ctlev_core.supervised.frame_sequences import name_stretches
+from ctlev_core.seeds import distinct_seeds, sample_seeds
+from ctlev_core.supervised.frame_sequences import frame_interval_us, name_stretches, stretch_lengths
 from data_contracts import tables
 from data_contracts.arrays import load_array, save_compressed
 from data_contracts.compressed_arrays import SUFFIX
@@ -54,7 +54,7 @@ MAX_FILTER_FRAMES = 2_000
 """Training frames the quality filter is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
-@stage(version=5, schema=tables.SYNTHETIC, optional=("part",))
+@stage(version=6, schema=tables.SYNTHETIC, optional=("part",))
 def sample(
     out: Output,
     checkpoint: Manifest,
@@ -71,25 +71,27 @@ def sample(
 
     A row whose frame cannot be an event image, beside the training frames among `frames`, is sampled again, in all
     `max_attempts` times. If the last is rejected too it is kept, and says why. Where the checkpoint has motion layers,
-    rows that follow one another in time are made from one another, and none again. With `rounding`, the encoding of the
-    training frames, each frame becomes the rendering of event counts that it is the expectation of. Training frames are
-    those of one `part` of a union where one is named.
+    or the noise is that of stretches, rows that follow one another in time are made together, and none again.
+
+    With `rounding`, the encoding of the training frames, each frame becomes the rendering of event counts that it is
+    the expectation of. Training frames are those of one `part` of a union where one is named.
     """
     frames = only_part(frames, part)
     plugin, asked = plugins.load_options(sampling), conditions_of(conditions)
     num_events = None if rounding is None else training_counts(frames)
-    folder = checkpoint.ref.path / "checkpoint"
-    if has_motion_layers(folder):
-        interval_us = read_settings(folder).interval_us
-        asked = replace(asked, stretches=name_stretches(conditions.table, np.arange(len(asked)), interval_us))
+    folder, seeds = checkpoint.ref.path / "checkpoint", sample_seeds(seed, len(asked))
+    stretches = _stretches(folder, frames, conditions, plugin.options)
+    if stretches is not None:
         max_attempts = 1  # a frame that was made anew would be of another stretch
+    if has_motion_layers(folder):
+        asked = replace(asked, stretches=stretches)
+    if isinstance(plugin.options, SamplingOptions):
+        # Here, so that every row is told the seed it was made from.
+        seeds = noise_seeds(seeds, plugin.options, None if stretches is None else stretch_lengths(stretches))
 
     def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
         return plugin.module.sample(folder, asked.take(rows), plugin.options, seeds=seeds, work=out.work)
 
-    seeds = sample_seeds(seed, len(asked))
-    if isinstance(plugin.options, SamplingOptions):
-        seeds = noise_seeds(seeds, plugin.options)  # here, so that every row is told the seed it was made from
     quality_filter, told = quality_filter_of(frames), SampleLog([], [], [])
     with out.open_array("frames") as written:
         for chunk in whole_stretches(asked, _chunk_rows(frames)):
@@ -100,12 +102,24 @@ def sample(
                 quality_filter,
                 max_attempts=max_attempts,
             )
+            told.add(made.seeds, made.num_attempts, made.causes)
             if rounding is None or num_events is None:
                 written.append(made.frames)
             else:
-                written.append(round_frames(made.frames, num_events, plugins.load_options(rounding), made.seeds))
-            told.add(made.seeds, made.num_attempts, made.causes)
+                own = distinct_seeds(told.seeds)[rows[0] :]
+                written.append(round_frames(made.frames, num_events, plugins.load_options(rounding), own))
     return _table(conditions, plugin, checkpoint.ref.digest, told)
+
+
+def _stretches(folder: Path, frames: Manifest, conditions: Manifest, options: Any) -> tuple[str, ...] | None:
+    """Names of the stretches of conditions that follow one another as frames do; None where frames are single ones."""
+    if has_motion_layers(folder):
+        interval_us = read_settings(folder).interval_us
+    elif isinstance(options, SamplingOptions) and options.noise == "stretches":
+        interval_us = frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
+    else:
+        return None
+    return name_stretches(conditions.table, np.arange(len(conditions)), interval_us)
 
 
 class SampleLog(NamedTuple):

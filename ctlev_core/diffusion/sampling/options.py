@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 from typing import Any, Literal, Self
@@ -56,10 +57,10 @@ class SamplingOptions(Frozen):
     controlnet_every: int = Field(
         default=1, gt=0, description="the ControlNet is evaluated at every k-th step, its residuals reused between"
     )
-    noise: Literal["independent", "shared"] = Field(
+    noise: Literal["independent", "shared", "stretches"] = Field(
         default="independent",
-        description="independent = each row's own seed; shared = the first row's seed for all rows, so that "
-        "consecutive frames of a motion agree",
+        description="independent = each row's own seed; stretches = the first seed of each stretch of consecutive "
+        "frames for all of it, so that they agree; shared = the first row's seed for all rows",
     )
     palette: Literal["rgb", "red_blue", "grey"] = Field(
         default="rgb",
@@ -141,11 +142,16 @@ def check_spacing(scheduler: str, timestep_spacing: str) -> None:
         )
 
 
-def noise_seeds(seeds: Sequence[int], options: SamplingOptions) -> list[int]:
-    """The seeds that noise is drawn from: the rows' own, or for shared noise the first one for all rows.
+def noise_seeds(seeds: Sequence[int], options: SamplingOptions, lengths: Sequence[int] | None = None) -> list[int]:
+    """The seeds that noise is drawn from: the rows' own, or the first one of all rows or of each stretch.
 
     A frame depends on its condition and on this seed alone: sampled again by itself with this seed, a row of a call
-    with shared noise is the same.
+    with shared noise is the same. Without the `lengths` of stretches, which together are all rows, each row is one.
     """
     own = [int(seed) for seed in seeds]
-    return own[:1] * len(own) if options.noise == "shared" else own
+    if options.noise == "shared":
+        return own[:1] * len(own)
+    if options.noise == "independent" or lengths is None:
+        return own
+    starts = itertools.accumulate(lengths, initial=0)
+    return [own[start] for start, length in zip(starts, lengths, strict=False) for _ in range(length)]

@@ -208,7 +208,7 @@ def sample_frames(
     if not len(conditions):
         width, height = base_model.image_size
         return np.zeros((0, height, width, 3), np.uint8)
-    shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
+    shards = plan_shards(conditions, _noise_seeds(conditions, seeds, options), _settings(identity, options), work)
     with _progress(shards) as (missing, report):
         sample_shards(base_model, _prompts(conditions), missing, options, report)
     return _read(shards)
@@ -243,7 +243,7 @@ def sample_shards(
         if compiled_rows:
             sample = functools.partial(_compiled_if_whole, sample, batches, compiled_rows)
         parts = []
-        for rows, latents in _sampled(sample, batches, shard):
+        for rows, latents in _sampled(sample, batches, shard, whole=base_model.motion is not None):
             decode = functools.partial(_decode_rows, base_model, latents, options, shard.seeds[rows])
             parts += [frames for _, frames in decoded.map(decode, len(latents))]
             report(rows.stop - rows.start)
@@ -251,10 +251,10 @@ def sample_shards(
 
 
 def _sampled(
-    sample: Callable[[slice], Tensor], batches: ShrinkingBatches, shard: Shard
+    sample: Callable[[slice], Tensor], batches: ShrinkingBatches, shard: Shard, *, whole: bool
 ) -> Iterator[tuple[slice, Tensor]]:
-    """Batches of rows and their latents; where rows have stretches, batches of whole stretches."""
-    if shard.conditions.stretches is None:
+    """Batches of rows and their latents; `whole` for batches of whole stretches, where rows have stretches."""
+    if shard.conditions.stretches is None or not whole:
         yield from batches.map(sample, len(shard))
         return
     for rows in whole_stretches(shard.conditions, batches.size):
@@ -312,7 +312,7 @@ def sample_checkpoint(
         base_model = load_for_sampling(checkpoint, options, devices[0], with_controlnet)
         return sample_frames(base_model, conditions, options, seeds=seeds, work=work, identity=identity)
     _check_seeds(conditions, seeds)
-    shards = plan_shards(conditions, noise_seeds(seeds, options), _settings(identity, options), work)
+    shards = plan_shards(conditions, _noise_seeds(conditions, seeds, options), _settings(identity, options), work)
     with _progress(shards) as (missing, report):
         function = functools.partial(
             _sample_share, checkpoint, options, with_controlnet, _prompts(conditions), len(conditions)
@@ -404,6 +404,11 @@ def _check_scheduler(checkpoint: Path, options: SamplingOptions) -> None:
 
 def _settings(identity: str, options: SamplingOptions) -> str:
     return json.dumps([identity, cache_material(options)])
+
+
+def _noise_seeds(conditions: Conditions, seeds: Sequence[int], options: SamplingOptions) -> list[int]:
+    lengths = None if conditions.stretches is None else stretch_lengths(conditions.stretches)
+    return noise_seeds(seeds, options, lengths)
 
 
 def _prompts(conditions: Conditions) -> list[str]:
