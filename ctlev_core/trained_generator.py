@@ -110,7 +110,7 @@ class TrainedGenerator:
         seeds = sample_seeds(seed, len(asked))
         with tempfile.TemporaryDirectory(prefix="ctlev_sample_") as work:
             frames = module.sample(self.folder, asked, chosen, seeds=seeds, work=Path(work))
-        return frames if self.decoder is None else self._decoded(self.decoder, frames, asked, seeds)
+        return frames if self.decoder is None else self._decoded(self.decoder, frames, asked, seeds, lengths)
 
     def _stretches(self, lengths: Sequence[int], count: int, in_time: bool) -> tuple[str, ...]:
         if not in_time:
@@ -122,13 +122,20 @@ class TrainedGenerator:
             raise ValueError(f"lengths must be 1 or more and add up to the {count} rows, got {list(lengths)}")
         return tuple(str(number) for number, length in enumerate(lengths) for _ in range(length))
 
-    def _decoded(self, choice: DecoderChoice, frames: np.ndarray, asked: Conditions, seeds: list[int]) -> np.ndarray:
+    def _decoded(
+        self,
+        choice: DecoderChoice,
+        frames: np.ndarray,
+        asked: Conditions,
+        seeds: list[int],
+        lengths: Sequence[int] | None,
+    ) -> np.ndarray:
         from ctlev_core.pixel_decoder.decoder import open_decoder
         from ctlev_core.pixel_decoder.options import PixelDecoderOptions
 
         options = validate_options(PixelDecoderOptions, choice.options, f"pixel decoder {choice.folder}")
         decoder = open_decoder(choice.folder, options, plugins.load_options(choice.encoding))
-        return np.stack(list(decoder.redraw(frames, asked.images, seeds)))
+        return np.stack(list(decoder.redraw(frames, asked.images, seeds, lengths)))
 
 
 def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] | None = None) -> TrainedGenerator:

@@ -97,6 +97,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         sampling=baseline.sampling_choice,
         number=number,
         part=part,
+        motion=motion is not None,
         label=label,
     )
     return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)

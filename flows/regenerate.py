@@ -98,6 +98,7 @@ def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: Mani
         conditions,
         sampling=regeneration.sampling_choice,
         seed=seed,
+        motion=regeneration.motion_layers is not None,
         label=regeneration.generator.name,
     )
     calls = [partial(_score_likeness, regeneration, dataset, synthetic)]

@@ -27,6 +27,7 @@ def sample_generator(
     number: int = 0,
     seed: int | None = None,
     part: str | None = None,
+    motion: bool = False,
     label: str,
 ) -> ManifestRef:
     """Sampled frames, drawn by a pixel decoder where the experiment asks for one.
@@ -41,9 +42,14 @@ def sample_generator(
         number: of the generator, of several.
         seed: of the noise; None = that of the experiment and of the generator's number.
         part: of a union, whose training frames alone samples are compared with; None = all.
+        motion: whether the checkpoint has motion layers.
         label: of the stages.
     """
-    decoder = train_decoder(experiment, checkpoint, frames, learnt, sampling=sampling, number=number, label=label)
+    solver = plugins.load_options(sampling).options
+    stretches = motion or (isinstance(solver, SamplingOptions) and solver.noise == "stretches")
+    decoder = train_decoder(
+        experiment, checkpoint, frames, learnt, sampling=sampling, stretches=stretches, number=number, label=label
+    )
     made = sample(
         checkpoint,
         frames,
@@ -57,7 +63,7 @@ def sample_generator(
     )
     if decoder is None:
         return made
-    options = decoder_options(experiment)
+    options = decoder_options(experiment, stretches)
     return decode_pixels(decoder, made, asked, encoding=experiment.encoding, options=options, label=label)
 
 
@@ -68,10 +74,22 @@ def train_decoder(
     learnt: ManifestRef,
     *,
     sampling: SamplingChoice,
+    stretches: bool = False,
     number: int = 0,
     label: str,
 ) -> ManifestRef | None:
-    """The pixel decoder of a generator; None where the experiment asks for none, or it is no diffusion model."""
+    """The pixel decoder of a generator; None where the experiment asks for none, or it is no diffusion model.
+
+    Args:
+        experiment: what is asked for.
+        checkpoint: the trained generator.
+        frames: recorded ones.
+        learnt: conditions of the training frames.
+        sampling: the generator's sampling options.
+        stretches: whether frames are made together with those that follow one another.
+        number: of the generator, of several.
+        label: of the stage.
+    """
     if experiment.pixel_decoder is None or not isinstance(plugins.load_options(sampling).options, SamplingOptions):
         return None
     return train_pixel_decoder(
@@ -80,19 +98,20 @@ def train_decoder(
         learnt,
         sampling=without_solver(smooth(sampling)),
         encoding=experiment.encoding,
-        decoder=decoder_options(experiment).of_training,
+        decoder=decoder_options(experiment, stretches).of_training,
         seed=experiment.seed + number,
         label=label,
     )
 
 
-def decoder_options(experiment: Experiment) -> PixelDecoderOptions:
-    """The options of the experiment's pixel decoder, checked.
+def decoder_options(experiment: Experiment, stretches: bool = False) -> PixelDecoderOptions:
+    """The options of the experiment's pixel decoder, checked; only in stretches it can see the frame before.
 
     Raises:
         PluginError: an option is unknown or wrong.
     """
-    return validate_options(PixelDecoderOptions, experiment.pixel_decoder or {}, "pixel_decoder")
+    options = validate_options(PixelDecoderOptions, experiment.pixel_decoder or {}, "pixel_decoder")
+    return options if stretches else options.model_copy(update={"previous_frame": False})
 
 
 def smooth(sampling: SamplingChoice) -> SamplingChoice:

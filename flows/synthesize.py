@@ -47,6 +47,7 @@ def synthesize(
         dataset.sample_conditions,
         sampling=experiment.sampling_choice,
         number=number,
+        motion=experiment.motion_layers is not None,
         label=numbered(experiment.generator.name, number),
     )
     if isinstance(experiment, Synthesis) and experiment.export_folder is not None:

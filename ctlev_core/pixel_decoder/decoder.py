@@ -27,6 +27,7 @@ class PixelDecoder:
         classes: of its counts.
         conditioned: whether it takes condition images.
         whole_counts: whether its values are event counts, which `encoder` renders, or grey levels.
+        interval_us: from one frame to the next, where it sees what it drew for the frame before; else None.
         options: number of passes and precision.
         encoder: the encoding of the recorded frames.
     """
@@ -35,16 +36,25 @@ class PixelDecoder:
     classes: ValueClasses
     conditioned: bool
     whole_counts: bool
+    interval_us: int | None
     options: PixelDecoderOptions
     encoder: Plugin
 
-    def redraw(self, frames: Images, conditions: Images | None, seeds: Sequence[int]) -> Iterator[np.ndarray]:
+    def redraw(
+        self,
+        frames: Images,
+        conditions: Images | None,
+        seeds: Sequence[int],
+        lengths: Sequence[int] | None = None,
+    ) -> Iterator[np.ndarray]:
         """Event images with the pixel values of recorded ones, one after another.
 
         Args:
             frames: [N, H, W, 3] uint8 as the generator gives them.
             conditions: [N, H, W, 3] uint8 that they were asked for; None = there are none.
-            seeds: N non-negative integers; image i depends on its own row alone.
+            seeds: N non-negative integers; image i depends on its own row alone, and on those before it in its stretch
+                where the decoder sees the frame before.
+            lengths: frames of each stretch, which lie behind one another; None = each frame is by itself.
         Yields:
             [H, W, 3] uint8.
         """
@@ -56,6 +66,7 @@ class PixelDecoder:
             seeds=seeds,
             num_passes=self.options.num_passes,
             precision=self.options.precision,
+            lengths=lengths if self.interval_us else None,
         )
         for values in drawn:
             if self.whole_counts:
@@ -74,5 +85,4 @@ def open_decoder(folder: Path, options: PixelDecoderOptions, encoder: Plugin) ->
     Raises:
         DataError: the folder holds no pixel decoder.
     """
-    network, classes, conditioned, whole_counts = load_decoder(folder, choose_device(options.device))
-    return PixelDecoder(network, classes, conditioned, whole_counts, options, encoder)
+    return PixelDecoder(*load_decoder(folder, choose_device(options.device)), options, encoder)

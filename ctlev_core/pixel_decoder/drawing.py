@@ -5,7 +5,8 @@ the next, lower noise level given them and the noisy values before (the posterio
 drawn in one pass is drawn pixel by pixel; the passes after it see the neighbours, so that an edge becomes an edge. One
 pass alone would leave pixels independent of one another.
 
-Every image has a random stream of its own.
+Every image has a random stream of its own. A network that sees the frame before draws the frames of a stretch one after
+another, those of several stretches at a time.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ctlev_core.pixel_decoder.value_classes import ValueClasses
 from data_contracts.image_rows import Images
 
 BATCH = 16
-"""Images in memory at a time."""
+"""Images, or stretches of images, in memory at a time."""
 DRAW_STREAM = 11
 """Entropy that keeps what is drawn here apart from the noise an image was sampled from, whose seed is the same."""
 
@@ -64,7 +65,10 @@ def condition_planes(images: np.ndarray) -> np.ndarray:
 def even_sided(planes: Tensor) -> Tensor:
     """Planes [B, C, H, W] with a last row and column repeated where a side is odd."""
     bottom, right = planes.shape[2] % 2, planes.shape[3] % 2
-    return torch.nn.functional.pad(planes, (0, right, 0, bottom), mode="replicate") if bottom or right else planes
+    if not bottom and not right:
+        return planes
+    padded = torch.nn.functional.pad(planes.float(), (0, right, 0, bottom), mode="replicate")
+    return padded.to(planes.dtype)
 
 
 @torch.inference_mode()
@@ -77,8 +81,11 @@ def draw_values(
     seeds: Sequence[int],
     num_passes: int,
     precision: str = "float32",
+    lengths: Sequence[int] | None = None,
 ) -> Iterator[np.ndarray]:
     """Values of sampled images, one after another; image i depends on image, condition and seed i alone.
+
+    With `lengths` it depends on the images, conditions and seeds before it in its stretch, too.
 
     Args:
         network: trained, on the device to compute on.
@@ -88,6 +95,8 @@ def draw_values(
         seeds: N non-negative integers.
         num_passes: at least 1.
         precision: of the convolutions.
+        lengths: images of each stretch, which lie behind one another, of a network that sees the frame before; None =
+            each is by itself.
     Yields:
         [P, H, W] uint16.
     Raises:
@@ -96,13 +105,33 @@ def draw_values(
     if len(seeds) != len(frames) or (conditions is not None and len(conditions) != len(frames)):
         asked = "none" if conditions is None else len(conditions)
         raise ValueError(f"expected one seed and condition a frame, got {len(frames)}, {len(seeds)} and {asked}")
-    levels = noise_levels(num_passes, classes)
-    for start in range(0, len(frames), BATCH):
-        rows = slice(start, min(start + BATCH, len(frames)))
+    if lengths is not None and (sum(lengths) != len(frames) or any(length < 1 for length in lengths)):
+        raise ValueError(f"lengths must be 1 or more and add up to {len(frames)}, got {list(lengths)}")
+    levels, dtype = noise_levels(num_passes, classes), getattr(torch, precision)
+    counts = np.ones(len(frames), np.int64) if lengths is None else np.array(lengths, np.int64)
+    firsts = np.cumsum(counts) - counts
+    for start in range(0, len(counts), BATCH):
+        first, count = firsts[start : start + BATCH], counts[start : start + BATCH]
+        rows = slice(int(first[0]), int(first[-1] + count[-1]))
         images = as_input(image_planes(np.asarray(frames[rows]), network.num_planes))
         asked = None if conditions is None else torch.from_numpy(condition_planes(np.asarray(conditions[rows])))
         streams = [np.random.default_rng([seed, DRAW_STREAM]) for seed in seeds[rows]]
-        drawn = _draw_batch(network, levels, images, asked, streams, getattr(torch, precision))
+        drawn = np.empty(images.shape, np.int64)
+        for position in range(int(count.max())):
+            # The rows at this place of their stretch.
+            at = first[count > position] - rows.start + position
+            previous = None
+            if network.sees_previous:
+                previous = torch.from_numpy(drawn[at - 1] if position else np.full_like(drawn[at], -1))
+            drawn[at] = _draw_batch(
+                network,
+                levels,
+                images[at],
+                None if asked is None else asked[at],
+                previous,
+                [streams[row] for row in at],
+                dtype,
+            )
         for one, stream in zip(drawn, streams, strict=True):
             yield classes.draw(one, stream.random(one.shape))
 
@@ -112,13 +141,15 @@ def _draw_batch(
     levels: np.ndarray,
     images: Tensor,
     conditions: Tensor | None,
+    previous: Tensor | None,
     streams: Sequence[np.random.Generator],
     dtype: torch.dtype,
 ) -> np.ndarray:
-    """Classes [B, P, H, W] int64 of images on the CPU."""
+    """Classes [B, P, H, W] int64 of images on the CPU; `previous`, likewise, are those of the frames before."""
     device, (height, width) = network.embeddings.device, images.shape[2:]
     images = even_sided(images).to(device)
     conditions = None if conditions is None else even_sided(conditions).to(device)
+    previous = None if previous is None else even_sided(previous).to(device)
     shape = images.shape[1:]
 
     def normal() -> Tensor:
@@ -127,7 +158,8 @@ def _draw_batch(
     noisy = float(levels[0]) * normal()
     for level, following in zip(levels, [*levels[1:], None], strict=True):
         with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
-            logits = network(noisy, torch.full((len(images),), float(level), device=device), images, conditions)
+            noise_level = torch.full((len(images),), float(level), device=device)
+            logits = network(noisy, noise_level, images, conditions, previous)
         uniform = torch.from_numpy(np.stack([stream.random(shape, np.float32) for stream in streams]))
         drawn = draw_classes(logits, uniform.to(device))
         if following is not None:

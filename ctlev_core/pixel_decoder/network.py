@@ -1,6 +1,6 @@
 """The network of the pixel decoder, and the noise that it takes pixel values out of.
 
-    noisy values, sampled image, condition image, noise level
+    noisy values, sampled image, condition image, noise level, values of the frame before
     -> half the resolution: residual blocks, which see some 40 px around
     -> full resolution: two convolutions beside the inputs themselves
     -> for each pixel and plane (polarity, or colour) a logit a class of values
@@ -51,15 +51,24 @@ class PixelNetwork(nn.Module):
         condition_channels: of the condition image; 0 = there is none.
         width: channels at half the resolution.
         depth: residual blocks.
+        sees_previous: whether it takes the values of the frame before.
     """
 
     embeddings: Tensor
 
-    def __init__(self, embeddings: Tensor, num_planes: int, condition_channels: int, width: int, depth: int) -> None:
+    def __init__(
+        self,
+        embeddings: Tensor,
+        num_planes: int,
+        condition_channels: int,
+        width: int,
+        depth: int,
+        sees_previous: bool = False,
+    ) -> None:
         super().__init__()
-        self.num_planes = num_planes
+        self.num_planes, self.sees_previous = num_planes, sees_previous
         self.register_buffer("embeddings", embeddings)
-        inputs = 2 * num_planes + condition_channels + 1
+        inputs = 2 * num_planes + condition_channels + 1 + (num_planes + 1 if sees_previous else 0)
         self.first = nn.Conv2d(4 * inputs, width, 3, padding=1)
         self.blocks = nn.Sequential(*(_ResidualBlock(width) for _ in range(depth)))
         self.up = nn.Conv2d(width, 4 * _DETAIL, 1)
@@ -71,7 +80,14 @@ class PixelNetwork(nn.Module):
             nn.Conv2d(2 * _DETAIL, num_planes * len(embeddings), 1),
         )
 
-    def forward(self, noisy: Tensor, noise_level: Tensor, images: Tensor, conditions: Tensor | None) -> Tensor:
+    def forward(
+        self,
+        noisy: Tensor,
+        noise_level: Tensor,
+        images: Tensor,
+        conditions: Tensor | None,
+        previous: Tensor | None = None,
+    ) -> Tensor:
         """Unnormalised log-probabilities.
 
         Args:
@@ -79,12 +95,16 @@ class PixelNetwork(nn.Module):
             noise_level: [B] its standard deviation.
             images: [B, P, H, W] sampled images in [-1, 1].
             conditions: [B, C, H, W] in [0, 1], or None.
+            previous: [B, P, H, W] int64 classes of the frame before, -1 where there is none, of a network that sees it.
         Returns:
             [B, P, K, H, W] float32.
         """
         level = noise_level[:, None, None, None]
         planes = [noisy / torch.sqrt(level**2 + 1), images]
         planes += [] if conditions is None else [conditions]
+        if previous is not None:
+            known = previous >= 0
+            planes += [self.embeddings[previous.clamp(min=0)] * known, known[:, :1].to(noisy)]
         planes.append((level.log() / 2).expand(-1, 1, *noisy.shape[2:]))
         inputs = torch.cat(planes, dim=1).contiguous(memory_format=torch.channels_last)
         hidden = self.blocks(self.first(nn.functional.pixel_unshuffle(inputs, 2)))

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from data_contracts.config import RUN_SETTING, Frozen
+from data_contracts.config import ADDED_LATER, RUN_SETTING, Frozen
 
 DECODER_FOLDER = "decoder"
 """In the artefact of a trained decoder."""
@@ -35,6 +35,12 @@ class PixelDecoderOptions(Frozen):
     max_frames: int = Field(default=1000, ge=1, description="training frames, evenly chosen where there are more")
     num_passes: int = Field(
         default=4, ge=1, description="of the network when counts are drawn; 1 draws every pixel by itself"
+    )
+    previous_frame: bool = Field(
+        default=False,
+        json_schema_extra=ADDED_LATER,
+        description="the decoder also sees what it drew for the frame before, as it learnt from consecutive recorded "
+        "frames; of stretches of frames that are made together, elsewhere it changes nothing",
     )
     precision: Literal["float32", "bfloat16"] = Field(
         default="bfloat16", description="of the convolutions; weights, probabilities and losses stay float32"

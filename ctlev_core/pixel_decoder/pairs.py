@@ -15,7 +15,7 @@ from ctlev_core.diffusion.pretrained.loading import PretrainedModel
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.pixel_decoder.drawing import image_planes
 from ctlev_core.pixel_decoder.options import PixelDecoderOptions
-from ctlev_core.pixel_decoder.training import TrainingPairs
+from ctlev_core.pixel_decoder.training import Places, TrainingPairs
 from ctlev_core.progress import ProgressBar
 from ctlev_core.realism.chain_frames import Parts, send_through
 from ctlev_core.seeds import sample_seeds
@@ -30,25 +30,27 @@ _CHUNK = 256
 def make_pairs(
     base_model: PretrainedModel,
     frames: Images,
-    counts: Images | None,
+    values: Images,
     conditions: Conditions,
     sampling: SamplingOptions,
     options: PixelDecoderOptions,
     *,
     seed: int,
     work: Path,
+    places: Places | None = None,
 ) -> TrainingPairs:
     """The images of every time step, kept in `work` as far as an earlier run has come.
 
     Args:
         base_model: the fine-tuned generator.
         frames: [N, H, W, 3] uint8 training frames.
-        counts: [N, P, H, W] uint16 event counts of their pixels; None = the grey levels of the frames are learnt.
+        values: [N, P, H, W] event counts or grey levels of their pixels; with `places` also of other frames.
         conditions: N prompts, with N condition images where the generator has a ControlNet.
         sampling: how the generator's frames are sampled: palette, guidance, precision.
         options: time steps, and evaluations of the network.
         seed: of the noise.
         work: folder for the images.
+        places: as of `TrainingPairs`.
     Raises:
         DataError: frames are not of the generator's size, or its schedule has no such time step.
     """
@@ -70,7 +72,7 @@ def make_pairs(
                             bar.update(len(made))
                 unfinished.replace(path)
             images.append(np.load(path, mmap_mode="r", allow_pickle=False))
-    return TrainingPairs(level_planes(frames, work) if counts is None else counts, images, conditions.images)
+    return TrainingPairs(values, images, conditions.images, places)
 
 
 def level_planes(frames: Images, work: Path) -> np.ndarray:

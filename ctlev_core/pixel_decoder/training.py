@@ -5,12 +5,14 @@ Everything random is a function of (seed, step), so that a run that is killed an
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -34,7 +36,37 @@ logger = logging.getLogger(__name__)
 FEW_FRAMES = 50
 MAX_VALIDATION = 64
 """Frames held back for the validation curve, a tenth of all at most."""
+HIDDEN_PREVIOUS = 0.1
+"""Share of the frames whose previous one is not shown: the first of a stretch has none."""
 _ORDER_STREAM, _CROP_STREAM, _NOISE_STREAM, _WEIGHT_STREAM, _SPLIT_STREAM = 1, 2, 3, 4, 5
+
+
+class Places(NamedTuple):
+    """Where, among the rows of values [M, P, H, W], those of N frames lie.
+
+    Attributes:
+        own: [N] rows.
+        previous: [N] rows of the frame before each; -1 where it is not known.
+    """
+
+    own: np.ndarray
+    previous: np.ndarray
+
+
+class Crops(NamedTuple):
+    """What a step learns from.
+
+    Attributes:
+        values: [B, P, h, w].
+        images: [B, P, h, w] in [-1, 1].
+        conditions: [B, 3, h, w] in [0, 1], or None.
+        previous: [B, P, h, w] int64 values of the frame before, -1 where it is not shown; None = it never is.
+    """
+
+    values: np.ndarray
+    images: Tensor
+    conditions: Tensor | None
+    previous: np.ndarray | None
 
 
 class TrainingPairs:
@@ -44,33 +76,34 @@ class TrainingPairs:
         values: [N, P, H, W] uint8 or uint16, such as counts by polarity.
         images: one or more [N, H, W, 3] uint8, such as of several noise levels.
         conditions: [N, H, W, 3] uint8, or None.
+        places: where values of frames lie, of a decoder that sees the frame before; None = values are [N, P, H, W].
     Raises:
         ValueError: numbers or sizes differ.
     """
 
-    def __init__(self, values: Images, images: Sequence[Images], conditions: Images | None) -> None:
-        shape = (len(values), *values.shape[2:], 3)
+    def __init__(
+        self, values: Images, images: Sequence[Images], conditions: Images | None, places: Places | None = None
+    ) -> None:
+        shape = (len(values) if places is None else len(places.own), *values.shape[2:], 3)
         given = [*images, *([] if conditions is None else [conditions])]
         if not images or not len(values) or any(tuple(each.shape) != shape for each in given):
             raise ValueError(f"expected images and conditions of shape {shape}, got {[each.shape for each in given]}")
-        self.values, self.images, self.conditions = values, images, conditions
+        self.values, self.images, self.conditions, self.places = values, images, conditions, places
 
     def __len__(self) -> int:
-        return len(self.values)
+        return len(self.images[0])
 
     def digest(self) -> str:
-        """Of the pixels."""
+        """Of the pixels, and of what is the frame before what."""
         arrays = [self.values, *self.images, *([] if self.conditions is None else [self.conditions])]
-        return " ".join(as_image_rows(array).digest() for array in arrays)
+        told = [as_image_rows(array).digest() for array in arrays]
+        if self.places is not None:
+            told.append(hashlib.sha256(np.stack(self.places).astype(np.int64).tobytes()).hexdigest())
+        return " ".join(told)
 
-    def crops(
-        self, rows: np.ndarray, crop_px: int, num_planes: int, rng: np.random.Generator
-    ) -> tuple[np.ndarray, Tensor, Tensor | None]:
-        """Values [B, P, h, w], images [B, P, h, w] and conditions [B, 3, h, w] of square crops, turned and mirrored.
-
-        All three are cut, turned and mirrored together; which of the images of a frame is drawn.
-        """
-        values, images, conditions = [], [], []
+    def crops(self, rows: np.ndarray, crop_px: int, num_planes: int, rng: np.random.Generator) -> Crops:
+        """Square crops, turned and mirrored, all of a frame together; which of the images of a frame is drawn."""
+        values, images, conditions, previous = [], [], [], []
         height, width = self.values.shape[2:]
         side = min(crop_px, height, width) // 2 * 2
         for row in rows.tolist():
@@ -83,19 +116,32 @@ class TrainingPairs:
                 planes = np.rot90(planes[0][window], turns, axes=(1, 2))
                 return planes[..., ::-1] if mirrored else planes
 
+            def values_of(row: int, moved=moved) -> np.ndarray:
+                return moved(np.asarray(self.values[row : row + 1]))
+
             one = slice(row, row + 1)
-            values.append(moved(np.asarray(self.values[one])))
+            values.append(values_of(row if self.places is None else int(self.places.own[row])))
             images.append(moved(image_planes(np.asarray(chosen[one]), num_planes)))
             if self.conditions is not None:
                 conditions.append(moved(condition_planes(np.asarray(self.conditions[one]))))
-        stacked = None if self.conditions is None else torch.from_numpy(np.stack(conditions))
-        return np.stack(values), as_input(np.stack(images)), stacked
+            if self.places is not None:
+                before = int(self.places.previous[row])
+                hidden = before < 0 or rng.random() < HIDDEN_PREVIOUS
+                previous.append(np.full(values[-1].shape, -1) if hidden else values_of(before).astype(np.int64))
+        return Crops(
+            np.stack(values),
+            as_input(np.stack(images)),
+            None if self.conditions is None else torch.from_numpy(np.stack(conditions)),
+            None if self.places is None else np.stack(previous),
+        )
 
 
-def build_network(classes: ValueClasses, num_planes: int, conditioned: bool, width: int, depth: int) -> PixelNetwork:
+def build_network(
+    classes: ValueClasses, num_planes: int, conditioned: bool, width: int, depth: int, sees_previous: bool = False
+) -> PixelNetwork:
     """A network with weights from torch's random stream."""
     embeddings = torch.from_numpy(classes.embeddings)
-    return PixelNetwork(embeddings, num_planes, 3 if conditioned else 0, width, depth).to(
+    return PixelNetwork(embeddings, num_planes, 3 if conditioned else 0, width, depth, sees_previous).to(
         memory_format=torch.channels_last  # pyright: ignore[reportCallIssue]
     )
 
@@ -127,7 +173,14 @@ def train_pixel_decoder(
     classes, num_planes = fit_classes(pairs.values), pairs.values.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(np.random.SeedSequence([seed, _WEIGHT_STREAM]).generate_state(1)[0]))
-        network = build_network(classes, num_planes, pairs.conditions is not None, options.width, options.depth)
+        network = build_network(
+            classes,
+            num_planes,
+            pairs.conditions is not None,
+            options.width,
+            options.depth,
+            sees_previous=pairs.places is not None,
+        )
     network = network.to(device)
     learning = TrainingOptions(
         num_steps=options.num_steps,
@@ -195,10 +248,13 @@ class _Step:
 
     def loss(self, rows: np.ndarray, number: int) -> Tensor:
         rng = np.random.default_rng([self.seed, _CROP_STREAM, number])
-        values, images, conditions = self.pairs.crops(rows, self.options.crop_px, self.network.num_planes, rng)
-        classes = torch.from_numpy(self.classes.classes_of(values)).to(self.device)
+        crops = self.pairs.crops(rows, self.options.crop_px, self.network.num_planes, rng)
+        classes, previous = torch.from_numpy(self.classes.classes_of(crops.values)).to(self.device), None
+        if crops.previous is not None:
+            shown = self.classes.classes_of(crops.previous.clip(min=0))
+            previous = torch.from_numpy(np.where(crops.previous < 0, -1, shown)).to(self.device)
         levels = np.exp(np.log(TRAINED_NOISE) + TRAINED_SPREAD * rng.standard_normal(len(rows))).clip(0.1, 10)
-        noise = torch.from_numpy(rng.standard_normal(values.shape, np.float32)).to(self.device)
+        noise = torch.from_numpy(rng.standard_normal(crops.values.shape, np.float32)).to(self.device)
         level = torch.from_numpy((levels * self.classes.active_step).astype(np.float32)).to(self.device)
         noisy = self.network.embeddings[classes] + level[:, None, None, None] * noise
         enabled = self.options.precision != "float32"
@@ -206,8 +262,9 @@ class _Step:
             logits = self.network(
                 noisy,
                 level,
-                images.to(self.device),
-                None if conditions is None else conditions.to(self.device),
+                crops.images.to(self.device),
+                None if crops.conditions is None else crops.conditions.to(self.device),
+                previous,
             )
         return torch.nn.functional.cross_entropy(logits.transpose(1, 2), classes)
 

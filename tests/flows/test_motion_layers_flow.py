@@ -9,16 +9,24 @@ from flow_scripts import artefacts, run_script_here
 from ctlev_core.events import files as event_files
 from ctlev_core.export.event_dataset import EventDataset
 from ctlev_core.export.event_sequences import EventSequences
+from ctlev_core.plugins import load_options
+from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts
 from ctlev_core.provenance.records import read_records, write_provenance
+from ctlev_core.seeds import distinct_seeds
 from ctlev_core.trained_generator import load_generator
+from flows.command_line import load_experiment
 
 SMALL = (
     "dataset.options={num_train_recordings: 6, num_test_recordings: 1, num_condition_recordings: 3, "
     "recording_duration_us: 140000}",
     "windows={method: duration, duration_us: 20000}",
     "generator.options={tune: both, num_steps: 2, batch_size: 2}",
+    "stretch_length=null",
     "motion_layers={context: 4, batch_size: 4, num_steps: 3, learning_rate: 0.01}",
+    "pixel_decoder=null",
+    "stochastic_rounding=true",
     "sampling={num_inference_steps: 2, palette: red_blue, black_threshold: 0}",
+    "baselines={independent: {}}",
     "num_synthetic=10",
     "downstream_seeds=[0]",
 )
@@ -95,6 +103,11 @@ def test_from_python_the_same_frames_come(home, tmp_path):
     (image,) = artefacts(home, "finetune")
     with pytest.raises(ValueError, match="lengths are for a generator with motion layers"):
         load_generator(image.ref.path).sample(**asked_for, lengths=[4, 4, 2], **options)
+    # Without such layers frames can share their noise.
+    images = np.repeat(asked.array("images")[:1], 10, axis=0)
+    alike = load_generator(image.ref.path).sample(images=images, lengths=[4, 4, 2], noise="stretches", **options)
+    assert [len(np.unique(alike[rows], axis=0)) for rows in (slice(0, 4), slice(4, 8), slice(8, 10))] == [1, 1, 1]
+    assert len(np.unique(alike, axis=0)) == 3
     # By the name of a report, with the run's own options.
     made = next(one for one in artefacts(home, "sample") if motion.ref.digest in one.column("checkpoint_digest"))
     roles = [("checkpoint of synthetic", motion.ref.path), ("frames of synthetic", made.ref.path)]
@@ -117,7 +130,47 @@ def test_what_does_not_go_together_is_refused_before_anything_runs(tmp_path):
         ("temporal_order=false", "motion_layers make frames that follow one another"),
         ("windows.max_windows=2", "windows.max_windows"),
         ("generator.options.lora_rank=4", "motion_layers: expected a generator that is trained whole"),
+        ("baselines={other: {motion_layers: {contxt: 4}}}", "baselines.other.motion_layers: unknown option 'contxt'"),
     ):
         finished = run(tmp_path, further)
         assert finished.status == 2 and message in finished.errors, finished.errors
     assert not (tmp_path / "artefacts").exists()
+
+
+def test_noise_of_stretches_without_motion_layers(home):
+    """The generator makes each frame by itself, of noise that it shares with its stretch; a baseline has the layers."""
+    own = ("motion_layers=null", "stretch_length=4", "sampling.noise=stretches")
+    layers = "{motion_layers: {context: 4, batch_size: 4, num_steps: 3, learning_rate: 0.01}"
+    before = {one.ref.key for one in artefacts(home, "sample")}
+    baseline = f"baselines={{layers: {layers}, sampling: {{noise: independent}}}}}}"
+    for script in ("synthesize", "baselines"):
+        finished = run(home, *own, baseline, script=script)
+        assert finished.status == 0, finished.errors
+    # The baseline is what the experiment's own generator was in the runs above.
+    assert len(artefacts(home, "finetune")) == len(artefacts(home, "train_motion_layers")) == 1
+    (made,) = (one for one in artefacts(home, "sample") if one.ref.key not in before)
+    seeds = made.column("seed")
+    assert [len(set(seeds[rows])) for rows in (slice(0, 4), slice(4, 8), slice(8, 10))] == [1, 1, 1]
+    assert len(set(seeds)) == 3 and set(made.column("num_attempts")) == {1}
+    # What is rounded at random is another sensor's noise in each frame.
+    assert run(home, *own, "stochastic_rounding=false").status == 0
+    (expected,) = (one for one in artefacts(home, "sample") if one.ref.key not in before | {made.ref.key})
+    (encoded,) = artefacts(home, "encode")
+    counts, encoding = training_counts(encoded), load_options(load_experiment("sequences", []).encoding)
+    own_seeds = distinct_seeds(seeds)
+    assert len(set(own_seeds)) == 10
+    rounded = round_frames(np.asarray(expected.array("frames")), counts, encoding, own_seeds)
+    np.testing.assert_array_equal(made.array("frames")[:], rounded)
+
+
+@pytest.mark.parametrize(
+    ("further", "message"),
+    [
+        (("motion_layers=null", "sampling.noise=stretches"), "sampling.noise 'stretches' is for frames that follow"),
+        (("motion_layers=null", "stretch_length=4"), "stretch_length is of labels that follow one another"),
+        (("motion_layers=null", "baselines={other: {motion_layers: {}}}"), "motion_layers make frames that follow"),
+    ],
+)
+def test_stretches_need_an_order_in_time(tmp_path, further, message):
+    finished = run(tmp_path, "temporal_order=false", "sequence_length=null", *further)
+    assert finished.status == 2 and message in finished.errors, finished.errors

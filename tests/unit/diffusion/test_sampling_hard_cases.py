@@ -148,6 +148,17 @@ def test_shared_noise_is_the_first_rows(tmp_path, scheduler):
     assert np.array_equal(drawn[1], drawn[3]) and not np.array_equal(drawn[0], drawn[1])
 
 
+def test_noise_of_stretches_is_that_of_their_first_rows(tmp_path):
+    options = options_of(noise="stretches")
+    assert noise_seeds([3, 1, 4, 1, 5], options, [2, 3]) == [3, 3, 4, 4, 4]
+    assert noise_seeds([3, 1, 4], options) == noise_seeds([3, 1, 4], options_of(), [2, 1]) == [3, 1, 4]
+    conditions = make_data(5, seed=4)[1]
+    stretches = dataclasses.replace(conditions, stretches=("a", "a", "b", "b", "b"))
+    frames = sample_frames(shared_base_model(), stretches, options, seeds=[3, 1, 4, 1, 5], work=tmp_path)
+    plain = sample_frames(shared_base_model(), conditions, options_of(), seeds=[3, 3, 4, 4, 4], work=tmp_path)
+    np.testing.assert_array_equal(frames, plain)
+
+
 def test_shards_of_shared_noise_are_named_by_the_seed_that_counts(tmp_path):
     conditions, options = make_data(4, seed=4)[1], options_of(noise="shared")
     first = sample_frames(shared_base_model(), conditions, options, seeds=[3, 1, 4, 1], work=tmp_path)

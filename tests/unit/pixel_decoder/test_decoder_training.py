@@ -83,8 +83,8 @@ def test_pairs_of_different_sizes_are_refused():
 def test_a_decoder_on_disk_is_the_one_that_was_saved(tmp_path):
     network, classes, _ = train_pixel_decoder(make_pairs(), SMALL, seed=3, work=tmp_path / "work")
     save_decoder(tmp_path / "decoder", network, classes, SMALL, conditioned=False, whole_counts=True)
-    loaded, same, conditioned, whole_counts = load_decoder(tmp_path / "decoder", torch.device("cpu"))
-    assert whole_counts and not conditioned and vars(same).keys() == vars(classes).keys()
+    loaded, same, conditioned, whole_counts, interval_us = load_decoder(tmp_path / "decoder", torch.device("cpu"))
+    assert whole_counts and not conditioned and interval_us is None and vars(same).keys() == vars(classes).keys()
     frames = make_pairs(3).images[0]
     one, other = (
         np.stack(list(draw_values(*each, frames, None, seeds=range(3), num_passes=2)))
