@@ -66,7 +66,7 @@ def test_counts_images_and_conditions_are_cut_and_turned_together(num_planes):
     channels = [counts[:, 0], counts[:, 0] if num_planes == 1 else np.zeros_like(counts[:, 0]), counts[:, -1]]
     frames = np.stack(channels, axis=3).astype(np.uint8)
     pairs = TrainingPairs(counts, [frames, frames], 255 - frames)
-    found, images, conditions = pairs.crops(np.arange(6), 12, num_planes, np.random.default_rng(0))
+    found, images, conditions, _ = pairs.crops(np.arange(6), 12, num_planes, np.random.default_rng(0))
     assert found.shape == (6, num_planes, 12, 12) and conditions.shape == (6, 3, 12, 12)
     np.testing.assert_allclose((images.numpy() + 1) * 127.5, found, atol=1e-3)
     np.testing.assert_allclose(255 - conditions.numpy()[:, [0, 2][:num_planes]] * 255, found, atol=1e-3)
