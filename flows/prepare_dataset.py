@@ -10,10 +10,11 @@ from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.options import MotionOptions
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.scoring.sensor_pixels import check_in_image
+from ctlev_core.supervised.frame_sequences import name_followed, training_interval_us
 from data_contracts.config import ConditionChoice, Frozen
 from data_contracts.experiment import Experiment, LabelChoice
 from data_contracts.labels import HeldOut
-from data_contracts.manifest import ManifestRef
+from data_contracts.manifest import ManifestRef, read_manifest
 from flows.cli import script
 from flows.command_line import Command
 from flows.settings import flow
@@ -87,6 +88,9 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         poses = ingest(dataset=experiment.poses, label=f"{experiment.poses.name}, poses")
     frame_conditions = condition_training_frames(experiment, recordings, frames, experiment.condition)
     sample_conditions = condition_asked_samples(experiment, poses, recordings, frames, experiment.condition)
+    if sample_conditions.digest and _in_stretches(experiment):  # planned ones cannot be looked at
+        told, learnt = read_manifest(sample_conditions), read_manifest(frames)
+        name_followed(told.table, training_interval_us(learnt), told.ref.path)
     sheet = contact_sheet(
         frames,
         frame_conditions,
@@ -106,6 +110,12 @@ def prepare_dataset(experiment: Experiment) -> PreparedDataset:
         target_frames=target_frames,
         target_recordings=target_recordings,
     )
+
+
+def _in_stretches(experiment: Experiment) -> bool:
+    """Are frames made together with those that follow one another, by the generator or a baseline?"""
+    own = [experiment, *experiment.baselines.values()]
+    return any(one.motion_layers is not None or one.sampling.get("noise") == "stretches" for one in own)
 
 
 def held_out_of(experiment: Experiment) -> HeldOut | None:

@@ -22,7 +22,7 @@ from ctlev_core.postprocessing.event_streams import TimeModel, fit_times, join_w
 from ctlev_core.postprocessing.image_counts import CountModel, estimate_counts, fit_counts
 from ctlev_core.progress import ProgressBar
 from ctlev_core.recordings.stored_events import StoredEvents, stored_events
-from ctlev_core.supervised.frame_sequences import frame_interval_us, name_stretches, stretch_lengths
+from ctlev_core.supervised.frame_sequences import name_stretches, stretch_lengths, training_interval_us
 from data_contracts import tables
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
@@ -66,7 +66,7 @@ def export_events(
     rows: list[dict[str, Any]] = []
     interval_us, lengths = None, [1] * len(generated)
     if export.streams == "stretches":
-        interval_us = frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
+        interval_us = training_interval_us(frames)
         lengths = stretch_lengths(name_stretches(generated.table, np.arange(len(generated)), interval_us))
     windows = _window_events(generated, counts, times, export, rows, interval_us)
     joined = _streams(windows, lengths, interval_us or 0, times.least_gap_us)

@@ -31,7 +31,7 @@ from ctlev_core.postprocessing.stochastic_rounding import round_frames, training
 from ctlev_core.progress import ProgressBar
 from ctlev_core.recordings.stored_events import StoredEvents, stored_events
 from ctlev_core.seeds import distinct_seeds, sample_seeds
-from ctlev_core.supervised.frame_sequences import frame_interval_us, name_stretches, stretch_lengths
+from ctlev_core.supervised.frame_sequences import name_followed, stretch_lengths, training_interval_us
 from data_contracts import tables
 from data_contracts.arrays import load_array, save_compressed
 from data_contracts.compressed_arrays import SUFFIX
@@ -112,14 +112,18 @@ def sample(
 
 
 def _stretches(folder: Path, frames: Manifest, conditions: Manifest, options: Any) -> tuple[str, ...] | None:
-    """Names of the stretches of conditions that follow one another as frames do; None where frames are single ones."""
+    """Names of the stretches of conditions that follow one another as frames do; None where frames are single ones.
+
+    Raises:
+        DataError: no two do.
+    """
     if has_motion_layers(folder):
         interval_us = read_settings(folder).interval_us
     elif isinstance(options, SamplingOptions) and options.noise == "stretches":
-        interval_us = frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
+        interval_us = training_interval_us(frames)
     else:
         return None
-    return name_stretches(conditions.table, np.arange(len(conditions)), interval_us)
+    return name_followed(conditions.table, interval_us, conditions.ref.path)
 
 
 class SampleLog(NamedTuple):

@@ -21,7 +21,7 @@ from ctlev_core.labels.sources import (
     rows_of_frames,
     sensor_size_of,
 )
-from ctlev_core.supervised.frame_sequences import frame_interval_us
+from ctlev_core.supervised.frame_sequences import training_interval_us
 from data_contracts import tables
 from data_contracts.config import EncodingChoice, Windows
 from data_contracts.errors import DataError
@@ -86,7 +86,7 @@ def choose_rows_to_sample(
         if chosen is None:
             if order == "stretches":
                 names, times = moments["recording_id"].to_pylist(), moments["t_us"].to_numpy()
-                chosen = choose_stretches(names, times, count, length, _interval_us(frames))
+                chosen = choose_stretches(names, times, count, length, training_interval_us(frames))
             else:
                 allowed = inner_moments(moments, frames) if order == "random" else np.arange(moments.num_rows)
                 chosen = choose_in_turn(moments, allowed, count, order, seed)
@@ -112,7 +112,7 @@ def choose_rows_to_sample(
         if order == "stretches":
             names, times = frames.column("recording_id"), frames.table["t_end_us"].to_numpy()[learnt]
             own = [names[row] for row in learnt]
-            learnt = learnt[choose_stretches(own, times, count, length, _interval_us(frames))]
+            learnt = learnt[choose_stretches(own, times, count, length, training_interval_us(frames))]
         else:
             learnt = choose_in_turn(frames.table, learnt, count, order, seed)
         rows = rows_of_frames(recordings, frames, learnt)
@@ -130,11 +130,6 @@ def choose_in_turn(table: pa.Table, rows: np.ndarray, count: int, order: LabelOr
         return rows[np.sort(np.resize(spread(len(rows), count), count))]
     classes, recordings = (np.array(table[name].to_pylist())[rows].tolist() for name in ("class_name", "recording_id"))
     return rows[balanced_choice(classes, recordings, count, seed)]
-
-
-def _interval_us(frames: Manifest) -> int:
-    """From one training frame to the next."""
-    return frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
 
 
 def label_moments(poses: Manifest) -> pa.Table:

@@ -106,6 +106,11 @@ def frame_interval_us(table: pa.Table, rows: np.ndarray, where: object) -> int:
     return int(np.quantile(steps[steps > 0], 0.5, method="lower"))
 
 
+def training_interval_us(frames: Manifest) -> int:
+    """`frame_interval_us` of training frames."""
+    return frame_interval_us(frames.table, frames.rows_where(split="train"), frames.ref.path)
+
+
 def name_stretches(table: pa.Table, rows: np.ndarray, interval_us: int) -> tuple[str, ...]:
     """Names of the stretches of frames that follow one another every `interval_us`, of each row of a table of frames.
 
@@ -124,6 +129,21 @@ def name_stretches(table: pa.Table, rows: np.ndarray, interval_us: int) -> tuple
     else:
         follows |= steps == 1
     return tuple(map(str, np.cumsum(np.concatenate([[0], ~follows]))))
+
+
+def name_followed(table: pa.Table, interval_us: int, where: object) -> tuple[str, ...]:
+    """`name_stretches` of all rows, of which some must follow one another.
+
+    Raises:
+        DataError: none does; `where` says of what.
+    """
+    names = name_stretches(table, np.arange(table.num_rows), interval_us)
+    if len(names) == len(set(names)) > 1:
+        raise DataError(
+            f"{where}: none of {len(names)} labels to sample from follows another by {interval_us} us, as training "
+            "frames do: set stretch_length, or take labels of that rate"
+        )
+    return names
 
 
 def _steps(table: pa.Table, rows: np.ndarray) -> np.ndarray:

@@ -163,6 +163,15 @@ def test_noise_of_stretches_without_motion_layers(home):
     np.testing.assert_array_equal(made.array("frames")[:], rounded)
 
 
+def test_labels_that_do_not_follow_one_another_are_refused(home):
+    """Four moments, evenly spread over three recordings, lie farther apart than frames."""
+    further = ("motion_layers=null", "stretch_length=null", "sampling.noise=stretches", "num_synthetic=4")
+    finished = run(home, *further)
+    assert finished.status == 2
+    assert "none of 4 labels to sample from follows another by 20008 us" in finished.errors
+    assert "finetune" not in finished.errors, "before anything is learnt"
+
+
 @pytest.mark.parametrize(
     ("further", "message"),
     [
