@@ -4,10 +4,10 @@
     python benchmarks/sequences.py                        # some ten minutes on one core; of the run's own generators
     python benchmarks/sequences.py --stretches 8          # fewer, for a look
 
-Each line samples the same labels from the same checkpoints, rounds to event counts, and prints the CPU time of a
-stretch of 16 frames, that beside frames made one by one with as many evaluations, and the numbers of
-`ctlev_core.realism.sequences`. Recorded training stretches are the first line. The target is the issue of speed: a
-stretch takes at most 1.5 times as long as 16 frames made one by one.
+Each line samples the same labels from the same checkpoints, draws event counts by rounding or a pixel decoder, and
+prints the CPU time of a stretch of 16 frames, that beside frames made one by one with as many evaluations, and the
+numbers of `ctlev_core.realism.sequences`. Recorded training stretches are the first line. Target: a stretch takes at
+most 1.5 times as long as 16 frames made one by one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,11 +30,14 @@ from ctlev_core import plugins  # noqa: E402
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, conditions_to_tensor, encode_prompts  # noqa: E402
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds  # noqa: E402
 from ctlev_core.diffusion.sampling.sampling import decode_frames, load_for_sampling, sample_latents  # noqa: E402
+from ctlev_core.pixel_decoder.decoder import open_decoder  # noqa: E402
+from ctlev_core.pixel_decoder.options import DECODER_FOLDER, PixelDecoderOptions  # noqa: E402
 from ctlev_core.postprocessing.stochastic_rounding import round_frames, training_counts  # noqa: E402
 from ctlev_core.provenance.records import Record, read_provenance  # noqa: E402
 from ctlev_core.realism.sequences import LabelledJoints, estimate_numbers, measure_stretch  # noqa: E402
-from ctlev_core.seeds import distinct_seeds, sample_seeds  # noqa: E402
+from ctlev_core.seeds import sample_seeds  # noqa: E402
 from data_contracts.config import EncodingChoice  # noqa: E402
+from data_contracts.labels import Conditions  # noqa: E402
 from data_contracts.manifest import Manifest, ManifestRef, conditions_of, read_manifest  # noqa: E402
 
 LENGTH, MEASURED, TARGET = 16, 8, 1.5
@@ -48,14 +51,19 @@ class Case(NamedTuple):
     noise: str
     steps: int
     context: int
+    pixels: str
 
 
+ROUNDED, DECODER, BEFORE = "rounded", "decoder", "frame before"
 CASES = (
-    *(Case("independent", steps, 0) for steps in (3, 5, 10, 20)),
-    *(Case("stretches", steps, 0) for steps in (3, 5, 10, 20)),
-    *(Case("independent", steps, LENGTH) for steps in (5, 20)),
-    *(Case("independent", 5, context) for context in (4, 8)),
-    Case("stretches", 5, LENGTH),
+    *(Case("independent", steps, 0, DECODER) for steps in (3, 5, 10, 20)),
+    Case("independent", 5, 0, ROUNDED),
+    *(Case("stretches", steps, 0, BEFORE) for steps in (3, 5, 10, 20)),
+    Case("stretches", 5, 0, DECODER),
+    Case("stretches", 5, 0, ROUNDED),
+    *(Case("independent", 5, context, BEFORE) for context in (4, 8, LENGTH)),
+    Case("independent", 20, LENGTH, BEFORE),
+    Case("independent", 5, LENGTH, ROUNDED),
 )
 
 
@@ -68,76 +76,110 @@ def main() -> None:
     parser.add_argument("--stretches", type=int, default=30, help="of 16 frames each")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    records = {one.role: one for one in read_provenance(chosen.home / "reports" / chosen.run / "provenance.json")}
-    image, layers = records["checkpoint of synthetic"], records[f"checkpoint of {chosen.layers}"]
-    frames, asked = (_open(chosen.home, records[role]) for role in ("frames", "conditions"))
-    sampled = next(one for one in records.values() if one.stage == "sample")
-    given = sampled.arguments["sampling"]["options"]
+    run = Run(chosen.home, chosen.run, chosen.layers)
     print(f"{chosen.run}: stretches of {LENGTH} frames, seconds of one core; numbers over {MEASURED} frames")
-    print(f"{'layers':>8}{'noise':>13}{'evaluations':>13}{'context':>9}{'s':>7}{'ratio':>7}  "
-          + "".join(f"{name.replace('_', ' ')[:16]:>18}" for name in SHOWN))  # fmt: skip
-    print(f"{'recorded':>57}  {_told(_recorded(frames))}")
+    columns = f"{'layers':>8}{'noise':>13}{'evaluations':>13}{'context':>9}{'pixels':>14}{'s':>7}{'ratio':>7}  "
+    print(columns + "".join(f"{name.replace('_', ' ')[:16]:>18}" for name in SHOWN))
+    print(f"{'recorded':>{len(columns) - 2}}  {_told(_recorded(run.frames))}")
     alone: dict[int, float] = {}
     ratios: list[float] = []
     for case in CASES:
-        options = SamplingOptions(**(given | {"noise": case.noise, "num_inference_steps": case.steps}))
-        folder = chosen.home / "artefacts" / (layers if case.context else image).stage
-        base_model = load_for_sampling(
-            folder / (layers if case.context else image).key / "checkpoint", options, "cpu", with_controlnet=True
+        made, seconds = run.sample(case, chosen.stretches)
+        alone.setdefault(case.steps, seconds)
+        ratios.append(seconds / alone[case.steps])
+        numbers = _numbers(made, run.asked, np.arange(len(made)), "source_id")
+        print(
+            f"{'yes' if case.context else 'no':>8}{case.noise:>13}{case.steps:>13}{case.context or '':>9}"
+            f"{case.pixels:>14}{seconds:7.2f}{ratios[-1]:7.2f}  {_told(numbers)}",
+            flush=True,
         )
-        if case.context:
-            assert base_model.motion is not None
-            settings = base_model.motion.settings._replace(context=case.context)
-            base_model.motion.settings = settings
-        made, seconds = _sample(base_model, asked, options, chosen.stretches)
-        if case.noise == "independent" and not case.context:
-            alone[case.steps] = seconds
-        ratio = seconds / alone[case.steps]
-        ratios.append(ratio)
-        numbers = _numbers(_rounded(made, frames, records["frames"]), asked, np.arange(len(made)), "source_id")
-        print(f"{'yes' if case.context else 'no':>8}{case.noise:>13}{case.steps:>13}{case.context or '':>9}"
-              f"{seconds:7.2f}{ratio:7.2f}  {_told(numbers)}", flush=True)  # fmt: skip
     for what, wanted in (("noise of stretches", 0), ("motion layers", LENGTH)):
         most = max(ratio for case, ratio in zip(CASES, ratios, strict=True) if case.context == wanted)
         verdict = "met" if most <= TARGET else "missed"
         print(f"{what}: at most {most:.2f} x frames made one by one, target {TARGET}: {verdict}")
 
 
-def _open(home: Path, record: Record) -> Manifest:
-    return read_manifest(
-        ManifestRef(key=record.key, path=home / "artefacts" / record.stage / record.key, digest=record.digest)
-    )
+class Run:
+    """What a run made, and frames made of it anew.
+
+    Args:
+        home: folder of all state.
+        name: of the report.
+        layers: name of the baseline with motion layers.
+    """
+
+    def __init__(self, home: Path, name: str, layers: str) -> None:
+        self.home = home
+        records = read_provenance(home / "reports" / name / "provenance.json")
+        by_role = {one.role: one for one in records}
+        self.image, self.layers = by_role["checkpoint of synthetic"], by_role[f"checkpoint of {layers}"]
+        self.frames, self.asked = self._open(by_role["frames"]), self._open(by_role["conditions"])
+        self.sampling = next(one for one in records if one.stage == "sample").arguments["sampling"]["options"]
+        encoding = by_role["frames"].arguments["encoding"]
+        self.encoder = EncodingChoice(name=encoding["plugin"].rpartition("/")[2], options=encoding["options"])
+        self.decoders = {
+            (one.arguments["checkpoint"]["manifest"], bool(one.arguments["decoder"].get("previous_frame"))): one
+            for one in records
+            if one.stage == "train_pixel_decoder"
+        }
+
+    def sample(self, case: Case, stretches: int) -> tuple[np.ndarray, float]:
+        """Frames of the first stretches, and CPU seconds of one."""
+        threshold = self.sampling["black_threshold"] if case.pixels == ROUNDED else 0
+        changed = {"noise": case.noise, "num_inference_steps": case.steps, "black_threshold": threshold}
+        options = SamplingOptions(**(self.sampling | changed))
+        checkpoint = self.layers if case.context else self.image
+        base_model = load_for_sampling(self._folder(checkpoint) / "checkpoint", options, "cpu", with_controlnet=True)
+        if base_model.motion is not None:
+            base_model.motion.settings = base_model.motion.settings._replace(context=case.context)
+        conditions = conditions_of(self.asked).take(slice(0, stretches * LENGTH))
+        own = sample_seeds(0, len(conditions))
+        seeds = noise_seeds(own, options, [LENGTH] * stretches)
+        draw = self._drawer(case, checkpoint.key)
+        found, seconds = [], []
+        for start in range(0, len(conditions), LENGTH):
+            rows = slice(start, start + LENGTH)
+            began = time.process_time()
+            smooth = _sample_stretch(base_model, conditions.take(rows), seeds[rows], options)
+            found.append(draw(smooth, conditions.take(rows), own[rows]))
+            seconds.append(time.process_time() - began)
+        return np.concatenate(found), float(np.median(seconds))
+
+    def _drawer(self, case: Case, checkpoint: str) -> Callable[[np.ndarray, Conditions, list[int]], np.ndarray]:
+        """From smooth images, what they were asked for and seeds to images of whole counts."""
+        encoder = plugins.load_options(self.encoder)
+        if case.pixels == ROUNDED:
+            counts = training_counts(self.frames)
+            return lambda smooth, asked, seeds: round_frames(smooth, counts, encoder, seeds)
+        record = self.decoders[checkpoint, case.pixels == BEFORE]
+        options = PixelDecoderOptions(**record.arguments["decoder"])
+        decoder = open_decoder(self._folder(record) / DECODER_FOLDER, options, encoder)
+        return lambda smooth, asked, seeds: np.stack(list(decoder.redraw(smooth, asked.images, seeds, [len(seeds)])))
+
+    def _folder(self, record: Record) -> Path:
+        return self.home / "artefacts" / record.stage / record.key
+
+    def _open(self, record: Record) -> Manifest:
+        return read_manifest(ManifestRef(key=record.key, path=self._folder(record), digest=record.digest))
 
 
 @torch.no_grad()
-def _sample(
-    base_model: PretrainedModel, asked: Manifest, options: SamplingOptions, stretches: int
-) -> tuple[np.ndarray, float]:
-    """Frames of the first stretches, and seconds of one."""
-    conditions = conditions_of(asked).take(slice(0, stretches * LENGTH))
-    assert conditions.images is not None
-    table = encode_prompts(base_model, [conditions.prompts[0], ""])
-    seeds = noise_seeds(sample_seeds(0, len(conditions)), options, [LENGTH] * stretches)
-    found, seconds = [], []
-    for start in range(0, len(conditions), LENGTH):
-        rows = slice(start, start + LENGTH)
-        images = conditions_to_tensor(conditions.images[rows])
-        embeddings = table[:1].expand(LENGTH, -1, -1)
-        lengths = None if base_model.motion is None else [LENGTH]
-        began = time.process_time()
-        latents = sample_latents(base_model, embeddings, table[1:], images, seeds[rows], options, lengths)
-        found.append(decode_frames(base_model, latents, options, seeds[rows]))
-        seconds.append(time.process_time() - began)
-    return np.concatenate(found), float(np.median(seconds))
-
-
-def _rounded(made: np.ndarray, frames: Manifest, record: Record) -> np.ndarray:
-    counts = training_counts(frames)
-    if counts is None:
-        return made
-    encoding = record.arguments["encoding"]
-    choice = EncodingChoice(name=encoding["plugin"].rpartition("/")[2], options=encoding["options"])
-    return round_frames(made, counts, plugins.load_options(choice), distinct_seeds(sample_seeds(0, len(made))))
+def _sample_stretch(
+    base_model: PretrainedModel, asked: Conditions, seeds: list[int], options: SamplingOptions
+) -> np.ndarray:
+    assert asked.images is not None
+    table = encode_prompts(base_model, [asked.prompts[0], ""])
+    lengths = None if base_model.motion is None else [len(asked)]
+    latents = sample_latents(
+        base_model,
+        table[:1].expand(len(asked), -1, -1),
+        table[1:],
+        conditions_to_tensor(asked.images),
+        seeds,
+        options,
+        lengths,
+    )
+    return decode_frames(base_model, latents, options, seeds)
 
 
 def _recorded(frames: Manifest) -> Mapping[str, float]:
