@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import sys
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from ctlev_core.scoring.sensor_pixels import SensorSource, check_in_image, is_on_sensor
 from data_contracts.config import DownstreamChoice, Frozen
@@ -84,13 +86,24 @@ def evaluate(
     )
 
 
+def train_without_synthetic(experiment: Experiment, dataset: PreparedDataset) -> None:
+    """Train what needs no generator, so that it can begin before those have ended; `evaluate` finds it in the store."""
+    extractor = experiment.feature_extractor
+    calls: list[Callable[[], Any]] = [
+        partial(_train, experiment, dataset, {}, training_set, seed)
+        for training_set, seed in itertools.product(experiment.all_training_sets, experiment.downstream_seeds)
+        if {source.name for source in training_set.sources} <= {RECORDED, ORACLE}
+    ]
+    if extractor is not None:
+        calls.append(partial(_train_extractor, experiment, dataset, extractor))
+    call_together(*calls)
+
+
 def _train_and_score(
     experiment: Experiment, dataset: PreparedDataset, generated: Generated, training_set: TrainingSet, seed: int
 ) -> tuple[ManifestRef, list[ManifestRef]]:
     """A model of one training set and seed, and its scores."""
-    frames = [_frames_of(experiment, dataset, generated, source, seed) for source in training_set.sources]
-    label = f"{experiment.downstream.name} on {training_set}, seed {seed}"
-    model = train_downstream(frames, downstream=experiment.downstream, seed=seed, label=label)
+    model, frames, label = _train(experiment, dataset, generated, training_set, seed)
     sensor = partial(sensor_of, experiment, dataset.recordings)
     own = sensor_of(experiment, dataset.tested_recordings)
     tested = [(dataset.tested_frames, experiment.evaluate_on, str(training_set), [dataset.poses], own)]
@@ -120,6 +133,23 @@ def _train_and_score(
         for data, split, row, poses, seen_by in tested
     ]
     return model, scores
+
+
+def _train(
+    experiment: Experiment, dataset: PreparedDataset, generated: Generated, training_set: TrainingSet, seed: int
+) -> tuple[ManifestRef, list[ManifestRef], str]:
+    """A model, the frames it learnt from, and what it is called."""
+    frames = [_frames_of(experiment, dataset, generated, source, seed) for source in training_set.sources]
+    label = f"{experiment.downstream.name} on {training_set}, seed {seed}"
+    return train_downstream(frames, downstream=experiment.downstream, seed=seed, label=label), frames, label
+
+
+def _train_extractor(
+    experiment: Experiment, dataset: PreparedDataset, feature_extractor: DownstreamChoice
+) -> ManifestRef:
+    return train_downstream(
+        [dataset.frames], downstream=feature_extractor, seed=experiment.seed, label="feature extractor"
+    )
 
 
 def sensor_of(experiment: Experiment, recordings: ManifestRef, part: str | None = None) -> SensorSource | None:
@@ -163,9 +193,7 @@ def _distances(
     experiment: Experiment, feature_extractor: DownstreamChoice, dataset: PreparedDataset, generated: Generated
 ) -> tuple[ManifestRef, list[ManifestRef]]:
     """The feature extractor, and how far held-out and generated frames are from the training frames."""
-    extractor = train_downstream(
-        [dataset.frames], downstream=feature_extractor, seed=experiment.seed, label="feature extractor"
-    )
+    extractor = _train_extractor(experiment, dataset, feature_extractor)
     frames = dataset.tested_frames
     compared = [(frames, experiment.evaluate_on, HELD_OUT, 0)]
     compared += [(made, "train", name, number) for name, sets in generated.items() for number, made in enumerate(sets)]

@@ -21,7 +21,7 @@ from data_contracts.training_sets import SYNTHETIC
 from flows.baselines import baselines
 from flows.cli import script
 from flows.command_line import Command
-from flows.evaluate import evaluate
+from flows.evaluate import evaluate, train_without_synthetic
 from flows.export_events import export_streams
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
@@ -56,9 +56,10 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
             experiment.windows.duration_us,
             experiment.sequence_length,
         )
-    *own, compared = call_together(
+    *own, compared, _ = call_together(
         *(partial(_own_frames, experiment, dataset, number) for number in range(experiment.num_generators)),
         lambda: call_flow(baselines, experiment, dataset),
+        lambda: train_without_synthetic(experiment, dataset),
     )
     evaluation = call_flow(evaluate, experiment, dataset, [synthetic for _, synthetic in own], compared)
     # What is shown are the first set of each generator and the first of several fine-tunings.
