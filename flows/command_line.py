@@ -32,7 +32,7 @@ from flows.preset_list import PRESETS, preset_names
 from flows.run_progress import shown
 from flows.settings import ScriptFlow
 from tasks.stage import PlannedStage, in_one_run, planning
-from tasks.store import home_folder
+from tasks.store import Store, home_folder
 
 X = TypeVar("X", bound=Experiment)
 
@@ -210,7 +210,7 @@ def run_command(command: Command, asked: Asked) -> int:
     flow = command.flow
     try:
         home = home_folder()
-        check_home(home)
+        check_home(home, send=not asked.dry_run)
         if not asked.dry_run:
             local_server.start(home)  # first of all, so that what comes now overlaps with its start-up
         if asked.track:
@@ -233,6 +233,7 @@ def run_command(command: Command, asked: Asked) -> int:
         with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
             result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
         described = command.describe(result, options)
+        Store(home).send_files()
         if asked.track:
             described += "\n" + track(asked.track, result.path, options, home)
     except (DataError, PluginError, TrainingError, ValidationError, OSError, local_server.ServerLostError) as error:
@@ -259,7 +260,17 @@ def _terminate(number: int, frame: object) -> None:
     raise _Terminated
 
 
-def check_home(home: Path) -> None:
-    """Raise `PermissionError` where the home folder cannot be written."""
+def check_home(home: Path, *, send: bool = True) -> None:
+    """See whether the home can be written, before anything long starts.
+
+    Args:
+        home: folder of all state.
+        send: to a bucket what earlier runs could not send.
+
+    Raises:
+        PermissionError: the folder cannot be written.
+        BucketError: the bucket whose cache it is cannot be used.
+    """
     if not os.access(home, os.W_OK | os.X_OK):
         raise PermissionError(f"{home}: the home folder cannot be written; choose another with --home or CTLEV_HOME")
+    Store(home).connect(send=send)

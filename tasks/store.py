@@ -10,6 +10,9 @@ damaged/<stage>/           artefacts that were set aside; nothing here deletes t
 pruned/                    on its way out
 test_sets/<digest>.jsonl   which experiments were scored on these test frames (tasks.openings)
 published/<experiment>/    which artefacts are the versions of its synthetic data (data_contracts.published)
+
+A home in a bucket (tasks.bucket) has such a folder as its cache on each machine (tasks.bucket_cache): what is not in it
+is fetched, and what is made is sent.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import os
 import re
 import shutil
 import stat
+import sys
 import threading
 import time
 import uuid
@@ -31,12 +35,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from data_contracts.errors import DataError
+from data_contracts.errors import DataError, TableVersionError
 from data_contracts.file_lists import file_digest
+from data_contracts.home_folder import home_folder as folder_of_home
 from data_contracts.manifest import MANIFEST_FILE, ManifestRef, read_manifest
 from data_contracts.published import kept_versions
 from data_contracts.run_record import RUN_FILE, RunRecord, mark_used, read_run_record, write_run_record
 from tasks import file_locks
+from tasks.bucket import Bucket, BucketError, bucket_of
+from tasks.bucket_cache import BucketCache
+from tasks.bucket_files import fetch_files, send_files
 
 KEEP_VERSIONS = 5
 MAX_SYNCS = 16
@@ -44,8 +52,8 @@ MAX_SYNCS = 16
 
 
 def home_folder() -> Path:
-    """Folder of all state: `CTLEV_HOME`, by default `.ctlev` in the working directory."""
-    return Path(os.environ.get("CTLEV_HOME", ".ctlev")).absolute()
+    """Folder of all state: `CTLEV_HOME`, by default `.ctlev` in the working directory; of a bucket its cache."""
+    return folder_of_home()
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,8 @@ class Stored:
         name: stage/key of an artefact, else the key.
         folder: where it is.
         size_bytes: of all its files.
-        last_used_s: when a run last found it or wrote to it, in seconds since the epoch.
+        last_used_s: when a run last found it or wrote to it, in seconds since the epoch; of one that is in a bucket
+            alone, when it was sent there.
     """
 
     kind: str
@@ -72,10 +81,17 @@ _used_guard = threading.Lock()
 
 
 class Store:
-    """Finished artefacts by stage and key under one home folder."""
+    """Finished artefacts by stage and key under one home folder.
+
+    Attributes:
+        home: the folder.
+        bucket: whose cache it is, if it is one.
+    """
 
     def __init__(self, home: Path | None = None) -> None:
         self.home = home or home_folder()
+        self.bucket: Bucket | None = bucket_of(self.home)
+        self._cache = BucketCache(self.home)
 
     def folder(self, stage: str, key: str) -> Path:
         """Where the artefact is, or will be."""
@@ -103,24 +119,62 @@ class Store:
 
         Raises:
             OSError: the artefact cannot be read now, for reasons that say nothing about its content.
+            BucketError: it is not in the cache, and the bucket cannot be read now.
         """
         self.use()
-        folder = self.folder(stage, key)
-        try:
-            folder.lstat()
-        except (FileNotFoundError, NotADirectoryError):
+        found = self._find_here(stage, key, upstream, make_room=make_room)
+        if (
+            found is None
+            and self.bucket is not None
+            and self._fetch(self.bucket, stage, key, upstream, make_room=make_room)
+        ):
+            found = self._find_here(stage, key, upstream, make_room=make_room)
+            self._evict(self.bucket)
+        return found
+
+    def holds(self, stage: str, key: str) -> bool:
+        """Is there an artefact, made from whichever inputs? One that is in a bucket alone is not fetched."""
+        self.use()
+        here = self._find_here(stage, key, None, make_room=False)
+        return here is not None or (self.bucket is not None and self.bucket.has(stage, key))
+
+    def here(self, ref: ManifestRef) -> ManifestRef:
+        """The same artefact on this machine: as it is, or of a bucket that of our cache, fetched where it is not there.
+
+        Raises:
+            DataError: the bucket does not have it.
+        """
+        stage = ref.path.parent.name
+        if self.bucket is None or not ref.digest:
+            return ref
+        with self._cache.holding(f"{stage}/{ref.key}"):
+            is_here = self.folder(stage, ref.key).is_dir()
+        if not is_here and self.find(stage, ref.key) is None:
+            raise DataError(f"{self.bucket.url}: has no artefact {stage}/{ref.key} any more; run again to make it anew")
+        return ref.model_copy(update={"path": self.folder(stage, ref.key)})
+
+    def _find_here(
+        self, stage: str, key: str, upstream: dict[str, str] | None, *, make_room: bool
+    ) -> ManifestRef | None:
+        """As `find`, in the folder."""
+        holding = contextlib.nullcontext() if self.bucket is None else self._cache.holding(f"{stage}/{key}")
+        with holding:
+            folder = self.folder(stage, key)
+            try:
+                folder.lstat()
+            except (FileNotFoundError, NotADirectoryError):
+                return None
+            try:
+                record = read_run_record(folder)
+                ref = read_manifest(ManifestRef(key=key, path=folder, digest=record.digest)).ref
+                if upstream is None or record.upstream == upstream:
+                    mark_used(folder)
+                    return ref
+            except DataError:
+                pass
+            if make_room:
+                self.set_aside(folder)
             return None
-        try:
-            record = read_run_record(folder)
-            ref = read_manifest(ManifestRef(key=key, path=folder, digest=record.digest)).ref
-            if upstream is None or record.upstream == upstream:
-                mark_used(folder)
-                return ref
-        except DataError:
-            pass
-        if make_room:
-            self.set_aside(folder)
-        return None
 
     def set_aside(self, folder: Path) -> Path:
         """Move a damaged or outdated artefact out of the way without deleting it; returns its new place."""
@@ -133,11 +187,18 @@ class Store:
 
     @contextlib.contextmanager
     def lock(self, key: str, what: str = "") -> Iterator[None]:
-        """Only one process makes an artefact; a second waits here, saying so, and then finds it finished."""
+        """Only one process makes an artefact; a second waits here, saying so, and then finds it finished.
+
+        Raises:
+            BucketError: other machines cannot be told, for the bucket cannot be written now.
+        """
         path = self.home / "locks" / key
         path.parent.mkdir(parents=True, exist_ok=True)
         self.use()
-        with file_locks.locked(path, what or f"artefact {key}"):
+        what = what or f"artefact {key}"
+        with file_locks.locked(path, what), contextlib.ExitStack() as stack:
+            if self.bucket is not None:
+                stack.enter_context(self.bucket.lease(key, what))
             yield
 
     def use(self) -> None:
@@ -180,10 +241,27 @@ class Store:
     def publish(self, stage: str, key: str, temporary: Path, record: dict[str, Any]) -> ManifestRef:
         """Write the provenance record, flush everything to disk and rename the folder into place.
 
-        What is under its final name is whole, and still there after a power failure once this has returned.
+        What is under its final name is whole, and still there after a power failure once this has returned. Of a bucket
+        it is then in the bucket too; where another machine was first, which this one could not know, with the content
+        that the other gave it.
+
+        Raises:
+            BucketError: it cannot be sent. It is in the cache, and the next run sends it.
         """
         digest = file_digest(temporary / MANIFEST_FILE)
         write_run_record(temporary, RunRecord(**record, digest=digest))
+        holding = contextlib.nullcontext() if self.bucket is None else self._cache.holding(f"{stage}/{key}")
+        with holding:
+            self._move_in(stage, key, temporary)
+        shutil.rmtree(self.work_folder(key), ignore_errors=True)
+        if self.bucket is not None:
+            self._send(self.bucket, stage, key)
+            self._evict(self.bucket)
+            digest = read_run_record(self.folder(stage, key)).digest
+        return read_manifest(ManifestRef(key=key, path=self.folder(stage, key), digest=digest)).ref
+
+    def _move_in(self, stage: str, key: str, temporary: Path) -> None:
+        """Flush a finished artefact to disk and rename its folder into place."""
         _share_as_the_record(temporary)
         folder = self.folder(stage, key)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -192,14 +270,117 @@ class Store:
         _sync_all([*temporary.rglob("*"), temporary, *above])
         temporary.rename(folder)
         _sync(folder.parent)
-        shutil.rmtree(self.work_folder(key), ignore_errors=True)
-        return read_manifest(ManifestRef(key=key, path=folder, digest=digest)).ref
+
+    def _fetch(self, bucket: Bucket, stage: str, key: str, upstream: dict[str, str] | None, *, make_room: bool) -> bool:
+        """Fetch an artefact into the folder; whether one is there now.
+
+        It gets its name when every digest was found right. What is damaged, or was made from other inputs, is moved
+        aside in the bucket by who makes room.
+        """
+        (self.home / "locks").mkdir(parents=True, exist_ok=True)
+        with file_locks.locked(self.home / "locks" / f"{key}.fetched", f"artefact {stage}/{key} to be fetched"):
+            if self.folder(stage, key).exists():
+                return True
+            # Named after the key, as records are of the folder they lie in.
+            temporary, damage = self.home / "tmp" / uuid.uuid4().hex / key, ""
+            try:
+                record = bucket.record(stage, key)
+                if record is None:
+                    return False
+                if upstream is None or record.upstream == upstream:
+                    bucket.download(stage, key, record.digest, temporary)
+                    self.check(temporary)
+                    with self._cache.holding(f"{stage}/{key}"):
+                        self._move_in(stage, key, temporary)
+                    self._cache.mark_uploaded(f"{stage}/{key}", record.digest)
+                    return True
+            except BucketError:
+                raise
+            except TableVersionError:
+                pass
+            except DataError as error:
+                damage = str(error)
+            finally:
+                shutil.rmtree(temporary.parent, ignore_errors=True)
+            if make_room:
+                moved = bucket.set_aside(stage, key)
+                if damage:
+                    print(f"damaged in {bucket.url}: {stage}/{key}: {damage}\n  now in {moved}", file=sys.stderr)
+            return False
+
+    def _send(self, bucket: Bucket, stage: str, key: str) -> None:
+        """Send an artefact of the folder, or take the one that the bucket has under its key in its place."""
+        name, folder = f"{stage}/{key}", self.folder(stage, key)
+        digest = read_run_record(folder).digest
+        try:
+            if bucket.upload(stage, key, digest, folder):
+                self._cache.mark_uploaded(name, digest)
+                return
+        except DataError as error:
+            raise BucketError(f"{error}; {name} is kept in {self.home}, and the next run sends it") from error
+        self.set_aside(folder)
+        if not self._fetch(bucket, stage, key, None, make_room=False):
+            raise BucketError(f"{bucket.url}: {name} is damaged there; `ctlev verify` sets it aside, then run again")
+
+    def connect(self, *, send: bool) -> None:
+        """Before a run: see whether the bucket can be used, and fetch what people look at. Nothing without a bucket.
+
+        Args:
+            send: what earlier runs could not send.
+
+        Raises:
+            BucketError: it cannot be used.
+        """
+        if self.bucket is not None:
+            self.bucket.check()
+            self.fetch_files()
+            if send:
+                self.send_unsent()
+
+    def fetch_files(self) -> None:
+        """Fetch reports and published versions of other machines (tasks.bucket_files). Nothing without a bucket."""
+        if self.bucket is not None:
+            fetch_files(self.home, self.bucket)
+
+    def send_files(self) -> None:
+        """After a run: send what it left here, also reports and events. Nothing without a bucket."""
+        if self.bucket is not None:
+            self.send_unsent()
+            send_files(self.home, self.bucket)
+
+    def send_unsent(self) -> int:
+        """Send what earlier runs made and could not send; returns how many artefacts. Nothing without a bucket.
+
+        Raises:
+            BucketError: the bucket cannot be written now.
+        """
+        sent = 0
+        for item in [] if self.bucket is None else _named_folders(self.home / "artefacts"):
+            name = f"{item.parent.name}/{item.name}"
+            if self._is_unsent(item):
+                # Who makes it, here or elsewhere, sends it too.
+                with self.lock(item.name, f"artefact {name}"):
+                    if self._is_unsent(item):
+                        self._send(self.bucket, item.parent.name, item.name)
+                        sent += 1
+        return sent
+
+    def _is_unsent(self, folder: Path) -> bool:
+        """Is it an artefact that the bucket does not have, as far as is known here?"""
+        try:
+            return not self._cache.is_uploaded(f"{folder.parent.name}/{folder.name}", read_run_record(folder).digest)
+        except DataError:
+            return False  # made anew where it is needed
+
+    def _evict(self, bucket: Bucket) -> None:
+        """Keep the cache below its limit."""
+        self._cache.evict(lambda name: bucket.has(*name.split("/")))
 
     def artefacts(self) -> list[Stored]:
         """All finished artefacts, by stage and key. Links are not followed."""
-        stages = _folders(self.home / "artefacts")
         return [
-            _stored("artefact", f"{stage.name}/{folder.name}", folder) for stage in stages for folder in _folders(stage)
+            _stored("artefact", f"{folder.parent.name}/{folder.name}", folder)
+            for folder in _named_folders(self.home / "artefacts")
         ]
 
     def check(self, folder: Path) -> None:
@@ -286,6 +467,11 @@ def _folders(folder: Path) -> list[Path]:
         return []
     with os.scandir(folder) as entries:
         return sorted(Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False))
+
+
+def _named_folders(folder: Path) -> list[Path]:
+    """The folders in the folders in a folder: of artefacts, by stage and key."""
+    return [found for stage in _folders(folder) for found in _folders(stage)]
 
 
 def _stored(kind: str, name: str, folder: Path) -> Stored:
