@@ -360,9 +360,10 @@ class Bucket:
             raise
 
     def _list_once(self, folder: str) -> dict[str, Mapping[str, Any]]:
-        place = self._path(folder)
+        place = f"{self._path(folder)}/"
         found = self._files[0].find(place, detail=True)
-        return {path.removeprefix(place).lstrip("/"): info for path, info in sorted(found.items())}
+        # A folder whose first object comes just now may be listed as itself.
+        return {path.removeprefix(place): info for path, info in sorted(found.items()) if path.startswith(place)}
 
     def _remove_once(self, path: str) -> None:
         with contextlib.suppress(FileNotFoundError):
@@ -392,7 +393,8 @@ class Bucket:
             except BucketError:
                 raise
             except (FileNotFoundError, FileExistsError) as error:
-                if done == "written" and isinstance(error, FileNotFoundError) and not _is_local(error, arguments):
+                no_bucket = isinstance(error, FileNotFoundError) and done in ("written", "listed")
+                if no_bucket and not _is_local(error, arguments):
                     raise self._error(done, error) from error
                 raise
             except Exception as error:  # each package has errors of its own

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from data_contracts.errors import DataError
+from data_contracts.file_lists import file_digest
 from tasks import file_locks
 from tasks.bucket import Bucket, modified
 
@@ -25,7 +26,8 @@ OWN_FILES = ("lock", "claimed.json")
 """What a process keeps for itself beside published versions (tasks.publish)."""
 STATE_FILE = "shared_files.json"
 State = dict[str, list[Any]]
-"""By name: size and time of modification in ns of the file, and size and time of the object."""
+"""By name: size, time of modification in ns and SHA-256 of the file; and size and version of the object, None while it
+is being sent."""
 
 
 def fetch_files(home: Path, bucket: Bucket, folders: tuple[str, ...] = FETCHED) -> int:
@@ -43,12 +45,12 @@ def fetch_files(home: Path, bucket: Bucket, folders: tuple[str, ...] = FETCHED) 
                 if ".." in PurePosixPath(name).parts:
                     raise DataError(f"{bucket.url}/{name}: leads out of the home")
                 path = home / name
-                if path.exists() and state.get(name, [])[2:] == there:
+                if path.exists() and name in state and state[name][-1] == there:
                     continue
                 temporary = path.with_name(f".{path.name}.fetched")
                 bucket.fetch(name, temporary)
                 temporary.replace(path)
-                state[name] = [*_file_state(path), *there]
+                state[name] = [*_file_state(path), there]
                 fetched += 1
     return fetched
 
@@ -57,21 +59,21 @@ def send_files(home: Path, bucket: Bucket, folders: tuple[str, ...] = SENT) -> i
     """Send what was written here since the last time; returns how many files.
 
     Raises:
-        BucketError: the bucket cannot be written now; what was sent before is not sent again.
+        BucketError: the bucket cannot be written now; the next run sends what was not sent.
     """
     sent = 0
     with _state(home) as state:
         for folder in folders:
             files = {path.relative_to(home): path for path in (home / folder).rglob("*") if path.is_file()}
             own = {name.as_posix(): path for name, path in files.items() if _is_shared(name)}
-            changed = {name: path for name, path in own.items() if state.get(name, [])[:2] != _file_state(path)}
-            before = {name: _file_state(path) for name, path in changed.items()}
+            changed = {name: path for name, path in own.items() if _has_changed(path, state.get(name))}
             for name, path in changed.items():
+                # Before it is sent: what a process writes meanwhile is another state, and is sent the next time.
+                state[name] = [*_file_state(path), None]
                 bucket.send(path, name)
-            # A file that a process wrote meanwhile differs from what was sent, and is sent again.
             objects = bucket.list(folder) if changed else {}
             for name in changed:
-                state[name] = [*before[name], *_object_state(objects[name.partition("/")[2]])]
+                state[name][-1] = _object_state(objects[name.partition("/")[2]])
             if folder == EVENTS:
                 # Streams of the export before would lie among those of this one.
                 exports = {PurePosixPath(name).parts[1] for name in changed}
@@ -106,9 +108,19 @@ def _is_shared(name: Path) -> bool:
     return not any(part.startswith(".") for part in name.parts) and name.name not in OWN_FILES
 
 
-def _file_state(path: Path) -> list[int]:
+def _has_changed(path: Path, state: list[Any] | None) -> bool:
+    """Is a file another than the one of the bucket? A cached run writes its report anew, with the same content."""
+    if state is None or state[-1] is None:
+        return True
     status = path.stat()
-    return [status.st_size, status.st_mtime_ns]
+    if [status.st_size, status.st_mtime_ns] == state[:2]:
+        return False
+    return file_digest(path) != state[2]
+
+
+def _file_state(path: Path) -> list[Any]:
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns, file_digest(path)]
 
 
 def _object_state(info: Mapping[str, Any]) -> list[Any]:

@@ -50,7 +50,7 @@ from data_contracts.run_record import (
 )
 from tasks import file_locks
 from tasks.bucket import Bucket, BucketError, bucket_of
-from tasks.bucket_cache import BucketCache
+from tasks.bucket_cache import BucketCache, cache_limit_bytes
 from tasks.bucket_files import fetch_files, send_files
 
 KEEP_VERSIONS = 5
@@ -345,8 +345,10 @@ class Store:
 
         Raises:
             BucketError: it cannot be used.
+            DataError: CTLEV_CACHE_GB is not a number above 0.
         """
         if self.bucket is not None:
+            cache_limit_bytes()
             self.bucket.check()
             self.fetch_files()
             if send:
