@@ -442,7 +442,7 @@ class Store:
         Raises:
             DataError: a record cannot be read, so that what it refers to is not known.
         """
-        oldest_s = time.time() - keep_days * 86_400
+        oldest_s = (time.time() if self.bucket is None else self.bucket.clock()) - keep_days * 86_400
         stored = self.artefacts()
         referred = {item.folder: _keys_in(item.folder / RUN_FILE) for item in stored}
         half_made = [_stored("tmp", folder.name, folder) for folder in _folders(self.home / "tmp")]
