@@ -228,6 +228,7 @@ def run_command(command: Command, asked: Asked) -> int:
             if foretold := command.foretell(options):
                 print(foretold)
             return 0
+        Store(home).fetch_planned((row.stage, row.key) for row in rows if row.cached)
         use_memory(rows, home)
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else shown(rows, home):

@@ -29,7 +29,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,6 +56,8 @@ from tasks.bucket_files import fetch_files, send_files
 KEEP_VERSIONS = 5
 BEGUN_S = 86_400.0
 """What was begun in a bucket so long ago, and has no provenance record, is not being sent any more."""
+MAX_FETCHES = 8
+"""Artefacts that are fetched at once."""
 MAX_SYNCS = 16
 """Files that are synced at once. Four hundred of 40 kB take 0.12 s on ext4, one after the other 1.8 s."""
 
@@ -353,6 +355,23 @@ class Store:
             self.fetch_files()
             if send:
                 self.send_unsent()
+
+    def fetch_planned(self, wanted: Iterable[tuple[str, str]]) -> None:
+        """Fetch side by side what a run would else wait for one after the other. Nothing without a bucket.
+
+        Args:
+            wanted: stage and key of artefacts that the home holds.
+
+        Raises:
+            BucketError: the bucket cannot be read now.
+        """
+        missing = [] if self.bucket is None else [one for one in wanted if not self.folder(*one).exists()]
+        if not missing or self.bucket is None:
+            return
+        print(f"fetching {len(missing)} artefacts from {self.bucket.url}", file=sys.stderr, flush=True)
+        with ThreadPoolExecutor(MAX_FETCHES) as threads:
+            for _ in threads.map(lambda one: self.find(*one), missing):  # which raises what went wrong
+                pass
 
     def fetch_files(self) -> None:
         """Fetch reports and published versions of other machines (tasks.bucket_files). Nothing without a bucket."""
