@@ -102,11 +102,6 @@ def published_folder(home: Path, experiment: str) -> Path:
     return home / "published" / experiment
 
 
-def home_of(folder: Path) -> Path:
-    """The home that lists the versions of an experiment in a folder."""
-    return folder.parents[1]
-
-
 def version_file(folder: Path, number: int) -> Path:
     """The record of a version."""
     return folder / f"v{number:04d}.json"

@@ -109,8 +109,9 @@ class Bucket:
             BucketError: there is no such bucket, no credentials, a right is missing, or the server overwrites what a
                 conditional write must not.
         """
-        name = self._path("probes", uuid.uuid4().hex)
-        self._try("written", self._create_once, name, b"probe\n")
+        probe = f"probes/{uuid.uuid4().hex}"
+        name = self._path(probe)
+        self.create(probe, b"probe\n")
         with contextlib.suppress(FileExistsError):
             self._try("written", self._create_once, name, b"another probe\n")
             self._try("deleted", self._files[0].rm_file, name)

@@ -12,7 +12,6 @@ from pathlib import Path
 from data_contracts.errors import DataError
 from data_contracts.published import (
     Version,
-    home_of,
     read_latest,
     read_versions,
     version_file,
@@ -47,10 +46,10 @@ class Claim:
             write_version(self.folder, version)
         if version.passed:
             write_latest(self.folder, version)
-        bucket = bucket_of(home_of(self.folder))
+        bucket = bucket_of(_home(self.folder))
         if bucket is not None:
             # Other machines number their versions by these records, so that they are there before the claim ends.
-            send_files(home_of(self.folder), bucket, ("published",))
+            send_files(_home(self.folder), bucket, ("published",))
         (self.folder / CLAIM_FILE).unlink(missing_ok=True)
         return version
 
@@ -82,7 +81,7 @@ def claimed(folder: Path) -> Iterator[Claim]:
         BucketError: the bucket of the home cannot be used now.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    bucket = bucket_of(home_of(folder))
+    bucket = bucket_of(_home(folder))
     with (folder / "lock").open("ab") as lock, contextlib.ExitStack() as stack:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -91,7 +90,7 @@ def claimed(folder: Path) -> Iterator[Claim]:
         if bucket is not None:
             what = f"a version of {folder.name}"
             stack.enter_context(bucket.lease(f"published-{folder.name}", what, wait=False))
-            fetch_files(home_of(folder), bucket, ("published",))
+            fetch_files(_home(folder), bucket, ("published",))
         number = next_number(folder)
         began = version_file(folder, number)
         version = next((v for v in read_versions(folder) if v.number == number), None) if began.exists() else None
@@ -99,3 +98,8 @@ def claimed(folder: Path) -> Iterator[Claim]:
             started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
             write_durably(folder / CLAIM_FILE, json.dumps({"number": number, "started": started}) + "\n")
         yield Claim(folder, number, version)
+
+
+def _home(folder: Path) -> Path:
+    """The home that lists the versions of an experiment in a folder."""
+    return folder.parents[1]

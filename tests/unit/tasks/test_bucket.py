@@ -17,6 +17,7 @@ from data_contracts.home_folder import home_folder
 from tasks import bucket as bucket_module
 from tasks import store as store_module
 from tasks.bucket import Bucket, BucketError
+from tasks.runners import environment_there
 from tasks.store import Store
 
 
@@ -104,10 +105,9 @@ def test_an_artefact_of_a_machine_that_was_killed_while_sending_is_none_until_it
     """
     environment = os.environ | {"CTLEV_HOME": bucket_url, "CTLEV_CACHE": str(tmp_path / "a")}
     environment["PYTHONPATH"] = os.pathsep.join(sys.path)
-    code = textwrap.dedent(script).replace(
-        "import os, signal", "import os, signal\nimport tasks.bucket as b\nb.MAX_TRANSFERS = 1"
+    ended = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], env=environment, capture_output=True, text=True
     )
-    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert ended.returncode == -9, ended.stderr
     killed, other = machine("a"), machine("b")
     names = bucket_server.objects(bucket_url)
@@ -376,6 +376,13 @@ def test_inputs_that_left_the_cache_are_fetched_where_a_stage_opens_them(machine
     gone = ref.model_copy(update={"key": key(2), "path": first.folder("encode", key(2))})
     with pytest.raises(DataError, match=rf"has no artefact encode/{key(2)} any more"):
         second.here(gone)
+
+
+def test_processes_elsewhere_are_told_of_the_bucket_not_of_our_cache(machine, bucket_url, monkeypatch, tmp_path):
+    monkeypatch.setenv("CTLEV_HOME", str(machine("a").home))
+    assert environment_there()["CTLEV_HOME"] == bucket_url
+    monkeypatch.setenv("CTLEV_HOME", str(tmp_path / "home"))
+    assert environment_there()["CTLEV_HOME"] == str(tmp_path / "home")
 
 
 def test_a_home_folder_asks_no_bucket(tmp_path, monkeypatch):
