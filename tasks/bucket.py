@@ -22,6 +22,7 @@ import datetime
 import errno
 import functools
 import importlib
+import math
 import os
 import socket
 import sys
@@ -183,12 +184,13 @@ class Bucket:
         # An object appears whole or not at all, and the digest in its name is that of the content.
         missing = [item for item in files.items() if arrived.get(item[0]) != item[1].stat().st_size]
         self._side_by_side(lambda item: self.send(item[1], f"{place}/{item[0]}"), missing)
-        if self.create(f"artefacts/{stage}/{key}/{RUN_FILE}", (folder / RUN_FILE).read_bytes()):
-            return True
-        there = self.record(stage, key)
-        if there is None or there.digest != digest:
-            self._try("deleted", self._remove_once, self._path(place))
-        return there is not None and there.digest == digest
+        while not self.create(f"artefacts/{stage}/{key}/{RUN_FILE}", (folder / RUN_FILE).read_bytes()):
+            there = self.record(stage, key)
+            if there is not None and there.digest != digest:
+                self._try("deleted", self._remove_once, self._path(place))
+            if there is not None:
+                return there.digest == digest
+        return True
 
     def set_aside(self, stage: str, key: str) -> str:
         """Move a damaged or outdated artefact out of the way without deleting it; returns its new URL.
@@ -295,23 +297,24 @@ class Bucket:
             ended.set()
             renewing.join()  # else it could write the object again after it was deleted
             with contextlib.suppress(BucketError):  # it expires
-                for other in self.list(f"leases/{key}"):
-                    if int(other) <= int(name.rpartition("/")[2]):
-                        self.delete(f"leases/{key}/{other}")
+                for number in self._leases(key):
+                    if number <= int(name.rpartition("/")[2]):
+                        self.delete(_lease_name(key, number))
 
     def _take_lease(self, key: str, what: str, holder: bytes, *, wait: bool) -> str:
         """The name of the object of a lease that is now held."""
         started = said = time.monotonic()
         while True:
-            taken = self.list(f"leases/{key}")
-            newest = max(taken, key=int, default="0")
-            age_s = self.clock() - modified(taken[newest]).timestamp() if taken else LEASE_S + 1
+            taken = self._leases(key)
+            newest = max(taken, default=0)
+            age_s = self.clock() - modified(taken[newest]).timestamp() if taken else math.inf
             if age_s > LEASE_S:
-                name = f"leases/{key}/{int(newest) + 1:06d}"
+                name = _lease_name(key, newest + 1)
                 if self.create(name, holder):
                     return name
                 continue
-            by = (self.read(f"leases/{key}/{newest}") or b"another process").decode(errors="replace").partition(",")[0]
+            content = self.read(_lease_name(key, newest)) or b"another process"
+            by = content.decode(errors="replace").partition(",")[0]
             if not wait:
                 raise BlockingIOError(
                     f"{self.url}/leases/{key}: {by[:200]} is making {what}; ask again when it has ended"
@@ -326,6 +329,10 @@ class Bucket:
                     flush=True,
                 )
             time.sleep(POLL_S)
+
+    def _leases(self, key: str) -> dict[int, Mapping[str, Any]]:
+        """What fsspec says of the objects of leases, by their numbers."""
+        return {int(name): info for name, info in self.list(f"leases/{key}").items() if name.isdecimal()}
 
     def _renew(self, name: str, holder: bytes, ended: threading.Event) -> None:
         while not ended.wait(RENEW_S):
@@ -426,6 +433,10 @@ class Bucket:
             f"{self.url}: an object could not be {done}: {said}; see whether the bucket can be reached and has room, "
             "then run again"
         )
+
+
+def _lease_name(key: str, number: int) -> str:
+    return f"leases/{key}/{number:06d}"
 
 
 def modified(info: Mapping[str, Any]) -> datetime.datetime:

@@ -299,7 +299,8 @@ class Store:
             if self.folder(stage, key).exists():
                 return True
             # Named after the key, as records are of the folder they lie in.
-            temporary, damage = self.home / "tmp" / uuid.uuid4().hex / key, ""
+            temporary, damage = self.home / "tmp" / f"{key}.fetched" / key, ""
+            shutil.rmtree(temporary.parent, ignore_errors=True)  # left by a process that died
             try:
                 record = bucket.record(stage, key)
                 if record is None:
@@ -397,7 +398,7 @@ class Store:
             if self._is_unsent(folder):
                 # Who makes it, here or elsewhere, sends it too.
                 with self.lock(folder.name, f"artefact {folder.parent.name}/{folder.name}"):
-                    if self._is_unsent(folder):
+                    if self._is_unsent(folder) and _is_whole(self, folder):
                         self._send(self.bucket, folder.parent.name, folder.name)
                         sent += 1
         return sent
@@ -539,6 +540,18 @@ class Store:
 
 class StoreInUseError(RuntimeError):
     """The store cannot be pruned because a run uses it."""
+
+
+def _is_whole(store: Store, folder: Path) -> bool:
+    """Is an artefact one that others can use? Of a damaged one a line says so."""
+    try:
+        store.check(folder)
+    except TableVersionError:
+        return False
+    except DataError as error:
+        print(f"damaged, and not sent: {error}; `ctlev verify` sets it aside", file=sys.stderr)
+        return False
+    return True
 
 
 def _share_as_the_record(folder: Path) -> None:

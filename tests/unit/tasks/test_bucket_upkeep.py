@@ -79,6 +79,19 @@ def test_damage_of_the_cache_is_set_aside_and_fetched_again(machine, capsys):
     assert store.find("encode", key(1)) is not None and (folder / "frames.npy").read_bytes() == whole
 
 
+def test_damage_of_the_cache_is_not_sent(machine, capsys):
+    store = machine("a")
+    folder = publish(store, 1)
+    store.bucket.remove("encode", key(1))
+    (store.home / "uploaded" / "encode" / key(1)).unlink()
+    content = (folder / "frames.npy").read_bytes()
+    (folder / "frames.npy").write_bytes(content[:-1] + b"!")
+    assert store.send_unsent() == 0 and stored(store.bucket) == set()
+    assert f"damaged, and not sent: {folder / 'frames.npy'}" in capsys.readouterr().err
+    (folder / "frames.npy").write_bytes(content)
+    assert store.send_unsent() == 1 and stored(store.bucket) == {1}
+
+
 def test_prune_removes_from_bucket_and_cache_what_it_lists(machine, capsys, monkeypatch):
     first, second = machine("a"), machine("b")
     for number, inputs in {1: (), 2: (1,), 3: ()}.items():
