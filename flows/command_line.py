@@ -210,9 +210,10 @@ def run_command(command: Command, asked: Asked) -> int:
     flow = command.flow
     try:
         home = home_folder()
-        check_home(home, send=not asked.dry_run)
+        check_home(home)
         if not asked.dry_run:
             local_server.start(home)  # first of all, so that what comes now overlaps with its start-up
+        Store(home).connect(send=not asked.dry_run)
         if asked.track:
             from flows.tracking import check_tracker, track  # here, because few runs are tracked
 
@@ -261,17 +262,7 @@ def _terminate(number: int, frame: object) -> None:
     raise _Terminated
 
 
-def check_home(home: Path, *, send: bool = True) -> None:
-    """See whether the home can be written, before anything long starts.
-
-    Args:
-        home: folder of all state.
-        send: to a bucket what earlier runs could not send.
-
-    Raises:
-        PermissionError: the folder cannot be written.
-        BucketError: the bucket whose cache it is cannot be used.
-    """
+def check_home(home: Path) -> None:
+    """Raise `PermissionError` where the home folder cannot be written."""
     if not os.access(home, os.W_OK | os.X_OK):
         raise PermissionError(f"{home}: the home folder cannot be written; choose another with --home or CTLEV_HOME")
-    Store(home).connect(send=send)

@@ -69,6 +69,7 @@ def _deployable(
         folder = configure(home)  # this process runs this one flow, and stages look there
         folder.mkdir(parents=True, exist_ok=True)
         check_home(folder)
+        Store(folder).connect(send=True)
         options = load(preset, list(overrides))
         with planning() as rows:
             script_flow.fn(options)
