@@ -23,6 +23,7 @@ from ctlev_core.provenance.scores import GENERATOR_STAGES
 from ctlev_core.seeds import sample_seeds
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
+from data_contracts.home_folder import home_folder
 from data_contracts.labels import Conditions
 from data_contracts.manifest import RUN_FILE
 
@@ -144,14 +145,15 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
     Args:
         place: name of a report (its experiment's own generator, with its pixel decoder), the path of an artefact of the
             stage `finetune` or `train_motion_layers`, or of a diffusers folder that training wrote.
-        home: folder of all state, where `place` is a name; None = CTLEV_HOME, else `.ctlev`.
+        home: folder of all state, where `place` is a name, or URL of a bucket, of which what is in the cache of this
+            machine is found; None = CTLEV_HOME, else `.ctlev`.
     Raises:
         DataError: there is no such run or folder, or it holds no generator.
     """
     path = Path(place)
     if path.is_dir():
         return _of_folder(path)
-    state = Path(home or os.environ.get("CTLEV_HOME") or ".ctlev")
+    state = home_folder(home)
     report = state / "reports" / str(place)
     if not (report / "provenance.json").is_file():
         known = sorted(one.parent.name for one in (state / "reports").glob("*/provenance.json"))

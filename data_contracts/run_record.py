@@ -65,7 +65,25 @@ def read_run_record(folder: Path) -> RunRecord:
     """
     path = folder / RUN_FILE
     try:
-        values = json.loads(path.read_bytes())
+        content = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
+        raise DataError(f"{path}: is not a provenance record: {error.strerror}") from error
+    return parse_run_record(content, folder.name, str(path))
+
+
+def parse_run_record(content: bytes, key: str, where: str) -> RunRecord:
+    """The record in what a file or an object holds.
+
+    Args:
+        content: of `run.json`.
+        key: of the artefact it must be of.
+        where: named in messages.
+
+    Raises:
+        DataError: it is damaged, or is that of another artefact.
+    """
+    try:
+        values = json.loads(content)
         if not isinstance(values, dict):
             raise TypeError(f"expected an object, got {type(values).__name__}")
         # Records of before there was a digest have none.
@@ -73,16 +91,14 @@ def read_run_record(folder: Path) -> RunRecord:
         if own is not None and own != digest_of(values):
             raise ValueError("its content is not that of its digest")
         record = RunRecord.model_validate(values)
-        if record.key != folder.name:
+        if record.key != key:
             raise ValueError(f"it is of key {record.key[:64]!r}")
-    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
-        raise DataError(f"{path}: is not a provenance record: {error.strerror}") from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"]))
-        raise DataError(f"{path}: is not a provenance record: {place[:100]}: {first['msg'][:100]}") from error
+        raise DataError(f"{where}: is not a provenance record: {place[:100]}: {first['msg'][:100]}") from error
     except (TypeError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: is not a provenance record: {str(error)[:200]}") from error
+        raise DataError(f"{where}: is not a provenance record: {str(error)[:200]}") from error
     return record
 
 

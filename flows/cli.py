@@ -37,8 +37,9 @@ def _complete_preset(incomplete: str) -> list[tuple[str, str]]:
 
 
 def _complete_report(incomplete: str) -> list[str]:
-    home = Path(os.environ.get("CTLEV_HOME") or ".ctlev")
-    return sorted(path.stem for path in (home / "reports").glob(f"{incomplete}*.html"))
+    from data_contracts.home_folder import home_folder
+
+    return sorted(path.stem for path in (home_folder() / "reports").glob(f"{incomplete}*.html"))
 
 
 def _complete_option(incomplete: str) -> list[str]:
@@ -69,8 +70,13 @@ Overrides = Annotated[
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="print the plan and run nothing")]
 Home = Annotated[
-    Path | None,
-    typer.Option("--home", help="folder of all state (default: CTLEV_HOME, else .ctlev)", show_default=False),
+    str | None,
+    typer.Option(
+        "--home",
+        metavar="FOLDER|URL",
+        help="folder of all state, or a bucket such as s3://BUCKET/PREFIX (default: CTLEV_HOME, else .ctlev)",
+        show_default=False,
+    ),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", help="show Prefect's log")]
 Track = Annotated[
@@ -131,7 +137,7 @@ def _run(module: str, default: str, given: tuple[str | None, str | None], **aske
         raise typer.BadParameter(f"two presets are named: {given[0]} and --preset {given[1]}")
     from flows.settings import configure
 
-    configure(asked.pop("home"), verbose=asked.pop("verbose", False))
+    configure(_home(asked.pop("home")), verbose=asked.pop("verbose", False))
     from flows.command_line import Asked, run_command
 
     command = importlib.import_module(f"flows.{module}").COMMAND
@@ -296,7 +302,7 @@ def compare(run_a: Run, run_b: Run, home: Home = None) -> None:
     """Say what differs between two finished experiments: options, data, code and scores."""
     from flows.settings import configure
 
-    folder = configure(home)
+    folder = configure(_home(home))
     from flows.compare import print_comparison
 
     raise typer.Exit(print_comparison(run_a, run_b, folder))
@@ -336,10 +342,14 @@ def prune(
     raise typer.Exit(prune_home(_home(home), keep_days, keep_versions, apply=apply))
 
 
-def _home(home: Path | None) -> Path:
-    from tasks.store import home_folder
+def _home(home: str | None) -> Path:
+    from data_contracts.home_folder import home_folder
 
-    return (home or home_folder()).absolute()
+    try:
+        return home_folder(home)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
 
 
 @app.command(rich_help_panel=STORE)

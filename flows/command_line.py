@@ -32,7 +32,7 @@ from flows.preset_list import PRESETS, preset_names
 from flows.run_progress import shown
 from flows.settings import ScriptFlow
 from tasks.stage import PlannedStage, in_one_run, planning
-from tasks.store import home_folder
+from tasks.store import Store, home_folder
 
 X = TypeVar("X", bound=Experiment)
 
@@ -213,6 +213,7 @@ def run_command(command: Command, asked: Asked) -> int:
         check_home(home)
         if not asked.dry_run:
             local_server.start(home)  # first of all, so that what comes now overlaps with its start-up
+        Store(home).connect(send=not asked.dry_run)
         if asked.track:
             from flows.tracking import check_tracker, track  # here, because few runs are tracked
 
@@ -228,11 +229,13 @@ def run_command(command: Command, asked: Asked) -> int:
             if foretold := command.foretell(options):
                 print(foretold)
             return 0
+        Store(home).fetch_planned((row.stage, row.key) for row in rows if row.cached)
         use_memory(rows, home)
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
             result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
         described = command.describe(result, options)
+        Store(home).send_files()
         if asked.track:
             described += "\n" + track(asked.track, result.path, options, home)
     except (DataError, PluginError, TrainingError, ValidationError, OSError, local_server.ServerLostError) as error:

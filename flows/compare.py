@@ -16,9 +16,10 @@ from ctlev_core.report.page.html import render_report
 from ctlev_core.report.page.tables import Table, markdown_table
 from ctlev_core.report.studies.run_comparison import Run, compare_runs, find_run, read_run
 from data_contracts.errors import DataError
+from data_contracts.home_folder import home_folder
 from flows.cli import script
 from flows.settings import flow
-from tasks.store import home_folder
+from tasks.store import Store
 
 
 @flow(name="compare")
@@ -28,13 +29,14 @@ def compare(run_a: str, run_b: str, home: str | None = None) -> Path:
     Args:
         run_a: name, key or path of a report.
         run_b: of another.
-        home: folder of all state; by default that of the process.
+        home: folder of all state, or URL of a bucket; by default that of the process.
     """
-    folder = Path(home).absolute() if home else home_folder()
+    folder = home_folder(home)
     return write_comparison(*_read_runs(run_a, run_b, folder), folder)[0]
 
 
 def _read_runs(run_a: str, run_b: str, home: Path) -> tuple[Run, Run]:
+    Store(home).fetch_files()
     folders = [find_run(run, home) for run in (run_a, run_b)]
     first, second = (folder.name[:12] for folder in folders)
     return read_run(first, folders[0]), read_run(second if second != first else f"{second} (B)", folders[1])
@@ -55,6 +57,7 @@ def write_comparison(first: Run, second: Run, home: Path) -> tuple[Path, list[Ta
     temporary = path.with_name(f".{path.name}")
     temporary.write_text(page, encoding="utf-8")
     temporary.replace(path)
+    Store(home).send_files()
     return path, found
 
 

@@ -36,13 +36,14 @@ from tasks.contact_sheet import publish_contact_sheet
 from tasks.export_events import publish_events
 from tasks.speed_report import publish_speed_report
 from tasks.stage import planning
+from tasks.store import Store
 
 _ARGUMENTS = """
 
 Args:
     preset: name of a bundled preset, or path of a .yaml file.
     overrides: options to change, each as `key=value`.
-    home: folder of all state; by default that of the worker.
+    home: folder of all state, or URL of a bucket; by default that of the worker.
 """
 
 
@@ -65,9 +66,10 @@ def _deployable(
     """
 
     def run(preset: str = default_preset, overrides: tuple[str, ...] = (), home: str | None = None) -> Any:
-        folder = configure(Path(home) if home else None)  # this process runs this one flow, and stages look there
+        folder = configure(home)  # this process runs this one flow, and stages look there
         folder.mkdir(parents=True, exist_ok=True)
         check_home(folder)
+        Store(folder).connect(send=True)
         options = load(preset, list(overrides))
         with planning() as rows:
             script_flow.fn(options)
@@ -76,6 +78,7 @@ def _deployable(
             made = script_flow.fn(options)  # called as a flow it would be a second run of the same name within this one
         if publish is not None:
             get_run_logger().info(publish(made, folder, options.name))
+        Store(folder).send_files()
         return made
 
     # A choice of the bundled presets, or the path of another.

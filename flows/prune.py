@@ -1,6 +1,6 @@
 """Remove from the store what no run has used for long, and nothing that anything kept was made from.
 
-python flows/prune.py [--keep-days N] [--keep-versions N] [--apply] [--home FOLDER]
+python flows/prune.py [--keep-days N] [--keep-versions N] [--apply] [--home FOLDER|URL]
 
 Without --apply it only lists what would go.
 """
@@ -30,6 +30,7 @@ def prune_home(home: Path, keep_days: float, keep_versions: int, *, apply: bool)
         if not home.is_dir():
             raise FileNotFoundError(f"{home}: there is no such home folder")
         store = Store(home)
+        store.connect(send=False)
         leaving, kept = store.unneeded(keep_days, keep_versions)
         if apply:
             leaving = store.prune(keep_days, keep_versions)

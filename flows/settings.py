@@ -3,7 +3,8 @@
 Entry points call `configure` before anything imports Prefect, which reads its settings when it is imported; flows are
 therefore made by the decorator here, which imports Prefect when the first one is called.
 
-All state lies under one folder: `--home`, else the variable CTLEV_HOME, else `.ctlev` in the working directory.
+All state lies under one folder: `--home`, else the variable CTLEV_HOME, else `.ctlev` in the working directory. Where
+that is the URL of a bucket, the folder is its cache on this machine.
 Nothing here reaches out: telemetry and update checks are off, and model hubs are never asked.
 """
 
@@ -18,6 +19,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, ParamSpec, TypeVar
 
+from data_contracts.home_folder import home_folder
 from flows import local_server
 
 if TYPE_CHECKING:
@@ -41,22 +43,22 @@ _ENVIRONMENT = {
 }
 
 
-def configure(home: Path | None = None, *, verbose: bool = False) -> Path:
+def configure(home: str | Path | None = None, *, verbose: bool = False) -> Path:
     """Set the environment of this process and those it starts; must be called before Prefect is imported.
 
     Args:
-        home: folder of all state; None = CTLEV_HOME, else `.ctlev` in the working directory.
+        home: folder of all state, or the URL of a bucket; None = CTLEV_HOME, else `.ctlev` in the working directory.
         verbose: show Prefect's log.
 
     Returns:
-        The home, absolute. It is made where it is not there and can be.
+        The home folder, absolute; of a bucket its cache. It is made where it is not there and can be.
     """
-    home = (home or Path(os.environ.get("CTLEV_HOME") or ".ctlev")).expanduser().absolute()
-    os.environ["CTLEV_HOME"] = str(home)
+    folder = home_folder(home)
+    os.environ["CTLEV_HOME"] = str(folder)
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    local_server.configure(home, verbose=verbose)
-    return home
+    local_server.configure(folder, verbose=verbose)
+    return folder
 
 
 class ScriptFlow(Generic[P, R]):

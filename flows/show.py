@@ -8,7 +8,9 @@ import webbrowser
 from pathlib import Path
 
 from ctlev_core.report.page.report_files import PAGE
+from data_contracts.errors import DataError
 from data_contracts.renamed_options import name_hint
+from tasks.store import Store
 
 
 def show_report(name: str | None, home: Path, *, open_page: bool | None = None) -> int:
@@ -22,6 +24,10 @@ def show_report(name: str | None, home: Path, *, open_page: bool | None = None) 
     Returns:
         Exit status: 0 found, 2 not.
     """
+    try:
+        Store(home).fetch_files()
+    except DataError as error:
+        print(f"only what is in {home}: {error}", file=sys.stderr)
     page, problem = find_page(name, home)
     if page is None:
         print(f"error: {problem}", file=sys.stderr)

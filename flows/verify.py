@@ -1,6 +1,9 @@
 """Hash every artefact of the store again and set damaged ones aside, so that the next run makes them anew.
 
-python flows/verify.py [--home FOLDER]
+python flows/verify.py [--home FOLDER|URL]
+
+Of a home in a bucket the cache of this machine is hashed, and then every artefact of the bucket, which is fetched for
+that.
 """
 
 from __future__ import annotations
@@ -12,8 +15,9 @@ from tqdm import tqdm
 
 from ctlev_core.provenance import raw_file_digests
 from data_contracts.errors import DataError, TableVersionError
-from data_contracts.published import kept_versions
+from data_contracts.published import StoredArtefact, kept_versions
 from flows.cli import script
+from tasks.bucket import Bucket, BucketError
 from tasks.store import Store
 
 
@@ -51,7 +55,37 @@ def verify(store: Store) -> tuple[int, int]:
     counted = f"{len(artefacts)} artefacts, {damaged} of them damaged" + (f", {outdated} outdated" if outdated else "")
     print(counted + ("; run the flow again" if damaged else ""))
     digests_damaged, digests_failed = _check_raw_file_digests(store)
-    return damaged + digests_damaged + _check_latest(store), failed + digests_failed
+    in_bucket, unread = (0, 0) if store.bucket is None else _check_bucket(store, store.bucket)
+    return damaged + digests_damaged + in_bucket + _check_latest(store), failed + digests_failed + unread
+
+
+def _check_bucket(store: Store, bucket: Bucket) -> tuple[int, int]:
+    """Fetch every artefact of a bucket and hash it; damaged ones are set aside there, and sent again from the cache.
+
+    Returns:
+        How many are damaged, and how many cannot be fetched.
+    """
+    artefacts = [item for item in bucket.artefacts() if item.is_finished]
+    damaged = failed = 0
+    with tqdm(total=sum(item.size_bytes for item in artefacts), unit="B", unit_scale=True, desc="bucket") as progress:
+        for item in artefacts:
+            name = f"{item.stage}/{item.key}"
+            try:
+                store.check_in_bucket(bucket, item.stage, item.key)
+            except TableVersionError:
+                pass
+            except (BucketError, OSError) as error:
+                failed += 1
+                tqdm.write(f"error: {name}: cannot be fetched: {error}", file=sys.stderr)
+            except DataError as error:
+                damaged += 1
+                tqdm.write(f"damaged in {bucket.url}: {name}: {error}")
+                tqdm.write(f"  now in {store.set_aside_in_bucket(bucket, item.stage, item.key)}")
+            progress.update(item.size_bytes)
+    print(f"{len(artefacts)} artefacts in {bucket.url}, {damaged} of them damaged")
+    if sent := store.send_unsent():
+        print(f"{sent} sent from {store.home}")
+    return damaged, failed
 
 
 def _check_raw_file_digests(store: Store) -> tuple[int, int]:
@@ -82,12 +116,18 @@ def _check_latest(store: Store) -> int:
         return 1
     broken = 0
     for version in latest:
-        missing = [a for a in version.artefacts if not store.folder(a.stage, a.key).is_dir()]
+        missing = [a for a in version.artefacts if not _is_there(store, a)]
         broken += bool(missing)
         for artefact in missing:
             where = f"{artefact.stage}/{artefact.key}"
             print(f"missing: {where} of the latest data, {version}; make the next with flows/regenerate.py")
     return broken
+
+
+def _is_there(store: Store, artefact: StoredArtefact) -> bool:
+    if store.folder(artefact.stage, artefact.key).is_dir():
+        return True
+    return store.bucket is not None and store.bucket.has(artefact.stage, artefact.key)
 
 
 def verify_home(home: Path) -> int:
@@ -96,8 +136,10 @@ def verify_home(home: Path) -> int:
         print(f"error: {home}: there is no such home folder", file=sys.stderr)
         return 2
     try:
-        damaged, failed = verify(Store(home))
-    except OSError as error:
+        store = Store(home)
+        store.connect(send=False)
+        damaged, failed = verify(store)
+    except (BucketError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 2 if failed else int(damaged > 0)

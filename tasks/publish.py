@@ -19,6 +19,8 @@ from data_contracts.published import (
     write_latest,
     write_version,
 )
+from tasks.bucket import bucket_of
+from tasks.bucket_files import fetch_files, send_files
 
 CLAIM_FILE = "claimed.json"
 
@@ -44,6 +46,10 @@ class Claim:
             write_version(self.folder, version)
         if version.passed:
             write_latest(self.folder, version)
+        bucket = bucket_of(_home(self.folder))
+        if bucket is not None:
+            # Other machines number their versions by these records, so that they are there before the claim ends.
+            send_files(_home(self.folder), bucket, ("published",))
         (self.folder / CLAIM_FILE).unlink(missing_ok=True)
         return version
 
@@ -72,13 +78,19 @@ def claimed(folder: Path) -> Iterator[Claim]:
     Raises:
         BlockingIOError: another process makes a version of the same experiment.
         DataError: the claim or a record is damaged.
+        BucketError: the bucket of the home cannot be used now.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("ab") as lock:
+    bucket = bucket_of(_home(folder))
+    with (folder / "lock").open("ab") as lock, contextlib.ExitStack() as stack:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BlockingIOError(f"{folder}: another run is making a version; ask again when it has ended") from None
+        if bucket is not None:
+            what = f"a version of {folder.name}"
+            stack.enter_context(bucket.lease(f"published-{folder.name}", what, wait=False))
+            fetch_files(_home(folder), bucket, ("published",))
         number = next_number(folder)
         began = version_file(folder, number)
         version = next((v for v in read_versions(folder) if v.number == number), None) if began.exists() else None
@@ -86,3 +98,8 @@ def claimed(folder: Path) -> Iterator[Claim]:
             started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
             write_durably(folder / CLAIM_FILE, json.dumps({"number": number, "started": started}) + "\n")
         yield Claim(folder, number, version)
+
+
+def _home(folder: Path) -> Path:
+    """The home that lists the versions of an experiment in a folder."""
+    return folder.parents[1]

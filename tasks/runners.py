@@ -31,6 +31,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
 from data_contracts.errors import DataError
+from data_contracts.home_folder import bucket_url, home_folder
 
 R = TypeVar("R")
 KINDS = ("threads", "processes", "dask", "ray", "slurm")
@@ -177,8 +178,10 @@ def compute_there(environment: dict[str, str], function: Callable[..., Any], arg
 
 def environment_there() -> dict[str, str]:
     """What `compute_there` sets."""
-    home = os.environ.get("CTLEV_HOME")
-    return ALONE | ({"CTLEV_HOME": os.path.abspath(home)} if home else {})
+    if not os.environ.get("CTLEV_HOME"):
+        return ALONE
+    home = home_folder()
+    return ALONE | {"CTLEV_HOME": bucket_url(home) or str(home)}
 
 
 class _Cluster(ABC):

@@ -255,7 +255,7 @@ class Stage:
         label = f"{self.name}: {label}" if label else self.name
         plan = _plan.get()
         if plan is not None:
-            cached = store.find(self.name, key) is not None
+            cached = store.holds(self.name, key)
             plan.rows.append(PlannedStage(self.name, label, key, cached, materials, arguments))
             return ManifestRef(key=key, path=store.folder(self.name, key))
         found = self.find(key, arguments) if _in_one_run.get() else None
@@ -268,9 +268,9 @@ class Stage:
         arguments = dict(list(bound.arguments.items())[1:])
         store = Store()
         key = self.key(arguments, store)
-        # Digests are not known while planning.
-        upstream = None if _plan.get() is not None else self._upstream(arguments)
-        return store.find(self.name, key, upstream) is not None
+        if _plan.get() is not None:  # digests are not known
+            return store.holds(self.name, key)
+        return store.find(self.name, key, self._upstream(arguments)) is not None
 
     def check(self, arguments: dict[str, Any]) -> None:
         """Raise `DataError` where the settings do not go together: where a stage is planned, and where it is run."""
@@ -319,7 +319,8 @@ class Stage:
                 found = self.find(key, arguments)
                 if found is not None:
                     return found, True
-                return workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
+                ref, cached = workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
+                return Store().here(ref), cached
         store, upstream = Store(), self._upstream(arguments)
         with store.lock(key, f"artefact {self.name}/{key}"):
             # Another process may have just finished it.
@@ -343,7 +344,7 @@ class Stage:
         try:
             folder.mkdir(parents=True)
             work.mkdir(parents=True, exist_ok=True)
-            opened = {name: _opened(value) for name, value in arguments.items()}
+            opened = {name: _opened(value, store) for name, value in arguments.items()}
             with few_threads(), gpus_held(gpu_need(arguments), self.name), _time_limit(self.name):
                 table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
@@ -458,13 +459,13 @@ def _references(value: Any) -> list[ManifestRef]:
     return []
 
 
-def _opened(value: Any) -> Any:
+def _opened(value: Any, store: Store) -> Any:
     if isinstance(value, ManifestRef):
-        return read_manifest(value)
+        return read_manifest(store.here(value))
     if isinstance(value, list | tuple):
-        return [_opened(item) for item in value]
+        return [_opened(item, store) for item in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        opened = {field.name: _opened(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        opened = {field.name: _opened(getattr(value, field.name), store) for field in dataclasses.fields(value)}
         return dataclasses.replace(value, **opened)
     return value
 

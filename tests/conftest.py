@@ -80,3 +80,24 @@ def random_events() -> Events:
         random.integers(0, 2, 2000).astype(np.uint8),
         (32, 24),
     )
+
+
+@pytest.fixture(scope="session")
+def s3_server() -> Iterator[str]:
+    """The address of an S3 server on loopback, which the environment names with credentials for it."""
+    pytest.importorskip("moto.server", reason="the extra `test` has moto, an S3 server on loopback")
+    pytest.importorskip("s3fs", reason="the extra `bucket` has s3fs")
+    import bucket_server
+
+    with bucket_server.s3_server() as endpoint, pytest.MonkeyPatch.context() as patch:
+        for name, value in {**bucket_server.CREDENTIALS, "AWS_ENDPOINT_URL": endpoint}.items():
+            patch.setenv(name, value)
+        yield endpoint
+
+
+@pytest.fixture
+def bucket_url(s3_server: str) -> str:
+    """The home in a new bucket."""
+    import bucket_server
+
+    return bucket_server.new_bucket()

@@ -28,9 +28,10 @@ PACKAGES = ("ctlev_core", "data_contracts", "tasks")
 KINDS = ("datasets", "formats", "motions", "encodings", "conditions", "generators", "downstream", "metrics")
 RUNNING_ALONE = {
     "tasks.stage", "tasks.store", "tasks.file_locks", "tasks.workers", "tasks.runners", "tasks.prefect_runs",
-    "tasks.gpus", "tasks.slurm", "ctlev_core.plugins", "ctlev_core.plugin_contracts", "ctlev_core.processes",
+    "tasks.gpus", "tasks.slurm", "tasks.bucket", "tasks.bucket_cache", "tasks.bucket_files", "ctlev_core.plugins",
+    "ctlev_core.plugin_contracts", "ctlev_core.processes",
     "ctlev_core.provenance.raw_file_digests", "data_contracts.errors", "data_contracts.run_record",
-    "data_contracts.remembered_files",
+    "data_contracts.remembered_files", "data_contracts.home_folder",
 }  # fmt: skip
 """Modules that say where and when code runs, not what comes out; their own tests say that it does not."""
 COMMAND = "python tests/golden/import_closures.py --record"
