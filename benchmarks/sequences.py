@@ -113,7 +113,7 @@ class Run:
         records = read_provenance(home / "reports" / name / "provenance.json")
         by_role = {one.role: one for one in records}
         self.image, self.layers = by_role["checkpoint of synthetic"], by_role[f"checkpoint of {layers}"]
-        self.frames, self.asked = self._open(by_role["frames"]), self._open(by_role["conditions"])
+        self.frames, self.asked = self._open(by_role["frames"]), self._open(by_role["conditions to sample from"])
         self.sampling = next(one for one in records if one.stage == "sample").arguments["sampling"]["options"]
         encoding = by_role["frames"].arguments["encoding"]
         self.encoder = EncodingChoice(name=encoding["plugin"].rpartition("/")[2], options=encoding["options"])
