@@ -19,10 +19,11 @@ from flows.prepare_dataset import (
     condition_training_frames,
     motion_options,
     prepare_dataset,
+    student_options,
 )
 from flows.sampling import sample_generator
 from flows.settings import flow
-from flows.train_generator import fine_tuned, with_motion_layers
+from flows.train_generator import fine_tuned, with_motion_layers, with_student
 from tasks.ingest import ingest
 from tasks.sample import simulate
 from tasks.stage import call_flow, call_together, numbered
@@ -88,9 +89,13 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
     )
     motion = motion_options(experiment, name)
     checkpoint = with_motion_layers(checkpoint, dataset.frames, learnt, options=motion, seed=seed, label=label)
+    student = student_options(experiment, name)
+    generator = with_student(
+        checkpoint, learnt, sampling=baseline.sampling_choice, options=student, seed=seed, label=label
+    )
     synthetic = sample_generator(
         experiment,
-        checkpoint,
+        generator,
         dataset.frames,
         learnt,
         asked,
@@ -99,7 +104,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         part=part,
         label=label,
     )
-    return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)
+    return BaselineFrames(sample_conditions=asked, checkpoint=generator.sampled, synthetic=synthetic)
 
 
 COMMAND = Command(

@@ -84,7 +84,7 @@ def realism_chain(asked: RealismChain) -> ManifestRef:
         seed=options.seed,
         label=f"{asked.condition.name}, recorded frames of split {split}",
     )
-    checkpoint = call_flow(train_generator, asked, dataset)
+    checkpoint = call_flow(train_generator, asked, dataset).tuned
     decoder = train_decoder(
         asked,
         checkpoint,

@@ -9,6 +9,7 @@ from ctlev_core.plugins import PluginError, validate_options
 from data_contracts.config import SamplingChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
+from flows.train_generator import Checkpoints
 from tasks.pixel_decoder import decode_pixels, train_pixel_decoder
 from tasks.sample import sample
 
@@ -18,7 +19,7 @@ _OF_THE_SOLVER = ("scheduler", "num_inference_steps", "timestep_spacing", "noise
 
 def sample_generator(
     experiment: Experiment,
-    checkpoint: ManifestRef,
+    generator: Checkpoints,
     frames: ManifestRef,
     learnt: ManifestRef,
     asked: ManifestRef,
@@ -33,7 +34,7 @@ def sample_generator(
 
     Args:
         experiment: what is asked for.
-        checkpoint: the trained generator.
+        generator: trained; its student is sampled where it has one, and the decoder learns from what was fine-tuned.
         frames: recorded ones.
         learnt: conditions of the training frames.
         asked: conditions to sample from.
@@ -43,9 +44,12 @@ def sample_generator(
         part: of a union, whose training frames alone samples are compared with; None = all.
         label: of the stages.
     """
-    decoder = train_decoder(experiment, checkpoint, frames, learnt, sampling=sampling, number=number, label=label)
+    decoder = train_decoder(
+        experiment, generator.tuned, frames, learnt, sampling=sampling, number=number, label=label
+    )
+    sampling = generator.student_sampling or sampling
     made = sample(
-        checkpoint,
+        generator.sampled,
         frames,
         asked,
         sampling=sampling if decoder is None else smooth(sampling),

@@ -122,7 +122,7 @@ def speed_vs_error(measured: SpeedVsError) -> ManifestRef:
     """Sample with every setting under a stopwatch, measure errors, and write the page with the plots."""
     experiment, options = measured.experiment, measured.options
     dataset = call_flow(prepare_dataset, experiment)
-    checkpoint = call_flow(train_generator, experiment, dataset)
+    checkpoint = call_flow(train_generator, experiment, dataset).tuned
     conditions, sampling = dataset.sample_conditions, experiment.sampling_choice
     extractor = train_downstream(
         [dataset.frames], downstream=measured.feature_extractor, seed=experiment.seed, label="feature extractor"
