@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -77,15 +78,16 @@ class TrajectorySteps:
 
     @staticmethod
     def make(config: dict[str, Any], num_evaluations: int, teacher_evaluations: int) -> TrajectorySteps:
-        """Of a teacher's scheduler config; the teacher is evaluated so often for each evaluation of the student."""
+        """Of a teacher's scheduler config; the teacher's evaluations are shared out among those of the student."""
         schedule = NoiseSchedule(config)
         scheduler = make_scheduler(OF_STUDENTS, student_config(config, num_evaluations), num_evaluations)
         student = tuple(int(step) for step in scheduler.timesteps)
         alpha_bar = schedule.alphas_cumprod.double().clamp(min=2.0**-24)
         sigmas = ((1 - alpha_bar) / alpha_bar).sqrt().numpy() ** (1 / RHO)
         teacher: list[int] = []
+        each = math.ceil(teacher_evaluations / num_evaluations)
         for start, stop in zip(student, (*student[1:], 0), strict=True):
-            between = np.linspace(sigmas[start], sigmas[stop], teacher_evaluations, endpoint=False)
+            between = np.linspace(sigmas[start], sigmas[stop], each, endpoint=False)
             teacher += [start, *np.searchsorted(sigmas, between[1:]).tolist()]
         return TrajectorySteps(schedule, config, student, tuple(sorted({*teacher, 0}, reverse=True)))
 

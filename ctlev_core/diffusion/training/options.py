@@ -234,7 +234,11 @@ class StudentOptions(TrainingOptions):
         default=4, ge=1, le=8, description="evaluations of the network an image; a student is made for one number"
     )
     teacher_evaluations: int = Field(
-        default=3, ge=2, le=100, description="evaluations of the teacher for each of the student's, in training"
+        default=12,
+        ge=2,
+        le=200,
+        description="evaluations of the teacher on the way from noise to the lowest noise, shared out evenly among those "
+        "of the student and rounded up",
     )
     tune: Literal["unet", "both"] = Field(
         default="both", description="what learns: the U-Net alone, or the ControlNet too where there is one"
@@ -245,11 +249,13 @@ class StudentOptions(TrainingOptions):
         le=1,
         description="share of condition images turned by 90, 180 or 270 degrees, as in fine-tuning",
     )
-    num_steps: int = Field(default=600, gt=0, description="optimiser steps")
+    num_steps: int = Field(default=400, gt=0, description="optimiser steps")
     batch_size: int = Field(
         default=16, gt=0, description="states that the student learns from at a time; whole trajectories"
     )
-    learning_rate: float = Field(default=5e-4, gt=0, description="peak")
+    learning_rate: float = Field(
+        default=2e-4, gt=0, description="peak; higher ones lose more of what the teacher knows than is learnt anew"
+    )
     weight_decay: float = Field(default=0.0, ge=0, description="decoupled (AdamW)")
     ema_decay: float = Field(
         default=0.99, ge=0, lt=1, description="of the averaged weights that are kept; 0 = no averaging"
