@@ -209,9 +209,9 @@ class Experiment(Frozen):
     student: dict[str, Any] | None = Field(
         None,
         json_schema_extra=ADDED_LATER,
-        description="options of a distillation: frames are sampled from a student that in few evaluations of the network "
-        "imitates what the generator samples; {} = their defaults; of the experiment's own diffusion generator, while "
-        "baselines may have their own; null = none",
+        description="options of a distillation: frames are sampled from a student that in few evaluations of the "
+        "network imitates what the generator samples; {} = their defaults; of the experiment's own diffusion "
+        "generator, while baselines may have their own; null = none",
     )
     oracle: Oracle | None = Field(
         None, description="recordings of the sampled poses: the most that synthetic frames can give"

@@ -51,7 +51,7 @@ def baselines(experiment: Experiment, dataset: PreparedDataset | None = None) ->
 
 def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: int) -> BaselineFrames:
     baseline, seed, label = experiment.baselines[name], experiment.seed + number, numbered(name, number)
-    part = baseline.part
+    part, student = baseline.part, student_options(experiment, name)
     poses = dataset.poses
     if baseline.poses is not None:
         poses = ingest(dataset=baseline.poses, label=f"{baseline.poses.name}, poses of {name}")
@@ -89,7 +89,6 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
     )
     motion = motion_options(experiment, name)
     checkpoint = with_motion_layers(checkpoint, dataset.frames, learnt, options=motion, seed=seed, label=label)
-    student = student_options(experiment, name)
     generator = with_student(
         checkpoint, learnt, sampling=baseline.sampling_choice, options=student, seed=seed, label=label
     )

@@ -44,9 +44,7 @@ def sample_generator(
         part: of a union, whose training frames alone samples are compared with; None = all.
         label: of the stages.
     """
-    decoder = train_decoder(
-        experiment, generator.tuned, frames, learnt, sampling=sampling, number=number, label=label
-    )
+    decoder = train_decoder(experiment, generator.tuned, frames, learnt, sampling=sampling, number=number, label=label)
     sampling = generator.student_sampling or sampling
     made = sample(
         generator.sampled,

@@ -1,4 +1,4 @@
-"""What says that a checkpoint was distilled: the scheduler config of diffusers' `TCDScheduler`. Imports nothing heavy."""
+"""What says that a checkpoint was distilled: its scheduler is diffusers' `TCDScheduler`. Imports nothing heavy."""
 
 from __future__ import annotations
 

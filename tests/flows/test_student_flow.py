@@ -64,8 +64,8 @@ def test_students_share_the_fine_tuning_and_the_decoder(home):
 
 
 def test_a_second_run_makes_nothing(home):
-    planned = plan_script("baselines", "--preset", "pose",
-                          "--dry-run", *settings(f"student={{num_evaluations: 2, {STUDENT}}}", BASELINES), home=home)  # fmt: skip
+    asked = settings(f"student={{num_evaluations: 2, {STUDENT}}}", BASELINES)
+    planned = plan_script("baselines", "--preset", "pose", "--dry-run", *asked, home=home)
     assert planned.plan and {state for state, _ in planned.plan.values()} == {"cached"}, planned
 
 
@@ -87,7 +87,7 @@ def test_from_python_the_same_frames_come(home):
 def test_what_does_not_go_together_is_refused_before_anything_runs(tmp_path):
     for further, message in (
         ("student={num_evaluation: 4}", "student: unknown option 'num_evaluation'"),
-        ("student={num_evaluations: 9}", "student.num_evaluations"),
+        ("student={num_evaluations: 9}", "student: option 'num_evaluations'"),
         ("sampling.scheduler=tcd", "sampling.scheduler: a student gets 'tcd' by itself"),
         ("student={snr_gamma: 5}", "a student learns from trajectories"),
         ("baselines={other: {student: {}, sampling: {controlnet_every: 2}}}", "baselines.other.student: expected"),

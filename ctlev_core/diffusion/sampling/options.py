@@ -43,8 +43,8 @@ class SamplingOptions(Frozen):
 
     scheduler: Scheduler = Field(
         default="unipc",
-        description="solver; the paper's is ddpm with 1000 steps, unipc (Karras) matches it in 20; tcd is for distilled "
-        "checkpoints (`student`)",
+        description="solver; the paper's is ddpm with 1000 steps, unipc (Karras) matches it in 20; tcd is for "
+        "distilled checkpoints (`student`)",
     )
     num_inference_steps: int = Field(
         default=20, gt=0, le=1000, description="evaluations of the network an image; paper: 1000"

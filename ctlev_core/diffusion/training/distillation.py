@@ -14,11 +14,12 @@ Consistency Distillation, 2024 (the scheduler, here without noise of its own).
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +113,8 @@ class TrajectorySteps:
         """What the student must predict at its evaluation `number`, [B, C, h, w].
 
         The scheduler's step is x_s = a x_t + b x_0, with a = ((1 - abar_s) / (1 - abar_t))^1/2 and
-        b = abar_s^1/2 - a abar_t^1/2; the last goes to time step 0. Solved for x_0, with the teacher's next state for x_s.
+        b = abar_s^1/2 - a abar_t^1/2; the last goes to time step 0. It is solved for x_0, with the teacher's next state
+        for x_s.
 
         Args:
             state: [B, C, h, w] at the evaluation.
@@ -156,7 +158,7 @@ class Distillation:
     def loss(self, states: Sequence[Tensor], batch: Batch) -> Tensor:
         """Mean squared error of the student's predictions at the teacher's states, all evaluations alike."""
         count, number = len(batch.latents), len(self.steps.student)
-        pairs = zip(states, states[1:], strict=False)
+        pairs = itertools.pairwise(states)
         targets = torch.cat([self.steps.target(here, there, index) for index, (here, there) in enumerate(pairs)])
         timesteps = torch.tensor(self.steps.student, device=targets.device).repeat_interleave(count)
         conditions = None if batch.conditions is None else batch.conditions.repeat(number, 1, 1, 1)
@@ -309,9 +311,7 @@ def _identity(
     """Digest of what the saved state depends on."""
     weights = [file_digest(path) for path in sorted(checkpoint.rglob("*.safetensors"))]
     guided = [guidance.guidance_scale, guidance.guidance_interval]
-    digest = hashlib.sha256(
-        json.dumps([cache_material(options), guided, seed, weights, conditions.prompts]).encode()
-    )
+    digest = hashlib.sha256(json.dumps([cache_material(options), guided, seed, weights, conditions.prompts]).encode())
     if conditions.images is not None:
         digest.update(as_image_rows(conditions.images).digest().encode())
     return digest.hexdigest()

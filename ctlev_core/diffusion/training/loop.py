@@ -22,7 +22,6 @@ from ctlev_core.diffusion.training.tensorboard import TrainingLog, training_log
 from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 from ctlev_core.progress import ProgressBar
 
-
 BatchLoss = Callable[[Batch, torch.Generator], torch.Tensor]
 """From a batch and the stream of its noise to a loss [], whose gradients the trained weights get."""
 

@@ -237,8 +237,8 @@ class StudentOptions(TrainingOptions):
         default=12,
         ge=2,
         le=200,
-        description="evaluations of the teacher on the way from noise to the lowest noise, shared out evenly among those "
-        "of the student and rounded up",
+        description="evaluations of the teacher on the way from noise to the lowest noise, shared out evenly among "
+        "those of the student and rounded up",
     )
     tune: Literal["unet", "both"] = Field(
         default="both", description="what learns: the U-Net alone, or the ControlNet too where there is one"

@@ -81,7 +81,7 @@ def test_the_teacher_follows_the_exact_solution(kind, count):
     states = steps.follow(noise, gaussian(steps.schedule, SPREAD))
     assert len(states) == count + 1 and torch.equal(states[0], noise)
     for step, state in zip((*steps.student[1:], None), states[1:], strict=True):
-        # The last jump goes from the schedule's lowest noise to the mean, .03 of it; solver errors of order 2 elsewhere.
+        # The last jump goes from the schedule's lowest noise to the mean; elsewhere the solver's errors, of order 2.
         expected = exact_map(steps.schedule, noise, steps.student[0], step, SPREAD)
         assert (state - expected).abs().max() < (2e-3 if step is None else 5e-4)
 
@@ -213,7 +213,9 @@ def test_plain_diffusers_samples_what_we_sample(tmp_path, student):
     embeddings = encode_prompts(base_model, list(conditions.prompts))
     seeds = [5, 6, 7]
     channels, side = unet.config.in_channels, unet.config.sample_size
-    state = torch.stack([torch.randn((channels, side, side), generator=torch.Generator().manual_seed(s)) for s in seeds])
+    state = torch.stack(
+        [torch.randn((channels, side, side), generator=torch.Generator().manual_seed(s)) for s in seeds]
+    )
     for timestep in scheduler.timesteps:
         down, middle = steering(state, timestep, embeddings, images, return_dict=False)
         predicted = unet(
