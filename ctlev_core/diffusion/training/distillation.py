@@ -297,7 +297,8 @@ def _save(student: PretrainedModel, checkpoint: Path, num_evaluations: int, out:
 
     save_base_model(student, out)
     config = student_config(student.scheduler_config, num_evaluations)
-    TCDScheduler.from_config(config).save_pretrained(out / "scheduler")
+    scheduler: Any = TCDScheduler.from_config(config)
+    scheduler.save_pretrained(out / "scheduler")
     index = json.loads((out / "model_index.json").read_text())
     index["scheduler"] = ["diffusers", STUDENT_SCHEDULER]
     (out / "model_index.json").write_text(json.dumps(index, indent=2) + "\n")
