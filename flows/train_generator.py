@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import OF_STUDENTS
@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # torch, which most plans do without
     from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
 
 
+X = TypeVar("X", bound=Experiment)
 _OF_GUIDANCE = ("guidance_scale", "guidance_interval")
 """Sampling options of a teacher that its student learns."""
 _OF_THE_TEACHER = ("scheduler", "num_inference_steps", "timestep_spacing", "controlnet_every", *_OF_GUIDANCE)
@@ -132,6 +133,11 @@ def with_motion_layers(
     if options is None:
         return checkpoint
     return train_motion_layers(checkpoint, frames, conditions, options=options, seed=seed, label=label)
+
+
+def without_student(experiment: X) -> X:
+    """The same experiment for what measures the fine-tuned generator: its student need not be made."""
+    return experiment.model_copy(update={"student": None})
 
 
 def with_student(
