@@ -231,7 +231,7 @@ class StudentOptions(TrainingOptions):
     """Distillation of a fine-tuned generator into a student that needs few evaluations of the network."""
 
     num_evaluations: int = Field(
-        default=4, ge=1, le=8, description="evaluations of the network an image; a student is made for one number"
+        default=2, ge=1, le=8, description="evaluations of the network an image; a student is made for one number"
     )
     teacher_evaluations: int = Field(
         default=12,
