@@ -16,6 +16,8 @@ import numpy.typing as npt
 from ctlev_core import plugins
 from ctlev_core.diffusion.motion_files import has_motion_layers
 from ctlev_core.diffusion.pretrained.adapters import is_adapter
+from ctlev_core.diffusion.sampling.options import OF_STUDENTS
+from ctlev_core.diffusion.student_files import distilled_evaluations
 from ctlev_core.pixel_decoder.options import DECODER_FOLDER
 from ctlev_core.plugins import validate_options
 from ctlev_core.provenance.records import Record, read_provenance
@@ -144,7 +146,7 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
 
     Args:
         place: name of a report (its experiment's own generator, with its pixel decoder), the path of an artefact of the
-            stage `finetune` or `train_motion_layers`, or of a diffusers folder that training wrote.
+            stage `finetune`, `train_motion_layers` or `distill`, or of a diffusers folder that training wrote.
         home: folder of all state, where `place` is a name, or URL of a bucket, of which what is in the cache of this
             machine is found; None = CTLEV_HOME, else `.ctlev`.
     Raises:
@@ -198,10 +200,12 @@ def _of_folder(
         folder = folder.parent
     if (folder / RUN_FILE).is_file() and not has_motion_layers(folder / CHECKPOINT):
         try:
-            plugin = json.loads((folder / RUN_FILE).read_text())["arguments"]["generator"]["plugin"]
-        except (KeyError, TypeError, ValueError) as error:
+            arguments = json.loads((folder / RUN_FILE).read_text())["arguments"]
+            plugin = (arguments.get("generator") or arguments["sampling"])["plugin"]
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise DataError(f"{folder}: is no artefact of the stage finetune") from error
-        return TrainedGenerator(folder / CHECKPOINT, plugin.rpartition("/")[2], decoder, defaults)
+        folder = folder / CHECKPOINT
+        return TrainedGenerator(folder, plugin.rpartition("/")[2], decoder, defaults or _defaults_of(folder))
     if (folder / RUN_FILE).is_file():
         folder = folder / CHECKPOINT
     if not (folder / "model_index.json").is_file() and not is_adapter(folder):
@@ -209,7 +213,13 @@ def _of_folder(
             f"{folder}: expected an artefact of the stage finetune or a diffusers folder; no model_index.json"
         )
     name = "controlnet" if (folder / "controlnet").is_dir() else "stable_diffusion"
-    return TrainedGenerator(folder, name, decoder, defaults)
+    return TrainedGenerator(folder, name, decoder, defaults or _defaults_of(folder))
+
+
+def _defaults_of(folder: Path) -> dict[str, Any]:
+    """Students are sampled in one way alone."""
+    number = distilled_evaluations(folder)
+    return {} if number is None else {"scheduler": OF_STUDENTS, "num_inference_steps": number}
 
 
 def _conditions(prompts: str | Sequence[str] | None, images: npt.ArrayLike | None) -> Conditions:

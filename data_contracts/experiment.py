@@ -55,6 +55,11 @@ class Baseline(Frozen):
         description="options of layers that make consecutive frames from one another, as `motion_layers` of the "
         "experiment, which is not inherited; null = none",
     )
+    student: dict[str, Any] | None = Field(
+        None,
+        json_schema_extra=ADDED_LATER,
+        description="options of a distillation, as `student` of the experiment, which is not inherited; null = none",
+    )
     poses: DatasetChoice | None = Field(
         None, description="another dataset whose poses it is asked for; None = those of the experiment"
     )
@@ -201,6 +206,13 @@ class Experiment(Frozen):
         description="options of layers that make consecutive frames from one another; {} = their defaults; of the "
         "experiment's own diffusion generator, while baselines may have their own; needs temporal_order; null = none",
     )
+    student: dict[str, Any] | None = Field(
+        None,
+        json_schema_extra=ADDED_LATER,
+        description="options of a distillation: frames are sampled from a student that in few evaluations of the "
+        "network imitates what the generator samples; {} = their defaults; of the experiment's own diffusion "
+        "generator, while baselines may have their own; null = none",
+    )
     oracle: Oracle | None = Field(
         None, description="recordings of the sampled poses: the most that synthetic frames can give"
     )
@@ -291,6 +303,13 @@ class Experiment(Frozen):
             )
         if self.stretch_length is not None:
             raise ValueError("stretch_length is of labels that follow one another: set temporal_order to true")
+        return self
+
+    @model_validator(mode="after")
+    def _students_make_single_frames(self) -> Experiment:
+        for name, one in (("", self), *((f"baselines.{name}.", one) for name, one in self.baselines.items())):
+            if one.student is not None and one.motion_layers is not None:
+                raise ValueError(f"{name}student: a generator with motion layers cannot be distilled, leave out one")
         return self
 
     @model_validator(mode="after")

@@ -19,10 +19,11 @@ from flows.prepare_dataset import (
     condition_training_frames,
     motion_options,
     prepare_dataset,
+    student_options,
 )
 from flows.sampling import sample_generator
 from flows.settings import flow
-from flows.train_generator import fine_tuned, with_motion_layers
+from flows.train_generator import fine_tuned, with_motion_layers, with_student
 from tasks.ingest import ingest
 from tasks.sample import simulate
 from tasks.stage import call_flow, call_together, numbered
@@ -50,7 +51,7 @@ def baselines(experiment: Experiment, dataset: PreparedDataset | None = None) ->
 
 def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: int) -> BaselineFrames:
     baseline, seed, label = experiment.baselines[name], experiment.seed + number, numbered(name, number)
-    part = baseline.part
+    part, student = baseline.part, student_options(experiment, name)
     poses = dataset.poses
     if baseline.poses is not None:
         poses = ingest(dataset=baseline.poses, label=f"{baseline.poses.name}, poses of {name}")
@@ -88,9 +89,12 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
     )
     motion = motion_options(experiment, name)
     checkpoint = with_motion_layers(checkpoint, dataset.frames, learnt, options=motion, seed=seed, label=label)
+    generator = with_student(
+        checkpoint, learnt, sampling=baseline.sampling_choice, options=student, seed=seed, label=label
+    )
     synthetic = sample_generator(
         experiment,
-        checkpoint,
+        generator,
         dataset.frames,
         learnt,
         asked,
@@ -100,7 +104,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         motion=motion is not None,
         label=label,
     )
-    return BaselineFrames(sample_conditions=asked, checkpoint=checkpoint, synthetic=synthetic)
+    return BaselineFrames(sample_conditions=asked, checkpoint=generator.sampled, synthetic=synthetic)
 
 
 COMMAND = Command(

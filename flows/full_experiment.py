@@ -156,8 +156,8 @@ def _study(study: Study) -> ManifestRef:
 
 
 def _own_frames(experiment: Experiment, dataset: PreparedDataset, number: int) -> tuple[ManifestRef, ManifestRef]:
-    checkpoint = call_flow(train_generator, experiment, dataset, number)
-    return checkpoint, call_flow(synthesize, experiment, dataset, checkpoint, number)
+    generator = call_flow(train_generator, experiment, dataset, number)
+    return generator.sampled, call_flow(synthesize, experiment, dataset, generator, number)
 
 
 def _describe(made: ManifestRef, name: str) -> str:

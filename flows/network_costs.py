@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from ctlev_core.diffusion.pretrained.components import ModelPart
 from ctlev_core.diffusion.pretrained.paths import find_controlnet, read_controlnet, read_parts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.latent_files import ENCODE_BATCH, ENCODE_PIXELS
-from ctlev_core.diffusion.training.options import FineTuningOptions, LatentOptions
+from ctlev_core.diffusion.training.options import FineTuningOptions, LatentOptions, StudentOptions, TrainingOptions
 from ctlev_core.processes import few_threads, use_cores_for
 from data_contracts.config import Choice
 from data_contracts.errors import DataError
@@ -95,6 +95,8 @@ def network_cost(
     if stage == "finetune":
         return _fine_tuning(options, weights, size)
     sampling = _options(given.get("sampling"))
+    if stage == "distill" and isinstance(sampling, SamplingOptions):
+        return _distilling(given["options"], sampling, options, weights, size)
     if stage == "sample" and isinstance(sampling, SamplingOptions):
         return _sampling(sampling, weights, rows, size)
     return None
@@ -138,6 +140,30 @@ def _fine_tuning(options: FineTuningOptions, weights: Mapping[str, int], size: t
         4 * everything + 4 * trained + moments + averages + 4 * everything,
         processes * _memory(4 * everything, 4 * trained + averages + max(peak, backward), gpus),
         4 * everything,
+    )
+
+
+def _distilling(
+    student: StudentOptions,
+    sampling: SamplingOptions,
+    options: FineTuningOptions,
+    weights: Mapping[str, int],
+    size: tuple[int, int],
+) -> NetworkCost:
+    """Training of a copy, and the teacher's forward passes for the states that it learns from."""
+    with_controlnet = "controlnet" in weights
+    tune = student.tune if with_controlnet else "unet"
+    learning = {name: getattr(student, name) for name in TrainingOptions.model_fields} | {"device": student.device}
+    cost = _fine_tuning(options.model_copy(update={**learning, "tune": tune, "num_processes": None}), weights, size)
+    forward = operations("unet", *size) + with_controlnet * operations("controlnet", *size)
+    each = math.ceil(student.teacher_evaluations / student.num_evaluations) * (2 if sampling.guidance_scale > 1 else 1)
+    images = student.num_steps * student.batch_size * student.gradient_accumulation
+    teacher = 4 * (weights["unet"] + weights.get("controlnet", 0))
+    return replace(
+        cost,
+        operations={name: count + images * each * forward for name, count in cost.operations.items()},
+        io_bytes=cost.io_bytes + 4 * sum(weights.values()),
+        memory_bytes=cost.memory_bytes + (0 if num_gpus(student.device) else teacher),
     )
 
 

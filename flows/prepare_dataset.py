@@ -6,8 +6,8 @@ import sys
 from functools import partial
 
 from ctlev_core import plugins
-from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.training.options import MotionOptions
+from ctlev_core.diffusion.sampling.options import OF_STUDENTS, SamplingOptions
+from ctlev_core.diffusion.training.options import MotionOptions, StudentOptions
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.scoring.sensor_pixels import check_in_image
 from ctlev_core.supervised.frame_sequences import name_followed, training_interval_us
@@ -217,6 +217,34 @@ def motion_options(experiment: Experiment, baseline: str | None = None) -> Motio
             f"{where}.context: stretches of {options.context} frames, but windows.max_windows keeps {most} of a "
             "recording"
         )
+    return options
+
+
+def student_options(experiment: Experiment, baseline: str | None = None) -> StudentOptions | None:
+    """The options of the student of the experiment's own generator, or of a baseline's; None where it has none.
+
+    Raises:
+        PluginError: an option is unknown or wrong, or the generator or the way it is sampled cannot be distilled.
+    """
+    asked = experiment if baseline is None else experiment.baselines[baseline]
+    before = "" if baseline is None else f"baselines.{baseline}."
+    sampling = plugins.load_options(asked.sampling_choice).options
+    is_diffusion = isinstance(sampling, SamplingOptions)
+    if is_diffusion and sampling.scheduler == OF_STUDENTS:
+        raise PluginError(
+            f"{before}sampling.scheduler: a student gets {OF_STUDENTS!r} by itself where {before}student is set; "
+            f"expected the generator's own, such as 'unipc'"
+        )
+    if asked.student is None:
+        return None
+    where = f"{before}student"
+    options = validate_options(StudentOptions, asked.student, where)
+    if not is_diffusion:
+        raise PluginError(f"{where}: expected a diffusion generator, got {asked.generator.name!r}")
+    if sampling.controlnet_every > 1:
+        raise PluginError(f"{where}: expected sampling.controlnet_every 1, got {sampling.controlnet_every}")
+    if options.rot90_probability and not hasattr(plugins.load_options(asked.generator).options, "controlnet"):
+        raise PluginError(f"{where}.rot90_probability turns condition images, {asked.generator.name!r} takes prompts")
     return options
 
 

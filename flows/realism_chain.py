@@ -19,7 +19,7 @@ from flows.command_line import Command, load_experiment
 from flows.prepare_dataset import prepare_dataset
 from flows.sampling import decoder_options, smooth, train_decoder, without_solver
 from flows.settings import flow
-from flows.train_generator import train_generator
+from flows.train_generator import train_generator, without_student
 from tasks.chain_report import chain_report, publish_chain_report
 from tasks.condition import condition_some_frames
 from tasks.realism_chain import chain_frames, chain_realism
@@ -84,7 +84,7 @@ def realism_chain(asked: RealismChain) -> ManifestRef:
         seed=options.seed,
         label=f"{asked.condition.name}, recorded frames of split {split}",
     )
-    checkpoint = call_flow(train_generator, asked, dataset)
+    checkpoint = call_flow(train_generator, without_student(asked), dataset).tuned
     decoder = train_decoder(
         asked,
         checkpoint,

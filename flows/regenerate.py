@@ -26,7 +26,7 @@ from flows.evaluate import sensor_of
 from flows.prepare_dataset import PreparedDataset, condition_asked_samples, prepare_dataset
 from flows.sampling import sample_generator
 from flows.settings import flow
-from flows.train_generator import train_generator
+from flows.train_generator import Checkpoints, train_generator
 from tasks.downstream import train_downstream
 from tasks.evaluate import score_model
 from tasks.memorisation import memorisation
@@ -60,17 +60,17 @@ def make_next_version(regeneration: Regeneration) -> Version | None:
     What a version shares with others, data and generator, is made before one is claimed.
     """
     dataset = call_flow(prepare_dataset, regeneration)
-    checkpoint = call_flow(train_generator, regeneration, dataset)
+    generator = call_flow(train_generator, regeneration, dataset)
     folder = published_folder(home_folder(), regeneration.name)
-    if not checkpoint.digest:  # only planned
-        _make(regeneration, dataset, checkpoint, version_seed(regeneration.seed, next_number(folder)))
+    if not generator.sampled.digest:  # only planned
+        _make(regeneration, dataset, generator, version_seed(regeneration.seed, next_number(folder)))
         return None
     with claimed(folder) as claim:
         version = claim.version
         if version is None:
             seed = version_seed(regeneration.seed, claim.number)
-            made = _make(regeneration, dataset, checkpoint, seed)
-            version = _judge(regeneration, checkpoint, made, claim.number, seed)
+            made = _make(regeneration, dataset, generator, seed)
+            version = _judge(regeneration, generator.sampled, made, claim.number, seed)
         return claim.finish(version)
 
 
@@ -79,7 +79,7 @@ def version_seed(seed: int, number: int) -> int:
     return int(np.random.SeedSequence([seed, VERSION_STREAM, number]).generate_state(1)[0])
 
 
-def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: ManifestRef, seed: int) -> MadeVersion:
+def _make(regeneration: Regeneration, dataset: PreparedDataset, generator: Checkpoints, seed: int) -> MadeVersion:
     """Sample and score one version."""
     conditions = dataset.sample_conditions
     if regeneration.new_poses:
@@ -92,7 +92,7 @@ def _make(regeneration: Regeneration, dataset: PreparedDataset, checkpoint: Mani
         )
     synthetic = sample_generator(
         regeneration,
-        checkpoint,
+        generator,
         dataset.frames,
         dataset.frame_conditions,
         conditions,

@@ -9,6 +9,7 @@ from ctlev_core.plugins import PluginError, validate_options
 from data_contracts.config import SamplingChoice
 from data_contracts.experiment import Experiment
 from data_contracts.manifest import ManifestRef
+from flows.train_generator import Checkpoints
 from tasks.pixel_decoder import decode_pixels, train_pixel_decoder
 from tasks.sample import sample
 
@@ -18,7 +19,7 @@ _OF_THE_SOLVER = ("scheduler", "num_inference_steps", "timestep_spacing", "noise
 
 def sample_generator(
     experiment: Experiment,
-    checkpoint: ManifestRef,
+    generator: Checkpoints,
     frames: ManifestRef,
     learnt: ManifestRef,
     asked: ManifestRef,
@@ -34,7 +35,7 @@ def sample_generator(
 
     Args:
         experiment: what is asked for.
-        checkpoint: the trained generator.
+        generator: trained; its student is sampled where it has one, and the decoder learns from what was fine-tuned.
         frames: recorded ones.
         learnt: conditions of the training frames.
         asked: conditions to sample from.
@@ -48,10 +49,11 @@ def sample_generator(
     solver = plugins.load_options(sampling).options
     stretches = motion or (isinstance(solver, SamplingOptions) and solver.noise == "stretches")
     decoder = train_decoder(
-        experiment, checkpoint, frames, learnt, sampling=sampling, stretches=stretches, number=number, label=label
+        experiment, generator.tuned, frames, learnt, sampling=sampling, stretches=stretches, number=number, label=label
     )
+    sampling = generator.student_sampling or sampling
     made = sample(
-        checkpoint,
+        generator.sampled,
         frames,
         asked,
         sampling=sampling if decoder is None else smooth(sampling),

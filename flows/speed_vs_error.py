@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pydantic import BaseModel, ConfigDict
 
 from ctlev_core import plugins
-from ctlev_core.diffusion.sampling.options import STOCHASTIC, SamplingOptions
+from ctlev_core.diffusion.sampling.options import OF_STUDENTS, STOCHASTIC, SamplingOptions
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.report.studies.measurement_charts import CONVERGED_LINE, REFERENCE_LINE
 from ctlev_core.scoring.sensor_pixels import check_in_image
@@ -24,7 +24,7 @@ from flows.cli import script
 from flows.command_line import PRESETS, Command, load_experiment, load_preset
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
-from flows.train_generator import train_generator
+from flows.train_generator import train_generator, without_student
 from tasks.downstream import train_downstream
 from tasks.speed_report import publish_speed_report, speed_report
 from tasks.speed_vs_error import exact_score_errors, precision_errors, sample_timed, sampling_errors
@@ -105,8 +105,9 @@ def _checked(options: SpeedVsErrorOptions, experiment: Experiment, title: str) -
         raise PluginError(f"{options.experiment}: frames are compared in features, and feature_extractor is null")
     extractor = experiment.feature_extractor
     loaded = SpeedVsError(options=options, experiment=experiment, feature_extractor=extractor, title=title)
-    for _ in loaded.points():
-        pass  # every sampler's options are valid
+    for setting, choice in loaded.points():  # every sampler's options are valid
+        if plugins.load_options(choice).options.scheduler == OF_STUDENTS:
+            raise PluginError(f"lines.{setting.line}: expected a solver, got {OF_STUDENTS!r}, which samples students")
     for name, study in (("exact_score", options.exact_score), ("precision", options.precision)):
         for line in study.lines.values() if study is not None else ():
             checked = validate_options(SamplingOptions, line.options, f"{name}.lines")
@@ -122,7 +123,7 @@ def speed_vs_error(measured: SpeedVsError) -> ManifestRef:
     """Sample with every setting under a stopwatch, measure errors, and write the page with the plots."""
     experiment, options = measured.experiment, measured.options
     dataset = call_flow(prepare_dataset, experiment)
-    checkpoint = call_flow(train_generator, experiment, dataset)
+    checkpoint = call_flow(train_generator, without_student(experiment), dataset).tuned
     conditions, sampling = dataset.sample_conditions, experiment.sampling_choice
     extractor = train_downstream(
         [dataset.frames], downstream=measured.feature_extractor, seed=experiment.seed, label="feature extractor"

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ctlev_core.provenance.scores import GENERATOR_STAGES
 from data_contracts.manifest import RUN_FILE
 from flows.amounts_of_work import Amounts, inputs_of
 from flows.network_costs import network_cost
@@ -122,8 +123,8 @@ def kind_of(stage: str, arguments: Mapping[str, Any], size: tuple[int, int] | No
 def _trained(plan: Mapping[str, PlannedStage], row: PlannedStage) -> Mapping[str, Any]:
     """The arguments of the fine-tuning whose checkpoint a stage samples from."""
     made = [plan[key] for key in inputs_of(row.arguments) if key in plan]
-    with_motion = [one for one in made if one.stage == "train_motion_layers"]
-    made += [plan[key] for one in with_motion for key in inputs_of(one.arguments) if key in plan]
+    further = [one for one in made if one.stage in GENERATOR_STAGES and one.stage != "finetune"]
+    made += [plan[key] for one in further for key in inputs_of(one.arguments) if key in plan]
     return next((one.given for one in made if one.stage == "finetune"), {})
 
 

@@ -18,7 +18,7 @@ from flows.command_line import Command, load_experiment
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.sampling import sample_generator
 from flows.settings import flow
-from flows.train_generator import train_generator
+from flows.train_generator import Checkpoints, train_generator
 from tasks.export_events import export_events
 from tasks.export_images import check_export_folder, export_images
 from tasks.stage import call_flow, numbered
@@ -28,20 +28,20 @@ from tasks.stage import call_flow, numbered
 def synthesize(
     experiment: Experiment,
     dataset: PreparedDataset | None = None,
-    checkpoint: ManifestRef | None = None,
+    generator: Checkpoints | None = None,
     number: int = 0,
 ) -> ManifestRef:
     """Sample labelled synthetic event images, and write them as a plain folder where `export_folder` asks for one.
 
-    The frames are those of the `number`-th generator; dataset and checkpoint are made unless they are given.
+    The frames are those of the `number`-th generator; dataset and generator are made unless they are given.
     """
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
-    if checkpoint is None:
-        checkpoint = call_flow(train_generator, experiment, dataset, number)
+    if generator is None:
+        generator = call_flow(train_generator, experiment, dataset, number)
     synthetic = sample_generator(
         experiment,
-        checkpoint,
+        generator,
         dataset.frames,
         dataset.frame_conditions,
         dataset.sample_conditions,

@@ -120,6 +120,16 @@ class NoiseSchedule:
             return (noisy - noise * predicted) / signal
         return signal * noisy - noise * predicted
 
+    def prediction_of(self, clean: Tensor, noisy: Tensor, timesteps: Tensor) -> Tensor:
+        """What the network must predict [B, C, h, w] for these clean latents: `clean_of` the other way round."""
+        if self.prediction_type == "sample":
+            return clean
+        alpha_bar = self.alphas_cumprod.to(noisy.device)[timesteps][:, None, None, None]
+        signal, noise = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
+        if self.prediction_type == "epsilon":
+            return (noisy - signal * clean) / noise
+        return (signal * noisy - clean) / noise
+
     def loss_weights(self, timesteps: Tensor, emphasis: Emphasis = PLAIN) -> Tensor:
         """Weights [B] of the squared errors.
 

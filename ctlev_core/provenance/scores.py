@@ -17,7 +17,7 @@ from data_contracts.tables import Column, TableSchema
 
 Row = dict[str, Any]
 _DIGESTS = pa.list_(pa.string())
-GENERATOR_STAGES = ("finetune", "train_motion_layers")
+GENERATOR_STAGES = ("finetune", "train_motion_layers", "distill")
 """Stages whose artefacts are generators."""
 SCORE_LINEAGE = TableSchema(
     "score_lineage",

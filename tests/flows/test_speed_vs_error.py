@@ -148,6 +148,7 @@ def test_another_line_is_all_that_is_sampled_again(measured):
         ("experiment.generator={name: event_gan}", "experiment.sampling|sampler to compare|scheduler"),
         ("reference.steps=[5, 6]", "reference: expected one number of steps"),
         ("precision.lines={x: {options: {scheduler: ddim}, steps: [3]}}", "expected a scheduler of unipc, deis"),
+        ("lines={x: {options: {scheduler: tcd}, steps: [3]}}", "lines.x: expected a solver, got 'tcd'"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_runs(tmp_path, setting, message):

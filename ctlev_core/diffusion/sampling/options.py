@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from ctlev_core.diffusion.compilation import Compile
 from data_contracts.config import RUN_SETTING, Frozen
 
-Scheduler = Literal["unipc", "dpmpp_2m", "dpmpp_3m", "dpmpp_sde", "deis", "sa_solver", "ddim", "ddpm"]
+Scheduler = Literal["unipc", "dpmpp_2m", "dpmpp_3m", "dpmpp_sde", "deis", "sa_solver", "ddim", "ddpm", "tcd"]
 Spacing = Literal["karras", "lu", "linspace", "trailing"]
 
 _ANY: tuple[Spacing, ...] = ("karras", "lu", "linspace", "trailing")
@@ -25,11 +25,15 @@ SPACINGS: dict[str, tuple[Spacing, ...]] = {
     "sa_solver": _ANY,
     "ddim": _ANY,
     "ddpm": ("linspace", "trailing"),
+    "tcd": ("trailing",),
 }
 """The spacings each solver supports; the first is what it gets where none is asked for."""
 
 STOCHASTIC = ("ddpm", "dpmpp_sde", "sa_solver")
 """Solvers that draw noise at every step, from each image's own stream."""
+
+OF_STUDENTS = "tcd"
+"""Samples distilled checkpoints, at the time steps they were distilled for, and no others."""
 
 _DEVICE = re.compile(r"auto|all|(cpu|mps|cuda(:\d+)?)(,(cpu|mps|cuda(:\d+)?))*")
 
@@ -38,7 +42,9 @@ class SamplingOptions(Frozen):
     """How frames are drawn from a checkpoint."""
 
     scheduler: Scheduler = Field(
-        default="unipc", description="solver; the paper's is ddpm with 1000 steps, unipc (Karras) matches it in 20"
+        default="unipc",
+        description="solver; the paper's is ddpm with 1000 steps, unipc (Karras) matches it in 20; tcd is for "
+        "distilled checkpoints (`student`)",
     )
     num_inference_steps: int = Field(
         default=20, gt=0, le=1000, description="evaluations of the network an image; paper: 1000"
@@ -110,6 +116,16 @@ class SamplingOptions(Frozen):
     @model_validator(mode="after")
     def _check_spacing(self) -> Self:
         check_spacing(self.scheduler, self.timestep_spacing)
+        return self
+
+    @model_validator(mode="after")
+    def _students_are_sampled_plainly(self) -> Self:
+        if self.scheduler != OF_STUDENTS:
+            return self
+        if self.guidance_scale > 1:
+            raise ValueError("scheduler tcd takes no guidance_scale: that of the teacher is distilled")
+        if self.controlnet_every > 1:
+            raise ValueError("scheduler tcd takes no controlnet_every: the few evaluations lie far apart")
         return self
 
     @field_validator("guidance_interval")

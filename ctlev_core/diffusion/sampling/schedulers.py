@@ -18,11 +18,13 @@ from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_deis_multistep import DEISMultistepScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from diffusers.schedulers.scheduling_sasolver import SASolverScheduler
+from diffusers.schedulers.scheduling_tcd import TCDScheduler
 from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 from diffusers.schedulers.scheduling_utils import SchedulerOutput
 from torch import Tensor
 
-from ctlev_core.diffusion.sampling.options import SPACINGS, check_spacing
+from ctlev_core.diffusion.sampling.options import OF_STUDENTS, SPACINGS, check_spacing
+from ctlev_core.diffusion.student_files import STUDENT_SCHEDULER, evaluations_of
 from data_contracts.errors import DataError
 
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
@@ -86,6 +88,14 @@ class _SASolver(_EndsClean, SASolverScheduler):
     pass
 
 
+class _TCD(TCDScheduler):
+    """Without noise of its own (eta 0; diffusers' default of `step` is 0.3), as students are distilled."""
+
+    def step(self, model_output: Tensor, timestep: Any, sample: Tensor, return_dict: bool = True) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """As in diffusers."""
+        return super().step(model_output, timestep, sample, eta=0.0, return_dict=return_dict)
+
+
 _SOLVERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "unipc": (UniPCMultistepScheduler, {"solver_order": 3}),
     "dpmpp_2m": (DPMSolverMultistepScheduler, {"solver_order": 2}),
@@ -121,6 +131,7 @@ def make_scheduler(
     """
     timestep_spacing = timestep_spacing or SPACINGS.get(name, ("karras",))[0]
     check_spacing(name, timestep_spacing)
+    _check_student(name, config, num_inference_steps)
     schedule = _noise_schedule(config)
     steps = schedule.get("num_train_timesteps", 1000)
     if not 1 <= num_inference_steps <= steps:
@@ -128,6 +139,8 @@ def make_scheduler(
     if timestep_spacing == "linspace" and num_inference_steps in (1, steps):
         # A single step must be the first, and all steps must be each once: rounding would get both wrong.
         timestep_spacing = "trailing"
+    if name == OF_STUDENTS:
+        return _student_scheduler(schedule, num_inference_steps)
     solver, settings = _SOLVERS[name]
     if name == "unipc" and num_inference_steps < THIRD_ORDER_FROM:
         settings = {**settings, "solver_order": 2}
@@ -145,6 +158,38 @@ def make_scheduler(
     if hasattr(scheduler, "set_begin_index"):
         # Else the start is looked up by its time step, wrongly where close sigmas round to the same one.
         scheduler.set_begin_index(0)
+    return scheduler
+
+
+def trajectory_scheduler(config: dict[str, Any], timesteps: list[int]) -> Any:
+    """DPM-Solver++ of order 2 with an evaluation at each of these time steps, descending; it ends in clean latents."""
+    scheduler: Any = DPMSolverMultistepScheduler(**_noise_schedule(config), solver_order=2)
+    scheduler.set_timesteps(timesteps=timesteps)
+    scheduler.set_begin_index(0)
+    return scheduler
+
+
+def student_config(config: dict[str, Any], num_evaluations: int) -> dict[str, Any]:
+    """The scheduler config of a student of so many evaluations, of the noise schedule of its teacher's `config`."""
+    scheduler: Any = TCDScheduler(**_noise_schedule(config), original_inference_steps=num_evaluations)
+    return {**scheduler.config, "_class_name": STUDENT_SCHEDULER}
+
+
+def _check_student(name: str, config: dict[str, Any], num_inference_steps: int) -> None:
+    number = evaluations_of(config)
+    if number is None and name == OF_STUDENTS:
+        raise DataError(f"scheduler {name!r} is for distilled checkpoints, and this one was not: take 'unipc'")
+    if number is not None and (name, num_inference_steps) != (OF_STUDENTS, number):
+        raise DataError(
+            f"this checkpoint was distilled for scheduler {OF_STUDENTS!r} in num_inference_steps {number}, "
+            f"got {name!r} in {num_inference_steps}"
+        )
+
+
+def _student_scheduler(schedule: dict[str, Any], num_evaluations: int) -> Any:
+    scheduler = _TCD(**schedule, original_inference_steps=num_evaluations)
+    scheduler.set_timesteps(num_evaluations)
+    scheduler.set_begin_index(0)
     return scheduler
 
 

@@ -17,9 +17,13 @@ import torch
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.training.acceleration import accelerated, autocast, check_precision
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
+from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.diffusion.training.tensorboard import TrainingLog, training_log
 from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 from ctlev_core.progress import ProgressBar
+
+BatchLoss = Callable[[Batch, torch.Generator], torch.Tensor]
+"""From a batch and the stream of its noise to a loss [], whose gradients the trained weights get."""
 
 
 def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray:
@@ -57,6 +61,7 @@ def run_training(
     max_seconds: float = math.inf,
     description: str = "training",
     distributed: DistributedContext = SINGLE_PROCESS,
+    loss: BatchLoss | None = None,
 ) -> TrainingHistory:
     """Train until `num_steps`, or until `max_seconds` over all attempts; the kept weights end up in the models.
 
@@ -73,6 +78,7 @@ def run_training(
             it is repeatable, and several processes would not end together.
         description: of the progress bar.
         distributed: which of several processes this is; they share the batches of a step.
+        loss: of a batch; None = the denoising loss.
     Returns:
         The loss curves.
     Raises:
@@ -80,6 +86,7 @@ def run_training(
         TrainingError: the loss was not finite ten times in a row, or the state in `work` is of another run.
     """
     options, state, device = trainer.options, work / "state.pt", trainer.parameters[0].device
+    loss_of = _denoising(denoiser, schedule, options) if loss is None else loss
     check_run(trainer, distributed, validated=validate is not None)
     if state.is_file():
         trainer.restore(state)
@@ -92,11 +99,11 @@ def run_training(
     ):
         while trainer.step < options.num_steps and trainer.seconds < max_seconds and not trainer.out_of_patience:
             started = time.monotonic()
-            loss = _compute_gradients(trainer, denoiser, schedule, fetch, seed, distributed)
+            total = _compute_gradients(trainer, loss_of, fetch, seed, distributed)
             progress = max(trainer.step / options.num_steps, trainer.seconds / max_seconds)
-            if math.isfinite(loss) and trainer.update(progress):
+            if math.isfinite(total) and trainer.update(progress):
                 trainer.non_finite = 0
-                trainer.losses.append(loss)
+                trainer.losses.append(total)
             else:
                 trainer.count_skipped()
             trainer.step += 1
@@ -117,24 +124,27 @@ def run_training(
     return trainer.finish()
 
 
+def _denoising(denoiser: Denoiser, schedule: NoiseSchedule, options: TrainingOptions) -> BatchLoss:
+    emphasis = Emphasis(options.snr_gamma, options.max_loss_weight, options.timestep_power)
+    return lambda batch, generator: denoising_loss(denoiser, schedule, batch, generator, emphasis)
+
+
 def _compute_gradients(
     trainer: Trainer,
-    denoiser: Denoiser,
-    schedule: NoiseSchedule,
+    loss_of: BatchLoss,
     fetch: Callable[[int], Batch],
     seed: int,
     distributed: DistributedContext,
 ) -> float:
     """Gradients of a step, summed over its batches and over all processes, into the parameters; returns the loss."""
     options, device = trainer.options, trainer.parameters[0].device
-    emphasis = Emphasis(options.snr_gamma, options.max_loss_weight, options.timestep_power)
     trainer.optimizer.zero_grad(set_to_none=True)
     total = 0.0
     for part in distributed.batches(options.gradient_accumulation):
         number = trainer.step * options.gradient_accumulation + part
         noise = generator_for(seed, number)
         with autocast(options, device):
-            loss = denoising_loss(denoiser, schedule, fetch(number), noise, emphasis)
+            loss = loss_of(fetch(number), noise)
         trainer.scaler.scale(loss / options.gradient_accumulation).backward()
         total += loss.item() / options.gradient_accumulation
     return distributed.sum_gradients(trainer.parameters, total)

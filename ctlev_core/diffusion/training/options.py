@@ -227,6 +227,59 @@ class MotionOptions(TrainingOptions):
         return max(1, self.batch_size // self.context)
 
 
+class StudentOptions(TrainingOptions):
+    """Distillation of a fine-tuned generator into a student that needs few evaluations of the network."""
+
+    num_evaluations: int = Field(
+        default=2, ge=1, le=8, description="evaluations of the network an image; a student is made for one number"
+    )
+    teacher_evaluations: int = Field(
+        default=12,
+        ge=2,
+        le=200,
+        description="evaluations of the teacher on the way from noise to the lowest noise, shared out evenly among "
+        "those of the student and rounded up",
+    )
+    tune: Literal["unet", "both"] = Field(
+        default="both", description="what learns: the U-Net alone, or the ControlNet too where there is one"
+    )
+    rot90_probability: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="share of condition images turned by 90, 180 or 270 degrees, as in fine-tuning",
+    )
+    num_steps: int = Field(default=400, gt=0, description="optimiser steps")
+    batch_size: int = Field(
+        default=16, gt=0, description="states that the student learns from at a time; whole trajectories"
+    )
+    learning_rate: float = Field(
+        default=2e-4, gt=0, description="peak; higher ones lose more of what the teacher knows than is learnt anew"
+    )
+    weight_decay: float = Field(default=0.0, ge=0, description="decoupled (AdamW)")
+    ema_decay: float = Field(
+        default=0.99, ge=0, lt=1, description="of the averaged weights that are kept; 0 = no averaging"
+    )
+    validation_every: int = Field(default=200, gt=0, description="steps between two points of the validation curve")
+    num_validation: int = Field(
+        default=32, ge=0, description="conditions held back for the validation loss, a tenth at most"
+    )
+    optimizer: Literal["adamw", "muon"] = Field(default="muon", description="as of fine-tuning")
+    device: str = Field(default="auto", json_schema_extra=RUN_SETTING, description="auto, cpu, cuda, cuda:1 ...")
+
+    @property
+    def trajectories_at_a_time(self) -> int:
+        """Whole trajectories, of a state for each evaluation, that `batch_size` has room for, one at least."""
+        return max(1, self.batch_size // self.num_evaluations)
+
+    @model_validator(mode="after")
+    def _only_what_a_student_heeds(self) -> Self:
+        for name in ("snr_gamma", "max_loss_weight", "timestep_power", "sample_every"):
+            if getattr(self, name) != TrainingOptions.model_fields[name].default:
+                raise ValueError(f"{name} is of a training on noised frames; a student learns from trajectories")
+        return self
+
+
 class LatentOptions(Frozen):
     """How latents are encoded before a training; what the autoencoder is, the digests of its files tell."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ctlev_core.diffusion.training.options import LatentOptions
+from ctlev_core.diffusion.training.options import LatentOptions, StudentOptions
 from ctlev_core.stand_ins.making import make_stand_in
 from data_contracts.config import DatasetChoice, GeneratorChoice, SamplingChoice
 from flows import network_costs
@@ -72,6 +72,27 @@ def test_sampling_is_steps_and_a_decoding_for_each_row(base_model):
     assert cost is not None
     assert cost.operations == {"bfloat16": 7 * (20 * operations("unet", *SIZE) + operations("decoding", *SIZE))}
     assert cost.memory_bytes > 2 * ALL
+
+
+def test_distillation_is_a_training_and_passes_of_the_teacher(base_model):
+    trained = {"generator": generator("stable_diffusion", base_model)}
+    options = StudentOptions(num_evaluations=2, teacher_evaluations=5, num_steps=10, batch_size=4, ema_decay=0.0)
+    plain, guided = (
+        network_cost(
+            "distill",
+            {"sampling": SamplingChoice(name="stable_diffusion", options=sampling), "options": options},
+            trained,
+            0,
+            SIZE,
+        )
+        for sampling in ({}, {"guidance_scale": 2.0})
+    )
+    assert plain is not None and guided is not None
+    training, forward = operations("tune unet", *SIZE), operations("unet", *SIZE)
+    assert plain.operations == {"float32": pytest.approx(10 * 4 * (training + 3 * forward))}
+    assert guided.operations == {"float32": pytest.approx(10 * 4 * (training + 6 * forward))}
+    # Weights of teacher and student, gradients and two moments.
+    assert plain.memory_bytes > 20 * WEIGHTS["unet"] and plain.disk_bytes == 4 * ALL
 
 
 def test_latents_do_not_take_more_memory_for_more_frames(base_model):
