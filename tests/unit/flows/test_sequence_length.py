@@ -5,18 +5,12 @@ import json
 import pytest
 
 from ctlev_core.plugins import PluginError
-from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
 from flows.command_line import PRESETS, load_preset
 from flows.full_experiment import full_experiment
 from tasks.stage import call_flow, planning
 
 IN_TIME = ("temporal_order=true", "windows={method: duration, duration_us: 20000}")
-SMALL = (
-    "dataset.options={num_train_recordings: 2, num_test_recordings: 1, num_condition_recordings: 2, "
-    "recording_duration_us: 100000}",
-    "baselines={}", "oracle=null", "scaling=[]", "keep_fraction=null", "mixtures=[]", "export=null",
-)  # fmt: skip
 
 
 def smoke(*overrides):
@@ -59,21 +53,3 @@ def test_only_its_stage_and_the_report_are_new(monkeypatch, tmp_path):
     assert sorted(with_it[key] for key in set(with_it) - set(without)) == ["report", "sequence_realism"]
     assert [without[key] for key in set(without) - set(with_it)] == ["report"]
     assert len(set(plan(*IN_TIME, "sequence_length=4")) - set(with_it)) == 2
-
-
-@pytest.mark.parametrize(
-    ("length", "condition_rate_hz", "told"),
-    [(8, 50, "has so many training frames"), (3, 200, "labels to sample from")],
-)
-def test_too_short_recordings_and_labels_are_refused_before_anything_is_learnt(
-    monkeypatch, tmp_path, length, condition_rate_hz, told
-):
-    monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
-    asked = smoke(
-        *IN_TIME, *SMALL, f"sequence_length={length}", f"dataset.options.condition_rate_hz={condition_rate_hz}",
-        "num_synthetic=42",
-    )  # fmt: skip
-    with pytest.raises(DataError, match=f"sequence_length: expected {length} frames in a row.*{told}"):
-        call_flow(full_experiment, asked)
-    made = {folder.name for folder in (tmp_path / "artefacts").iterdir()}
-    assert "encode" in made and "finetune" not in made and "sample" not in made
