@@ -184,6 +184,20 @@ def environment_there() -> dict[str, str]:
     return ALONE | {"CTLEV_HOME": bucket_url(home) or str(home)}
 
 
+def never_pause() -> None:
+    """In a worker of Dask, which at 80 % of its memory takes no further call until it holds less.
+
+    That helps where Dask's own results fill it. Ours do not: libraries and freed memory do, and it would wait for ever.
+    """
+    importlib.import_module("distributed").get_worker().memory_manager.memory_pause_fraction = False
+
+
+def _compute_in_worker(environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
+    """`compute_there`, in a worker of Dask."""
+    never_pause()
+    return compute_there(environment, function, arguments)
+
+
 class _Cluster(ABC):
     """What Dask, Ray and SLURM share."""
 
@@ -251,7 +265,7 @@ class Dask(_Cluster):
         return len(threads)
 
     def _reply(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
-        return self._client.submit(compute_there, environment_there(), function, arguments, pure=False).result()
+        return self._client.submit(_compute_in_worker, environment_there(), function, arguments, pure=False).result()
 
     def close(self) -> None:
         """End our own cluster, or take leave of one that runs elsewhere, which ends what we asked for."""

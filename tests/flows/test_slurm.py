@@ -13,7 +13,7 @@ import job_calls
 import pytest
 import slurm_cluster
 from flow_scripts import digests, script
-from job_calls import note_and_wait, number_and_job, variable
+from job_calls import hold_memory, note_and_wait, number_and_job, variable
 from slurm_cluster import ACCOUNT, PARTITION, cancel, queued
 
 from data_contracts.errors import DataError
@@ -31,7 +31,7 @@ TIMED = {"report"}
 """Its digest covers the time that each stage took."""
 JOBS = {
     "CORES": "2",
-    "MEMORY": "2GB",
+    "MEMORY": "3GB",
     "QUEUE": PARTITION,
     "ACCOUNT": ACCOUNT,
     "WALLTIME": "00:20:00",
@@ -98,7 +98,7 @@ def test_a_job_is_what_the_configuration_says(jobs, monkeypatch):
     assert list(map_shards(variable, names)) == [PARTITION, ACCOUNT, "2", "1", "threads"]
     (job,) = queued(jobs)
     shown = subprocess.run(["scontrol", "show", "job", job], capture_output=True, text=True, check=True).stdout
-    for said in ("TimeLimit=00:20:00", "mem=2G", "Comment=of-a-test"):
+    for said in ("TimeLimit=00:20:00", "mem=3G", "Comment=of-a-test"):
         assert said in shown
     # Two workers with the cores of both: for networks that use several threads.
     end_jobs(jobs)
@@ -106,6 +106,14 @@ def test_a_job_is_what_the_configuration_says(jobs, monkeypatch):
     configured(monkeypatch, "PROCESSES", "2")
     assert list(map_shards(variable, ["SLURM_CPUS_ON_NODE", "CTLEV_CORES"])) == ["4", "2"]
     assert runners.asked_cluster(1).count == 2
+
+
+def test_workers_with_little_free_memory_take_further_calls(jobs, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", "slurm")
+    runner = runners.asked_cluster(1)
+    with ThreadPoolExecutor(2) as threads:
+        first = list(threads.map(lambda _: runner.call(hold_memory, 0.88), range(2)))
+    assert {runner.call(hold_memory, 0.88) for _ in range(4)} <= set(first), "the same processes"
 
 
 def test_shards_of_a_cancelled_job_are_computed_again(jobs, monkeypatch):
@@ -138,8 +146,11 @@ def test_a_run_whose_job_is_cancelled_has_the_digests_of_threads(smoke_home, clu
 
     watcher = threading.Thread(target=cancel_one)
     watcher.start()
-    _, errors = process.communicate(timeout=900)
-    watcher.join()
+    try:
+        _, errors = process.communicate(timeout=900)
+    finally:
+        process.kill()
+        watcher.join()
     assert process.returncode == 0, errors
     assert cancelled
     expected = digests(smoke_home)

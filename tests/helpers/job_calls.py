@@ -18,6 +18,22 @@ def variable(name: str) -> str | None:
     return os.environ.get(name)
 
 
+_held = bytearray()
+
+
+def hold_memory(share: float) -> int:
+    """Hold so large a share of the memory of a worker of Dask from now on; the process of the worker."""
+    import distributed
+    import psutil
+
+    global _held
+    process = psutil.Process()
+    missing = int(share * distributed.get_worker().memory_manager.memory_limit) - process.memory_info().rss
+    _held = bytearray(b"\1") * max(missing, 0)
+    time.sleep(1)  # Dask looks each tenth of a second
+    return process.pid
+
+
 def note_and_wait(folder: Path) -> int:
     """Note the job in `jobs` and wait for `go_on`; how often it was begun."""
     folder.mkdir(exist_ok=True)
