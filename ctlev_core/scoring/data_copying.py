@@ -121,7 +121,7 @@ def assign_cells(training: np.ndarray, *others: np.ndarray, seed: int = 0) -> li
     learnt, *asked = (rows / unit for rows in sets)
     num_cells = min(_MAX_CELLS, max(1, min(map(len, sets)) // _CELL_FRAMES))
     # Means that no row is nearest to are left out.
-    means, _ = kmeans(learnt, num_cells, iter=1, seed=np.random.default_rng(seed))
+    means, _ = kmeans(learnt, num_cells, iter=1, rng=np.random.default_rng(seed))
     return [vq(rows, means)[0].astype(np.int64) for rows in asked]
 
 

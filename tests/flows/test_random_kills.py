@@ -1,6 +1,6 @@
 """Runs that are killed with everything they started, at random moments, and run again until one ends by itself.
 
-CTLEV_KILLS sets how many are killed, 20 unless given.
+CTLEV_KILLS sets how many are killed, 10 unless given.
 """
 
 import os
@@ -17,7 +17,7 @@ from flow_scripts import REPOSITORY, digests
 from ctlev_core.processes import die_with_parent
 from tasks.store import Store
 
-KILLS = int(os.environ.get("CTLEV_KILLS", "20"))
+KILLS = int(os.environ.get("CTLEV_KILLS", "10"))
 MAX_NEW, LONGEST_S = 4, 1.0
 """A run is killed when it has stored fewer new artefacts than this, drawn at random, and as long after as is drawn too:
 `smoke` has some forty, so that the kills are spread over all of it, however busy the machine is."""
