@@ -70,6 +70,12 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture
+def quick_two_sample_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks of a quarter of their training: enough for what is plain, and for tests of what is compared."""
+    monkeypatch.setattr("ctlev_core.realism.two_sample_network.NUM_STEPS", 30)
+
+
+@pytest.fixture
 def random_events() -> Events:
     """2,000 valid events on a 32 x 24 sensor."""
     random = np.random.default_rng(0)

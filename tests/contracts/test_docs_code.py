@@ -26,6 +26,7 @@ from data_contracts.experiment import Experiment
 from data_contracts.study import Study
 from flows import command_line, studies
 from flows.command_line import PRESETS, load_preset
+from flows.stand_ins import make_missing
 from tasks.export_images import write_image_folder
 
 LOADERS = {"full_experiment": "load_study"} | {
@@ -53,9 +54,17 @@ def check_options(asked: Experiment | Study, *, thoroughly: bool = False) -> Non
             plugins.load_options(choice)
 
 
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """For stand-ins: tiny ones, made once."""
+    return tmp_path_factory.mktemp("home")
+
+
 @pytest.fixture(autouse=True)
-def no_data_is_looked_for(monkeypatch):
+def no_data_is_looked_for(home, monkeypatch):
     monkeypatch.setattr(command_line, "check_inputs", check_options)
+    monkeypatch.setenv("CTLEV_HOME", str(home))
+    monkeypatch.setattr(studies, "make_missing", lambda paths, size, where: make_missing(paths, "tiny", where))
     monkeypatch.setattr(studies, "check_inputs", check_options)
 
 

@@ -21,17 +21,25 @@ def invoke(*arguments):
     return result.exit_code, result.stdout, result.stderr
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory):
-    """A bright square that moves over a dark ground, 12 frames at 30 a second."""
-    path = tmp_path_factory.mktemp("video") / "square.avi"
+def write_video(path, num_frames, left=4):
+    """A bright square that moves over a dark ground from `left` px on, 30 frames a second."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 48))
-    for number in range(12):
+    for number in range(num_frames):
         frame = np.full((48, 64, 3), 30, np.uint8)
-        frame[14:34, 4 + 3 * number : 24 + 3 * number] = 220
+        frame[14:34, left + 3 * number : left + 20 + 3 * number] = 220
         writer.write(frame)
     writer.release()
     return path
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    return write_video(tmp_path_factory.mktemp("video") / "square.avi", 12)
+
+
+@pytest.fixture(scope="module")
+def short_video(tmp_path_factory):
+    return write_video(tmp_path_factory.mktemp("video") / "square.avi", 4, left=34)
 
 
 def test_a_video_becomes_events_and_a_preview(video, tmp_path):
@@ -60,12 +68,12 @@ def test_python_gives_the_same_events(video, tmp_path):
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_every_format_that_is_written_holds_the_same_events(video, tmp_path, name):
+def test_every_format_that_is_written_holds_the_same_events(short_video, tmp_path, name):
     output, size = tmp_path / f"a{load('formats', name).SUFFIXES[0]}", (240, 180) if name == "atis" else (346, 260)
     asked = ("--format", name, "--sensor", "clean", "--size", f"{size[0]}x{size[1]}")
-    status, _, errors = invoke(video, output, *asked)
+    status, _, errors = invoke(short_video, output, *asked)
     assert status == 0, errors
-    made, written = simulate_video(video, sensor="clean", size=size), read_events(output)
+    made, written = simulate_video(short_video, sensor="clean", size=size), read_events(output)
     assert len(written) == len(made)
     np.testing.assert_array_equal(written.t, made.t)
 
@@ -146,12 +154,12 @@ def test_a_still_picture_and_a_folder(tmp_path):
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_each_event_is_marked_in_every_format(video, tmp_path, name):
+def test_each_event_is_marked_in_every_format(short_video, tmp_path, name):
     """In the file where it can hold the marks, else beside it; the events are those without marks."""
     output, size = tmp_path / f"a{load('formats', name).SUFFIXES[0]}", (240, 180) if name == "atis" else (346, 260)
-    status, text, errors = invoke(video, output, "--format", name, "--size", f"{size[0]}x{size[1]}", "--marks")
+    status, text, errors = invoke(short_video, output, "--format", name, "--size", f"{size[0]}x{size[1]}", "--marks")
     assert status == 0, errors
-    made = simulate_video(video, size=size, marks=True)
+    made = simulate_video(short_video, size=size, marks=True)
     assert made.signal is not None and 0 < made.signal.sum() < len(made)
     if name == "parquet":
         signal = read_events(output).signal
@@ -163,12 +171,12 @@ def test_each_event_is_marked_in_every_format(video, tmp_path, name):
         signal = np.load(tmp_path / "a.signal.npy")
         assert signal.dtype == np.bool_ and f"signal or noise: {tmp_path}/a.signal.npy" in text
     np.testing.assert_array_equal(signal, made.signal)
-    plain, written = simulate_video(video, size=size), read_events(output)
+    plain, written = simulate_video(short_video, size=size), read_events(output)
     assert plain.signal is None
     for column in "txyp":
         np.testing.assert_array_equal(getattr(made, column), getattr(plain, column))
     np.testing.assert_array_equal(written.t, plain.t)
-    again = invoke(video, output, "--format", name, "--marks")
+    again = invoke(short_video, output, "--format", name, "--marks")
     assert again[0] == 2 and "is there already" in again[2]
 
 

@@ -12,6 +12,8 @@ from data_contracts import tables
 COUNT, PER_RECORDING = 80, 2
 GROUPS = [f"r{row // PER_RECORDING}" for row in range(COUNT)]
 
+pytestmark = pytest.mark.usefixtures("quick_two_sample_tests")
+
 
 def recorded(count=COUNT, seed=0):
     """Lone active pixels on a grid of which no two touch: all of them are isolated."""

@@ -121,6 +121,7 @@ def test_exchanging_the_sets_gives_the_same_area_up_to_noise():
     assert one.value == pytest.approx(other.value, abs=3 * max(one.deviation, other.deviation, 0.02))
 
 
+@pytest.mark.usefixtures("quick_two_sample_tests")
 def test_names_of_recordings_do_not_matter_and_mixed_sets_are_a_half():
     first, second = noise(45, 0.1, 0), bars(45, 1)
     found = compare(first, second)
@@ -202,6 +203,7 @@ def test_few_recordings_have_an_area_without_an_interval_and_cannot_be_halved_tw
     assert "fewer than 40" in compare_halves(bars(60, 0), names(60)).note
 
 
+@pytest.mark.usefixtures("quick_two_sample_tests")
 def test_frames_that_are_all_equal_or_empty_are_told_in_the_note():
     black = np.zeros((40, 16, 16, 3), np.uint8)
     found = compare(black, black)

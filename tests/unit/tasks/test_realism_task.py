@@ -15,6 +15,8 @@ from data_contracts.manifest import label_columns, read_manifest, write_manifest
 from tasks.realism import realism
 from tasks.stage import Output
 
+pytestmark = pytest.mark.usefixtures("quick_two_sample_tests")
+
 
 def frame_set(folder, pictures, recordings, splits):
     folder.mkdir(parents=True)

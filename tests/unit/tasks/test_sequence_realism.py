@@ -16,6 +16,7 @@ from tasks.sequence_realism import MAX_STRETCHES, sequence_realism
 from tasks.stage import Output
 
 LENGTH, STEP_US, SIDE = 4, 20_000, 24
+pytestmark = pytest.mark.usefixtures("quick_two_sample_tests")
 
 
 def moving_dots(count, speed, seed, length=LENGTH):
