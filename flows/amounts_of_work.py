@@ -23,6 +23,9 @@ _OF_TRAINING_FRAMES = ("condition_frames", "encode_latents")
 _OF_FRAMES = ("ingest", "encode", *_FRAMES_OF_CONDITIONS, *_OF_TRAINING_FRAMES)
 """Stages the rows of whose tables are recordings or frames."""
 
+_TWO_SAMPLE_TESTS = ("realism", "sequence_realism")
+"""Stages that spend their time on networks which tell sets of frames apart."""
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -66,13 +69,28 @@ class Amounts:
         return self._rows[key]
 
     def work(self, key: str) -> float:
-        """Steps times frames of a batch of a training, frames times steps of a sampling, rows elsewhere."""
+        """Steps times frames of a batch of a training, frames times steps of a sampling, two-sample tests; else rows."""
+        if key in self._stages and self._stages[key].stage in _TWO_SAMPLE_TESTS:
+            return self._two_sample_tests(self._stages[key].arguments)
         numbers = dict(_numbers(self._stages[key].arguments)) if key in self._stages else {}
         if "num_steps" in numbers:
             factors = "num_steps", "batch_size", "sequence_length", "gradient_accumulation"
             return math.prod(numbers.get(name, 1.0) for name in factors)
         guided = 2.0 if numbers.get("guidance_scale", 1.0) > 1 else 1.0
         return self.rows(key).total * numbers.get("num_inference_steps", 1.0) * guided
+
+    def _two_sample_tests(self, arguments: Mapping[str, Any]) -> float:
+        """How many there are: each takes the same time for any number of frames, and of few frames there is none."""
+        from ctlev_core.realism.two_sample import MIN_FRAMES
+
+        recorded = self.rows(arguments["frames"]["manifest"])
+        train, held_out = recorded.training, recorded.total - recorded.training
+        generated = [self.rows(item["manifest"]).total for item in arguments["generated"]]
+        smaller = [train / 2, held_out / 2, min(train, held_out)]
+        smaller += [min(rows, against) for rows in generated for against in (train, held_out)]
+        if "length" in arguments:  # of stretches; time in random order is one more
+            smaller = [rows / arguments["length"] for rows in (*smaller, train)]
+        return float(sum(rows >= MIN_FRAMES for rows in smaller))
 
     def _estimate(self, stage: PlannedStage) -> Rows:
         numbers = dict(_numbers(stage.arguments))

@@ -147,6 +147,7 @@ def test_rows_follow_from_the_recordings(tmp_path):
                 sampling={"options": {"num_inference_steps": 4}}),
         planned("train_downstream", "g", training_sets=[ref("c")],
                 downstream={"options": {"num_steps": 7, "batch_size": 4, "sequence_length": 3}}),
+        planned("realism", "h", frames=ref("c"), generated=[ref("f")]),
     ]  # fmt: skip
     amounts = Amounts({stage.key: stage for stage in stages})
     assert [amounts.rows(key) for key in "abcde"] == [
@@ -154,9 +155,23 @@ def test_rows_follow_from_the_recordings(tmp_path):
     ]  # fmt: skip
     assert amounts.work("f") == 20 and amounts.image_size("f") == SIZE and amounts.image_size("a") is None
     assert amounts.work("g") == 7 * 4 * 3
+    # Of 22 recorded frames none are told apart.
+    assert amounts.work("h") == 0
     # What is there already is counted and not guessed.
     known = Amounts({stage.key: stage for stage in stages}, {"b": 18, "d": 6})
     assert known.rows("b") == Rows(12, 18) and known.rows("c") == Rows(10, 16) and known.rows("d") == Rows(6, 6)
+
+
+def test_realism_is_as_many_two_sample_tests_as_have_enough_frames():
+    recorded = planned("encode", "a", recordings=ref("x"), num_train_recordings=90, num_test_recordings=60)
+    few, many = (planned("sample", name, conditions=ref("x"), count=count) for name, count in (("b", 39), ("c", 40)))
+    whole = planned("realism", "d", frames=ref("a"), generated=[ref("b"), ref("c")])
+    time = planned("sequence_realism", "e", frames=ref("a"), generated=[ref("c")], length=2)
+    amounts = Amounts({stage.key: stage for stage in (recorded, few, many, whole, time)})
+    # Halves of the training frames, these against those of the test, the larger set against both.
+    assert amounts.work("d") == 1 + 1 + 2
+    # Stretches: 45 of the training frames, in order and in none.
+    assert amounts.work("e") == 1
 
 
 def test_gpus_share_the_work_and_hold_what_processes_would(base_model, monkeypatch):
