@@ -322,6 +322,17 @@ class Generator(Protocol):
 
 
 @runtime_checkable
+class GeneratorInShards(Generator, Protocol):
+    """A generator whose frames lie in files of `diffusion.sampling.shards` first, which several machines may write."""
+
+    def sample_shards(
+        self, checkpoint: Path, conditions: Conditions, options: Any, *, seeds: Sequence[int], work: Path, only: slice
+    ) -> None:
+        """Write those that `only` names of the files which `sample`, called with the same, would write and join."""
+        ...
+
+
+@runtime_checkable
 class GeneratorFromWeights(Generator, Protocol):
     """A generator whose base model has a size and perhaps colours of its own."""
 

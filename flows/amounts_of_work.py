@@ -69,7 +69,7 @@ class Amounts:
         return self._rows[key]
 
     def work(self, key: str) -> float:
-        """Steps times frames of a batch of a training, frames times steps of a sampling, two-sample tests; else rows."""
+        """Steps times batch of a training, frames times steps of a sampling, number of two-sample tests; else rows."""
         if key in self._stages and self._stages[key].stage in _TWO_SAMPLE_TESTS:
             return self._two_sample_tests(self._stages[key].arguments)
         numbers = dict(_numbers(self._stages[key].arguments)) if key in self._stages else {}

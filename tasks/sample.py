@@ -41,6 +41,7 @@ from data_contracts.events import Events, SensorSize
 from data_contracts.labels import Conditions
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef, by_recording, conditions_of, read_manifest
 from data_contracts.parts import only_part
+from tasks.spread_sampling import Chunk, Sampling, deal_out, is_dealt_out
 from tasks.stage import Output, input_files_of, stage
 from tasks.workers import map_shards
 
@@ -54,7 +55,7 @@ MAX_FILTER_FRAMES = 2_000
 """Training frames the quality filter is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
-@stage(version=6, schema=tables.SYNTHETIC, optional=("part",))
+@stage(version=6, schema=tables.SYNTHETIC, optional=("part",), spreads=is_dealt_out)
 def sample(
     out: Output,
     checkpoint: Manifest,
@@ -89,24 +90,29 @@ def sample(
         # Here, so that every row is told the seed it was made from.
         seeds = noise_seeds(seeds, plugin.options, None if stretches is None else stretch_lengths(stretches))
 
-    def sample_rows(rows: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
+    chunks = [Chunk(np.arange(len(seeds))[rows], seeds[rows]) for rows in whole_stretches(asked, _chunk_rows(frames))]
+    deal = None
+    if is_dealt_out({"sampling": sampling}):
+        deal = partial(deal_out, Sampling(folder, conditions.ref, asked.stretches, sampling, out.work))
+        deal(chunks)
+
+    def sample_rows(chunk: Chunk, members: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
+        rows = chunk.rows[members]
+        if deal is not None and seeds != chunk.seeds:
+            deal([Chunk(rows, seeds)])  # of those that were rejected
         return plugin.module.sample(folder, asked.take(rows), plugin.options, seeds=seeds, work=out.work)
 
     quality_filter, told = quality_filter_of(frames), SampleLog([], [], [])
     with out.open_array("frames") as written:
-        for chunk in whole_stretches(asked, _chunk_rows(frames)):
-            rows = np.arange(len(seeds))[chunk]
+        for chunk in chunks:
             made = sample_until_accepted(
-                lambda members, seeds, rows=rows: sample_rows(rows[members], seeds),
-                seeds[chunk],
-                quality_filter,
-                max_attempts=max_attempts,
+                partial(sample_rows, chunk), chunk.seeds, quality_filter, max_attempts=max_attempts
             )
             told.add(made.seeds, made.num_attempts, made.causes)
             if rounding is None or num_events is None:
                 written.append(made.frames)
             else:
-                own = distinct_seeds(told.seeds)[rows[0] :]
+                own = distinct_seeds(told.seeds)[chunk.rows[0] :]
                 written.append(round_frames(made.frames, num_events, plugins.load_options(rounding), own))
     return _table(conditions, plugin, checkpoint.ref.digest, told)
 

@@ -55,9 +55,9 @@ from data_contracts.file_lists import files_of
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.table_writer import TableWriter
 from data_contracts.tables import TableSchema
-from tasks.gpus import gpu_need, gpus_held
+from tasks.gpus import GpuNeed, gpu_need, gpus_held
 from tasks.prefect_runs import run_as_task
-from tasks.runners import asked_runner
+from tasks.runners import Runner, asked_runner
 from tasks.store import Store
 from tasks.workers import current_workers, stage_workers, together
 
@@ -67,6 +67,7 @@ R_co = TypeVar("R_co", covariant=True)
 TIMEOUT = "CTLEV_STAGE_TIMEOUT_S"
 """Environment: seconds that the work of one stage may take; none = any."""
 RawFiles = Callable[[dict[str, Any]], Sequence[tuple[str, Path]]]
+Spreads = Callable[[dict[str, Any]], bool]
 """From the stage's arguments to (name, path) of the raw files it will read; the names enter the key too."""
 
 
@@ -222,7 +223,7 @@ class Stage:
         readers: Sequence[str] = (),
         optional: Sequence[str] = (),
         aside: Sequence[str] = (),
-        spreads: bool = False,
+        spreads: bool | Spreads = False,
     ) -> None:
         self.function = function
         self.name = function.__name__
@@ -312,7 +313,7 @@ class Stage:
         found = self.find(key, arguments)
         if found is not None:
             return found, True
-        workers = current_workers() if self.spreads else stage_workers()
+        workers = self._workers(arguments)
         if workers is not None:
             # Whoever else wants this artefact waits here, and leaves the processes to those who have work for them.
             with _being_made.setdefault(key, threading.Lock()):
@@ -328,6 +329,12 @@ class Stage:
             if found is not None:
                 return found, True
             return self._compute(store, key, arguments, upstream), False
+
+    def _workers(self, arguments: dict[str, Any]) -> Runner | None:
+        """Who runs it as a whole; None = this process."""
+        if callable(self.spreads):
+            return None if self.spreads(arguments) else stage_workers()
+        return current_workers() if self.spreads else stage_workers()
 
     def find(self, key: str, arguments: dict[str, Any]) -> ManifestRef | None:
         """The artefact, if it is there and was made from inputs of the same content."""
@@ -345,7 +352,9 @@ class Stage:
             folder.mkdir(parents=True)
             work.mkdir(parents=True, exist_ok=True)
             opened = {name: _opened(value, store) for name, value in arguments.items()}
-            with few_threads(), gpus_held(gpu_need(arguments), self.name), _time_limit(self.name):
+            # What is spread holds GPUs where it is computed.
+            need = GpuNeed() if callable(self.spreads) and self.spreads(arguments) else gpu_need(arguments)
+            with few_threads(), gpus_held(need, self.name), _time_limit(self.name):
                 table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
             record = {
@@ -428,7 +437,7 @@ def stage(
     readers: Sequence[str] = (),
     optional: Sequence[str] = (),
     aside: Sequence[str] = (),
-    spreads: bool = False,
+    spreads: bool | Spreads = False,
 ) -> Callable[[Callable[..., pa.Table]], Stage]:
     """Make a function a stage.
 
@@ -439,7 +448,8 @@ def stage(
         readers: kinds of plug-ins that read them, found by what is in the files: one that is mended reads all anew.
         optional: parameters that leave the key as it is where they are None: what is stored without them stays valid.
         aside: parameters that spare work and change no result: they are in neither key nor record.
-        spreads: most of its work is in shards (`map_shards`), which go to a cluster one by one.
+        spreads: most of its work is in shards (`map_shards`), which go to a cluster one by one. A function of the
+            arguments: whether it is for them; it then is this process that deals them out, whoever runs other stages.
     """
     return lambda function: Stage(function, version, schema, raw_files, readers, optional, aside, spreads)
 

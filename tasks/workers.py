@@ -247,8 +247,8 @@ def map_shards(
 
 
 def is_spread(num_shards: int) -> bool:
-    """Does `map_shards` compute so many side by side, rather than here and one when it is asked for?"""
-    return num_shards > 1 and _has_several()
+    """Does `map_shards` have so many computed elsewhere or side by side, rather than here and one after the other?"""
+    return num_shards > (0 if is_elsewhere() else 1) and _has_several()
 
 
 def _groups(shards: Sequence[S], count: int, max_group: int = MAX_GROUP) -> Iterator[Sequence[S]]:
@@ -268,6 +268,11 @@ def _call_each_on(runner: Runner, report: Report | None, function: Callable[[S],
 
 def _call_each(function: Callable[[S], R], shards: Sequence[S]) -> list[R]:
     return [function(shard) for shard in shards]
+
+
+def num_processes() -> int:
+    """That `map_shards` has; of a cluster, which is started if it must be, its workers."""
+    return getattr(asked_cluster(num_workers()), "count", num_workers())
 
 
 def _has_several() -> bool:

@@ -139,6 +139,16 @@ def sample(
     return sample_checkpoint(checkpoint, conditions, options, with_controlnet=True, seeds=seeds, work=work)
 
 
+def sample_shards(
+    checkpoint: Path, conditions: Conditions, options: SampleOptions, *, seeds: Sequence[int], work: Path, only: slice
+) -> None:
+    """Some of the files of `SHARD` rows that `sample` puts together, with the same N conditions."""
+    from ctlev_core.diffusion.sampling.sampling import make_shards
+
+    _check_images(conditions)
+    make_shards(checkpoint, conditions, options, with_controlnet=True, seeds=seeds, work=work, only=only)
+
+
 def _check_images(conditions: Conditions) -> None:
     if conditions.images is None:
         raise ValueError(

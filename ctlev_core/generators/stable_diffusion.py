@@ -122,6 +122,16 @@ def sample(
     return sample_checkpoint(checkpoint, conditions, options, with_controlnet=False, seeds=seeds, work=work)
 
 
+def sample_shards(
+    checkpoint: Path, conditions: Conditions, options: SampleOptions, *, seeds: Sequence[int], work: Path, only: slice
+) -> None:
+    """Some of the files of `SHARD` rows that `sample` puts together, with the same N conditions."""
+    from ctlev_core.diffusion.sampling.sampling import make_shards
+
+    _check_text_only(conditions)
+    make_shards(checkpoint, conditions, options, with_controlnet=False, seeds=seeds, work=work, only=only)
+
+
 def embed_names(checkpoint: Path, names: Sequence[str]) -> np.ndarray:
     """What the checkpoint's text encoder makes of N names: [N, D] float32."""
     from ctlev_core.diffusion.pretrained import name_embeddings

@@ -306,13 +306,38 @@ def sample_checkpoint(
     With several devices, or several cores and a small network, the shards are dealt out to one process each, batches as
     with one: the frames are the same.
     """
+    if not len(conditions):
+        _check_scheduler(checkpoint, options)
+        base_model = load_for_sampling(checkpoint, options, device_names(options.device)[0], with_controlnet)
+        return sample_frames(base_model, conditions, options, seeds=seeds, work=work)
+    return _read(make_shards(checkpoint, conditions, options, with_controlnet=with_controlnet, seeds=seeds, work=work))
+
+
+def make_shards(
+    checkpoint: Path,
+    conditions: Conditions,
+    options: SamplingOptions,
+    *,
+    with_controlnet: bool,
+    seeds: Sequence[int],
+    work: Path,
+    only: slice = slice(None),
+) -> list[Shard]:
+    """Write the files that `sample_checkpoint` puts together, or only some of them; those that are there are kept.
+
+    Args:
+        checkpoint: folder.
+        conditions: N > 0, all of the call, whatever `only` is: batches and prompts are planned for the whole.
+        options: solver, steps, guidance, devices.
+        with_controlnet: the route.
+        seeds: N non-negative integers.
+        work: folder of the files.
+        only: these of the shards, by number.
+    """
     _check_scheduler(checkpoint, options)
     devices, identity = device_names(options.device), _checkpoint_digest(checkpoint)
-    if not len(conditions):
-        base_model = load_for_sampling(checkpoint, options, devices[0], with_controlnet)
-        return sample_frames(base_model, conditions, options, seeds=seeds, work=work, identity=identity)
     _check_seeds(conditions, seeds)
-    shards = plan_shards(conditions, _noise_seeds(conditions, seeds, options), _settings(identity, options), work)
+    shards = plan_shards(conditions, _noise_seeds(conditions, seeds, options), _settings(identity, options), work)[only]
     with _progress(shards) as (missing, report):
         function = functools.partial(
             _sample_share, checkpoint, options, with_controlnet, _prompts(conditions), len(conditions)
@@ -325,7 +350,7 @@ def sample_checkpoint(
             function(devices[0], missing, report)
         else:
             run_on_devices(function, [devices[number] for number in busy], [shares[number] for number in busy], report)
-    return _read(shards)
+    return shards
 
 
 def _num_whole(shards: list[Shard]) -> int:
