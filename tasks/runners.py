@@ -27,9 +27,11 @@ import shutil
 import threading
 import traceback
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
+from ctlev_core.processes import CORES, num_cores
 from data_contracts.errors import DataError
 from data_contracts.home_folder import bucket_url, home_folder
 
@@ -192,9 +194,14 @@ def never_pause() -> None:
     importlib.import_module("distributed").get_worker().memory_manager.memory_pause_fraction = False
 
 
-def _compute_in_worker(environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
-    """`compute_there`, in a worker of Dask."""
+def _compute_in_worker(
+    environment: dict[str, str], workers: dict[str, int], function: Callable[..., Any], arguments: tuple[Any, ...]
+) -> bytes:
+    """`compute_there`, in a worker of Dask, with its share of the machine's cores; `workers` are those of each host."""
     never_pause()
+    comm = importlib.import_module("distributed.comm")
+    host = comm.get_address_host(importlib.import_module("distributed").get_worker().address)
+    os.environ.setdefault(CORES, str(max(num_cores() // workers.get(host, 1), 1)))
     return compute_there(environment, function, arguments)
 
 
@@ -234,6 +241,8 @@ class Dask(_Cluster):
 
     def __init__(self, address: str, count: int) -> None:
         super().__init__(address)
+        self._own_cores = {} if address else {CORES: str(max(num_cores() // count, 1))}
+        self._workers: dict[str, int] = {}
         distributed = importlib.import_module("distributed")
         self._own = self._start(address, count)
         self._client = distributed.Client(self._own or address, timeout=CONNECT_TIMEOUT_S)
@@ -256,6 +265,8 @@ class Dask(_Cluster):
     def _count_workers(self) -> int:
         self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
         threads = list(self._client.nthreads().values())
+        host = importlib.import_module("distributed.comm").get_address_host
+        self._workers = dict(Counter(host(address) for address in self._client.nthreads()))
         if set(threads) != {1}:
             self.close()
             raise DataError(
@@ -265,7 +276,8 @@ class Dask(_Cluster):
         return len(threads)
 
     def _reply(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
-        return self._client.submit(_compute_in_worker, environment_there(), function, arguments, pure=False).result()
+        call = (_compute_in_worker, environment_there() | self._own_cores, self._workers, function, arguments)
+        return self._client.submit(*call, pure=False).result()
 
     def close(self) -> None:
         """End our own cluster, or take leave of one that runs elsewhere, which ends what we asked for."""

@@ -23,10 +23,8 @@ from tasks.gpus import gpu_need, gpus_held
 from tasks.runners import is_elsewhere
 from tasks.workers import map_shards, num_processes
 
-MAX_SHARDS = 32
-"""That a call samples one after the other. It loads the checkpoint, which takes as long as tens of frames do."""
-CALLS_A_PROCESS = 4
-"""At least, so that all end at about the same time."""
+MIN_FILES, MAX_FILES = 8, 64
+"""That a call makes one after the other. It loads the checkpoint, which takes as long as tens of frames do."""
 
 
 @dataclass(frozen=True)
@@ -78,18 +76,21 @@ def is_dealt_out(arguments: Mapping[str, Any]) -> bool:
 def deal_out(asked: Sampling, chunks: Sequence[Chunk]) -> None:
     """Have the files of all chunks written; those that an interrupted run has left are kept."""
     total = sum(len(chunk.rows) for chunk in chunks)
-    most = min(max(total // SHARD // (CALLS_A_PROCESS * num_processes()), 1), MAX_SHARDS)
-    parts = [part for chunk in chunks for part in _parts_of(asked, chunk, most)]
+    parts = list(_parts_of(asked, chunks, total // SHARD))
     with ProgressBar(total=total, desc="sampling", unit="image") as progress:
         for num_frames in map_shards(partial(_sample_part, asked), parts, max_group=1):
             progress.update(num_frames)
 
 
-def _parts_of(asked: Sampling, chunk: Chunk, most: int) -> Iterator[_Part]:
-    files = whole_stretches(asked.wanted(chunk.rows), SHARD)
-    for start in range(0, len(files), most):
-        part = files[start : start + most]
-        yield _Part(chunk, slice(start, start + len(part)), min(part[-1].stop, len(chunk.rows)) - part[0].start)
+def _parts_of(asked: Sampling, chunks: Sequence[Chunk], left: int) -> Iterator[_Part]:
+    """Fewer and fewer of the files that are left, so that all processes end at about the same time."""
+    count = num_processes()
+    for chunk in chunks:
+        files, start = whole_stretches(asked.wanted(chunk.rows), SHARD), 0
+        while start < len(files):
+            part = files[start : start + min(max(left // (2 * count), MIN_FILES), MAX_FILES)]
+            yield _Part(chunk, slice(start, start + len(part)), min(part[-1].stop, len(chunk.rows)) - part[0].start)
+            start, left = start + len(part), left - len(part)
 
 
 def _sample_part(asked: Sampling, part: _Part) -> int:

@@ -81,6 +81,7 @@ def elsewhere(cluster, monkeypatch):
     for module in (spread_sampling, workers):
         monkeypatch.setattr(module, "is_elsewhere", lambda: True)
     monkeypatch.setattr(spread_sampling, "_sample_part", sample_part)
+    monkeypatch.setattr(spread_sampling, "MIN_FILES", 1)
 
 
 def sample_part(asked, part):
