@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import errno
 import importlib
 import importlib.util
@@ -40,6 +41,8 @@ KINDS = ("threads", "processes", "dask", "ray", "slurm")
 ALONE = {"CTLEV_WORKERS": "1", "CTLEV_RUNNER": "threads"}
 """Environment of a process that does our work: it starts none of its own."""
 CONNECT_TIMEOUT_S = 60
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+"""As mallopt names them."""
 LOOK_UP_S = 0.5
 """A call to Ray that waits notices within so long that the cluster was closed."""
 
@@ -186,19 +189,25 @@ def environment_there() -> dict[str, str]:
     return ALONE | {"CTLEV_HOME": bucket_url(home) or str(home)}
 
 
-def never_pause() -> None:
-    """In a worker of Dask, which at 80 % of its memory takes no further call until it holds less.
+def use_memory_freely() -> None:
+    """In a worker of Dask, which is set up for many small results rather than for networks.
 
-    That helps where Dask's own results fill it. Ours do not: libraries and freed memory do, and it would wait for ever.
+    At 80 % of its memory it takes no further call until it holds less. What fills it is libraries and freed memory, so
+    that it would wait for ever. And its nanny has freed memory given back at once, by MALLOC_TRIM_THRESHOLD_: sampling
+    then takes twice as long. The thresholds are those that glibc reaches by itself (mallopt(3)).
     """
     importlib.import_module("distributed").get_worker().memory_manager.memory_pause_fraction = False
+    with contextlib.suppress(AttributeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, 32 << 20)
+        mallopt(_M_TRIM_THRESHOLD, 64 << 20)
 
 
 def _compute_in_worker(
     environment: dict[str, str], workers: dict[str, int], function: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> bytes:
     """`compute_there`, in a worker of Dask, with its share of the machine's cores; `workers` are those of each host."""
-    never_pause()
+    use_memory_freely()
     comm = importlib.import_module("distributed.comm")
     host = comm.get_address_host(importlib.import_module("distributed").get_worker().address)
     os.environ.setdefault(CORES, str(max(num_cores() // workers.get(host, 1), 1)))
@@ -252,15 +261,13 @@ class Dask(_Cluster):
         """A cluster of our own, unless there is an address of one that runs elsewhere."""
         if address:
             return None
-        # By its own, workers give freed memory back at once: arrays of some 100 KiB then cost a third more.
-        with importlib.import_module("dask").config.set({"distributed.nanny.pre-spawn-environ": {}}):
-            return importlib.import_module("distributed").LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                host="127.0.0.1",
-                dashboard_address=None,
-                silence_logs=logging.CRITICAL,
-            )
+        return importlib.import_module("distributed").LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        )
 
     def _count_workers(self) -> int:
         self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)

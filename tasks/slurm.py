@@ -27,7 +27,7 @@ import distributed
 
 from ctlev_core.processes import CORES, module_environment
 from data_contracts.errors import DataError
-from tasks.runners import Dask, WorkerError, compute_there, environment_there, never_pause, num_jobs, reply_with
+from tasks.runners import Dask, WorkerError, compute_there, environment_there, num_jobs, reply_with, use_memory_freely
 from tasks.store import home_folder
 
 NAME = "ctlev"
@@ -241,7 +241,7 @@ def _compute_if_seen(
     witness: str, environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> bytes:
     """In a job. One that sees another home would compute everything anew, into a folder that nobody reads."""
-    never_pause()
+    use_memory_freely()
     if not os.path.exists(witness):
         home = Path(witness).parents[1]
         error = DataError(

@@ -13,7 +13,7 @@ import job_calls
 import pytest
 import slurm_cluster
 from flow_scripts import digests, script
-from job_calls import hold_memory, note_and_wait, number_and_job, variable
+from job_calls import hold_memory, note_and_wait, number_and_job, page_faults, variable
 from slurm_cluster import ACCOUNT, PARTITION, cancel, queued
 
 from data_contracts.errors import DataError
@@ -114,6 +114,12 @@ def test_workers_with_little_free_memory_take_further_calls(jobs, monkeypatch):
     with ThreadPoolExecutor(2) as threads:
         first = list(threads.map(lambda _: runner.call(hold_memory, 0.88), range(2)))
     assert {runner.call(hold_memory, 0.88) for _ in range(4)} <= set(first), "the same processes"
+
+
+def test_freed_memory_is_kept_for_what_comes_next(jobs, monkeypatch):
+    """Given back, as Dask has it, each array of a network would be new pages to the kernel: as slow again."""
+    monkeypatch.setenv("CTLEV_RUNNER", "slurm")
+    assert runners.asked_cluster(1).call(page_faults, 20) < 20_000 / 4
 
 
 def test_shards_of_a_cancelled_job_are_computed_again(jobs, monkeypatch):

@@ -34,6 +34,18 @@ def hold_memory(share: float) -> int:
     return process.pid
 
 
+def page_faults(count: int) -> int:
+    """When `count` arrays of 1,000 pages are made and freed, one after the other."""
+    import resource
+
+    import numpy as np
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(count):
+        np.ones(1000 * 4096, np.uint8)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
 def note_and_wait(folder: Path) -> int:
     """Note the job in `jobs` and wait for `go_on`; how often it was begun."""
     folder.mkdir(exist_ok=True)
