@@ -168,7 +168,7 @@ class Killing:
 
         wanted = max(round(KILLED_CALLS * self._files), 1)
         while self._killed < wanted and not self._ended.wait(0.1):
-            written = len(list(self._home.glob("work/sample/*/shard_*.zst")))
+            written = len(list(self._home.glob("work/*/shard_*")))
             if written < (self._killed + 0.5) * self._files / wanted:
                 continue
             workers = [

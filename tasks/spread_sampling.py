@@ -23,7 +23,7 @@ from tasks.gpus import gpu_need, gpus_held
 from tasks.runners import is_elsewhere
 from tasks.workers import map_shards, num_processes
 
-MIN_FILES, MAX_FILES = 8, 64
+MIN_FILES, MAX_FILES = 4, 64
 """That a call makes one after the other. It loads the checkpoint, which takes as long as tens of frames do."""
 
 
