@@ -9,7 +9,7 @@ processes of this machine stands for one of several: the stage `sample` deals it
 
     alone     this machine as it is by default: a process a core
     cluster   the files dealt out
-    killed    the same, while a worker is killed for every tenth call
+    killed    the same, while a worker is killed for every tenth file of frames
 
 Digests of all are compared. The last number of frames is foretold from the others, on a line through their times; so is
 a million. Needs the extra `dask`.
@@ -34,6 +34,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from ctlev_core.diffusion.sampling.shards import SHARD  # noqa: E402
 from ctlev_core.processes import begin_memory_peak, memory_peak_mib, num_cores  # noqa: E402
 from data_contracts.config import (  # noqa: E402
     ConditionChoice,
@@ -55,7 +56,8 @@ from tasks.store import Store  # noqa: E402
 WAYS = ("alone", "cluster", "killed")
 POSES = 60
 """Recordings whose poses are asked for; each gives some twenty."""
-KILLED_CALLS = 0.1
+KILLED_SHARE = 0.1
+"""Workers that are killed, of the number of files."""
 MILLION = 1_000_000
 
 
@@ -150,7 +152,7 @@ def cluster(folder: Path, workers: int, environment: dict[str, str]) -> Iterator
 
 
 class Killing:
-    """Kills a worker for every tenth call, spread over the frames that are written.
+    """Kills a worker for every tenth file, spread over the frames that are written.
 
     Args:
         home: in which files of unfinished frames are counted.
@@ -158,7 +160,7 @@ class Killing:
     """
 
     def __init__(self, home: Path, count: int) -> None:
-        self._home, self._files = home, -(-count // 128)
+        self._home, self._files = home, -(-count // SHARD)
         self._ended, self._killed = threading.Event(), 0
         self._thread = threading.Thread(target=self._watch)
         self._thread.start()
@@ -166,7 +168,7 @@ class Killing:
     def _watch(self) -> None:
         import psutil
 
-        wanted = max(round(KILLED_CALLS * self._files), 1)
+        wanted = max(round(KILLED_SHARE * self._files), 1)
         while self._killed < wanted and not self._ended.wait(0.1):
             written = len(list(self._home.glob("work/*/shard_*")))
             if written < (self._killed + 0.5) * self._files / wanted:

@@ -50,6 +50,11 @@ class Sampling:
         every = _read_conditions(self.conditions.path, self.conditions.digest)
         return replace(every, stretches=self.stretches).take(rows)
 
+    def files(self, rows: np.ndarray) -> list[slice]:
+        """Those of `rows` that lie in each file; images, which do not matter for it, are not read."""
+        every = _read_conditions(self.conditions.path, self.conditions.digest)
+        return whole_stretches(replace(every, images=None, motions=None, stretches=self.stretches).take(rows), SHARD)
+
 
 class Chunk(NamedTuple):
     """Rows of the conditions that are sampled by one call of `sample`, and a seed for each."""
@@ -86,7 +91,7 @@ def _parts_of(asked: Sampling, chunks: Sequence[Chunk], left: int) -> Iterator[_
     """Fewer and fewer of the files that are left, so that all processes end at about the same time."""
     count = num_processes()
     for chunk in chunks:
-        files, start = whole_stretches(asked.wanted(chunk.rows), SHARD), 0
+        files, start = asked.files(chunk.rows), 0
         while start < len(files):
             part = files[start : start + min(max(left // (2 * count), MIN_FILES), MAX_FILES)]
             yield _Part(chunk, slice(start, start + len(part)), min(part[-1].stop, len(chunk.rows)) - part[0].start)

@@ -67,8 +67,9 @@ R_co = TypeVar("R_co", covariant=True)
 TIMEOUT = "CTLEV_STAGE_TIMEOUT_S"
 """Environment: seconds that the work of one stage may take; none = any."""
 RawFiles = Callable[[dict[str, Any]], Sequence[tuple[str, Path]]]
-Spreads = Callable[[dict[str, Any]], bool]
 """From the stage's arguments to (name, path) of the raw files it will read; the names enter the key too."""
+Spreads = Callable[[dict[str, Any]], bool]
+"""From the stage's arguments to whether this process deals its work out."""
 
 
 @dataclasses.dataclass
@@ -332,9 +333,12 @@ class Stage:
 
     def _workers(self, arguments: dict[str, Any]) -> Runner | None:
         """Who runs it as a whole; None = this process."""
-        if callable(self.spreads):
-            return None if self.spreads(arguments) else stage_workers()
-        return current_workers() if self.spreads else stage_workers()
+        if self._deals_out(arguments):
+            return None
+        return current_workers() if self.spreads is True else stage_workers()
+
+    def _deals_out(self, arguments: dict[str, Any]) -> bool:
+        return callable(self.spreads) and self.spreads(arguments)
 
     def find(self, key: str, arguments: dict[str, Any]) -> ManifestRef | None:
         """The artefact, if it is there and was made from inputs of the same content."""
@@ -353,7 +357,7 @@ class Stage:
             work.mkdir(parents=True, exist_ok=True)
             opened = {name: _opened(value, store) for name, value in arguments.items()}
             # What is spread holds GPUs where it is computed.
-            need = GpuNeed() if callable(self.spreads) and self.spreads(arguments) else gpu_need(arguments)
+            need = GpuNeed() if self._deals_out(arguments) else gpu_need(arguments)
             with few_threads(), gpus_held(need, self.name), _time_limit(self.name):
                 table = self.function(Output(folder, work), **opened)
             write_manifest(folder, table, self.schema)
