@@ -1,16 +1,17 @@
 """Training and sampling at the size of Stable Diffusion v1 on a GPU: beside diffusers, and beside the card's own limit.
 
     python benchmarks/gpu.py                                    # random weights, nothing is downloaded; bf16
-    python benchmarks/gpu.py --device cpu --size tiny --image-size 64 --batch-size 2 --rounds 1 --ddpm-steps 20
+    python benchmarks/gpu.py --device cpu --size tiny --image-size 64 --batch-size 2 --sampling-batch-size 2 \
+        --rounds 1 --ddpm-steps 20
 
 Both sides have the same networks, batch, precision and image size and take turns in one process: fine-tuning beside
 the loops of diffusers' examples (`diffusers_loop.py`), sampling beside `StableDiffusionControlNetPipeline` called
 plainly, with the same solver and 20 steps, and with 1000 steps of DDPM, the paper's. Wall time. The card's limit is a
 bf16 matrix product of 8192 x 8192, measured here; operations are counted by torch.
 
-With the defaults, batches of 8 at 512 px, expect some 80 GB for the text route, whose two loops hold weights,
-gradients, moments and averages of a U-Net in float32 each, and half of that for the others; what it took is printed.
-A part that fails, for want of memory perhaps, is reported, and the others go on.
+With the defaults, 512 px and batches of 8 for training and 32 for sampling, expect some 80 GB for the text route, whose
+two loops hold weights, gradients, moments and averages of a U-Net in float32 each, and half of that for the others;
+what it took is printed. A part that fails, for want of memory perhaps, is reported, and the others go on.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=tuple(PARTS))
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="bfloat16")
     parser.add_argument("--image-size", type=int, default=512, help="px, a multiple of 64")
-    parser.add_argument("--batch-size", type=int, default=8)
+    parser.add_argument("--batch-size", type=int, default=8, help="of training")
+    parser.add_argument("--sampling-batch-size", type=int, default=32)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=4, help="of training a round")
     parser.add_argument("--inference-steps", type=int, default=20)
@@ -66,7 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found: list[Comparison] = []
     failed = [name for name in chosen.parts if not _run_part(name, chosen, device, limit, found)]
     if found:
-        print_comparisons(f"batches of {chosen.batch_size}, {chosen.image_size} px", "diffusers", found)
+        print_comparisons(
+            f"batches of {chosen.batch_size}, for sampling {chosen.sampling_batch_size}, {chosen.image_size} px",
+            "diffusers",
+            found,
+        )
     print_targets(found)
     if failed:
         sys.exit(f"parts that failed: {', '.join(failed)}")
@@ -147,12 +153,12 @@ def measure_sampling(compiled: bool, chosen: Any, device: torch.device, limit: f
     )
     print(f"  {count_parameters(base_model)}")
     options = SamplingOptions(num_inference_steps=chosen.inference_steps, precision=chosen.precision)
-    options = options.model_copy(update={"batch_size": chosen.batch_size})
-    _, conditions = training.make_rows(base_model, chosen.batch_size, with_images=True)
+    options = options.model_copy(update={"batch_size": chosen.sampling_batch_size})
+    _, conditions = training.make_rows(base_model, chosen.sampling_batch_size, with_images=True)
     with FlopCounterMode(display=False) as counter:
         sampling.sample_ours(base_model, conditions, options)
     flops = counter.get_total_flops()
-    compare = partial(sampling.compare, base_model, options, count=chosen.batch_size, rounds=chosen.rounds)
+    compare = partial(sampling.compare, base_model, options, count=chosen.sampling_batch_size, rounds=chosen.rounds)
     if compiled:
         copies = {part: copy.deepcopy(getattr(base_model, part)) for part in ("unet", "controlnet")}
         ours = dataclasses.replace(base_model, **copies)

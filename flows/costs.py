@@ -14,11 +14,11 @@ from ctlev_core import plugins
 from data_contracts.experiment import Experiment
 
 TRAINING_RATE = {"bfloat16": 168e12, "float16": 168e12, "float32": 50e12}
-SAMPLING_RATE = {"bfloat16": 230e12, "float16": 230e12, "float32": 50e12}
-"""Operations a second by precision: in bfloat16 as measured on one H200, 512 px, batches of 8, networks compiled
-(`benchmarks/RESULTS.md`); in float32, which was not measured, what it reaches at best."""
+SAMPLING_RATE = {"bfloat16": 330e12, "float16": 330e12, "float32": 50e12}
+"""Operations a second by precision: in bfloat16 as measured on one H200, 512 px, networks compiled, batches of 8 for
+training and 32 for sampling (`benchmarks/RESULTS.md`); in float32, which was not measured, what it reaches at best."""
 HOW_ESTIMATED = (
-    "by calculation, at the rates measured on one H200 in bfloat16: 168 TFLOP/s for training and 230 for sampling; in "
+    "by calculation, at the rates measured on one H200 in bfloat16: 168 TFLOP/s for training and 330 for sampling; in "
     "float32 50, which is the best that can be:"
 )
 PIXELS = 3

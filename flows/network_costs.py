@@ -31,7 +31,7 @@ LARGE = 400e6
 """Weights of a U-Net from which on the operations counted for Stable Diffusion's are taken."""
 ITEM_BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 EFFICIENCY = {"encoding": 0.85, "sampling": 0.7, "training": 0.45}
-GPU_EFFICIENCY = {"encoding": 0.85, "sampling": 0.3, "training": 0.22}
+GPU_EFFICIENCY = {"encoding": 0.85, "sampling": 0.43, "training": 0.22}
 """Of the rate of a matrix product, what whole networks reach: on an AMD EPYC in float32, bfloat16 and bfloat16, on an
 H200 in bfloat16 (`benchmarks/RESULTS.md`), where encoding was not measured."""
 DISK_BYTES_A_S = 500e6

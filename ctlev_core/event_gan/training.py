@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ctlev_core.determinism import deterministic
 from ctlev_core.event_gan import losses
 from ctlev_core.event_gan.batches import Batch, Pairs, make_batch, split_rows
 from ctlev_core.event_gan.event_images import NUM_CHANNELS, pairs_to_tensor
@@ -234,7 +235,7 @@ def train_generator(data: Pairs, options: TrainingOptions, *, seed: int, work: P
     gan.discriminator.train()
     saved = time.monotonic()
     progress = ProgressBar(total=options.num_steps, initial=gan.step, desc="Event-GAN", unit="step")
-    with progress:
+    with progress, deterministic(gan.device):
         while gan.step < options.num_steps:
             gan.train_step()
             progress.update()

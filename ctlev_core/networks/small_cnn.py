@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from ctlev_core.networks.grid_pool import GridPool
+
 QUARTERS = 2
 """Rows and columns of the last feature map that the head sees."""
 
@@ -30,7 +32,7 @@ class SmallCNN(nn.Module):
         channels = 3
         for number, width in enumerate(shape["widths"]):
             layers += [nn.Conv2d(channels, width, 3, padding=1, bias=False), nn.BatchNorm2d(width), nn.ReLU()]
-            layers += [nn.MaxPool2d(2)] if number < len(shape["widths"]) - 1 else [nn.AdaptiveAvgPool2d(QUARTERS)]
+            layers += [nn.MaxPool2d(2)] if number < len(shape["widths"]) - 1 else [GridPool(QUARTERS)]
             channels = width
         self.backbone = nn.Sequential(*layers, nn.Flatten())
         count = num_features(shape)

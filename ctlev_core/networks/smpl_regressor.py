@@ -15,6 +15,7 @@ from torch import nn
 from torch.nn.utils.rnn import pad_sequence
 
 from ctlev_core.body.torch_rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
+from ctlev_core.networks.grid_pool import GridPool
 from ctlev_core.networks.resnet import ResNetClassifier
 
 NUM_JOINTS, NUM_BETAS = 24, 10
@@ -46,7 +47,7 @@ class SmplRegressor(nn.Module):
         self.network = ResNetClassifier(shape, num_classes=1, head_width=0)
         self.network.head = nn.Identity()
         features = shape["hidden_sizes"][-1] * grid**2
-        self.pool = nn.AdaptiveAvgPool2d(grid)
+        self.pool = GridPool(grid)
         hidden = [nn.Linear(features, head_width), nn.ReLU()] if head_width else []
         self.head = nn.Sequential(*hidden, nn.Linear(head_width or features, NUM_OUTPUTS))
         self.recurrent = nn.GRU(features, features, batch_first=True) if recurrent else None

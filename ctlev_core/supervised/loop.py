@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from ctlev_core.determinism import deterministic
 from ctlev_core.progress import ProgressBar
 from ctlev_core.supervised.batches import TrainingRows
 from ctlev_core.supervised.checkpoints import read_training_state, write_training_state
@@ -92,7 +92,7 @@ def train_model(
     model.train()
     saved = time.monotonic()
     bar = ProgressBar(total=options.num_steps, initial=run.state.step, desc=description, unit="step")
-    with bar, _repeatable_convolutions():
+    with bar, deterministic(next(model.parameters()).device):
         while run.state.step < options.num_steps and not run.is_over():
             step = run.state.step
             batch = rows.batch(options.batch_size, seed, step)
@@ -247,15 +247,3 @@ def _copy(source: list[torch.Tensor], target: list[torch.Tensor]) -> None:
     with torch.no_grad():
         for value, place in zip(source, target, strict=True):
             place.copy_(value)
-
-
-@contextmanager
-def _repeatable_convolutions() -> Iterator[None]:
-    """Keep cuDNN from choosing algorithms by stop-watch, and from sums in the order of the moment."""
-    settings = torch.backends.cudnn
-    before = settings.benchmark, settings.deterministic
-    settings.benchmark, settings.deterministic = False, True
-    try:
-        yield
-    finally:
-        settings.benchmark, settings.deterministic = before

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ctlev_core.determinism import deterministic
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.training.acceleration import accelerated, autocast, check_precision
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
@@ -93,6 +94,7 @@ def run_training(
     saved = time.monotonic()
     folder = options.tensorboard if distributed.rank == 0 else None
     with (
+        deterministic(device, strict=True),
         accelerated(denoiser, options, device),
         training_log(folder, trainer.identity[:12], pictures=work / "samples", first_step=trainer.step) as log,
         _progress_bar(trainer, description, distributed) as bar,

@@ -190,6 +190,7 @@ def test_gpu_benchmark_says_that_there_is_no_gpu(benchmarks, capsys, monkeypatch
 
 
 TOY = ["--device", "cpu", "--size", "tiny", "--image-size", "64", "--batch-size", "1", "--rounds", "1", "--steps", "1"]
+TOY += ["--sampling-batch-size", "1"]
 
 
 @pytest.mark.slow

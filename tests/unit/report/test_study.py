@@ -431,8 +431,8 @@ def test_costs_are_those_of_the_operations():
     assert (text.images_trained, pose.images_trained) == (15625 * 512, 11719 * 512)
     assert text.training_s == pytest.approx(15625 * 512 * 2.41 / 168)
     assert pose.training_s == pytest.approx(11719 * 512 * 2.27 / 168)
-    assert text.sampling_s == pytest.approx(650_000 * (1000 * 0.803 + 2.515) / 230)
-    assert pose.sampling_s == pytest.approx(5000 * (1000 * (0.803 + 0.283) + 2.515) / 230)
+    assert text.sampling_s == pytest.approx(650_000 * (1000 * 0.803 + 2.515) / 330)
+    assert pose.sampling_s == pytest.approx(5000 * (1000 * (0.803 + 0.283) + 2.515) / 330)
     assert pose.frames_bytes == 5000 * 512 * 512 * 3 // 5
     assert estimate_costs(load_experiment("pose", [])) is None
 
@@ -456,7 +456,7 @@ def test_costs_of_smaller_images_and_guidance_are_between_the_counted_ones():
     # In float32, the default of sampling, tensor cores stand idle.
     assert guided.sampling_s - large.sampling_s == pytest.approx(800 * 20 * 0.803 / 50)
     half = seconds("encoding.options.image_size=[512, 512]", "sampling={precision: bfloat16}")
-    assert large.sampling_s / half.sampling_s == pytest.approx(230 / 50)
+    assert large.sampling_s / half.sampling_s == pytest.approx(330 / 50)
 
 
 def test_only_the_full_experiment_takes_a_study():
