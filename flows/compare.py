@@ -38,8 +38,13 @@ def compare(run_a: str, run_b: str, home: str | None = None) -> Path:
 def _read_runs(run_a: str, run_b: str, home: Path) -> tuple[Run, Run]:
     Store(home).fetch_files()
     folders = [find_run(run, home) for run in (run_a, run_b)]
-    first, second = (folder.name[:12] for folder in folders)
+    first, second = (_short(folder.name) for folder in folders)
     return read_run(first, folders[0]), read_run(second if second != first else f"{second} (B)", folders[1])
+
+
+def _short(name: str) -> str:
+    """A name as it is, and as much of a key as tells it from others."""
+    return name[:12] if re.fullmatch(r"[0-9a-f]{32}", name) else name
 
 
 def write_comparison(first: Run, second: Run, home: Path) -> tuple[Path, list[Table]]:

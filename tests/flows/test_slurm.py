@@ -12,7 +12,7 @@ from pathlib import Path
 import job_calls
 import pytest
 import slurm_cluster
-from flow_scripts import digests, script
+from flow_scripts import digests, run_script, script
 from job_calls import hold_memory, note_and_wait, number_and_job, page_faults, variable
 from slurm_cluster import ACCOUNT, PARTITION, cancel, queued
 
@@ -165,6 +165,26 @@ def test_a_run_whose_job_is_cancelled_has_the_digests_of_threads(smoke_home, clu
     }
     wait_until(lambda: not queued(cluster))
     assert not [path.name for path in (home / "slurm").iterdir() if path.suffix not in (".err", ".out")]
+
+
+def test_a_sweep_in_jobs_ends_on_one_page_and_its_runs_are_compared(smoke_home, cluster, tmp_path, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", "slurm")
+    home = Path(shutil.copytree(smoke_home, tmp_path / "home", symlinks=True))
+    before = digests(home)
+    use(cluster, home, monkeypatch)
+    finished = run_script("full_experiment", "--preset", "smoke", "--set", "num_synthetic=8,6", home=home)
+    assert finished.status == 0, finished.errors
+    wait_until(lambda: not queued(cluster))
+    assert list((home / "slurm").glob("*.out")), "it ran in jobs"
+    made = digests(home).keys() - before.keys()
+    assert {name.partition("/")[0] for name in made} >= {"sample", "train_downstream", "score_model", "study_report"}
+    page = (home / "reports" / "smoke_num_synthetic_8_6.html").read_text()
+    assert "num synthetic 8" in page and "num synthetic 6" in page
+    names = [f"smoke_num_synthetic_8_6/num_synthetic_{count}" for count in (8, 6)]
+    compared = run_script("compare", *names, home=home)
+    assert compared.status == 0, compared.errors
+    assert "Differences: 1 in options" in compared.output and "0 in code" in compared.output
+    assert (home / "reports" / "compare_num_synthetic_8_num_synthetic_6.html").is_file()
 
 
 def test_jobs_are_as_many_as_there_is_work_for(jobs, tmp_path, monkeypatch):

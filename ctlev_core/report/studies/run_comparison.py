@@ -85,7 +85,8 @@ def find_run(name: str, home: Path) -> Path:
 
 
 def _known(home: Path) -> str:
-    names = sorted(path.parent.name for path in (home / "reports").glob("*/provenance.json"))
+    reports = home / "reports"
+    names = sorted(str(path.parent.relative_to(reports)) for path in reports.rglob("provenance.json"))
     keys = sorted(path.name[:12] for path in (home / "artefacts" / "report").glob("*") if path.is_dir())
     return f"reports {', '.join(names) or '(none)'} and keys {', '.join(keys) or '(none)'}"
 
