@@ -88,8 +88,11 @@ def main() -> None:
             print(json.dumps(all_found))
 
 
-def write_recordings(root: Path, count: int, num_events: int, num_contents: int) -> None:
-    """`count` recordings in N-ImageNet's layout, a tenth of them to test on: a bright edge before a moving camera."""
+def write_recordings(root: Path, count: int, num_events: int, num_contents: int, classes: int = 0) -> None:
+    """`count` recordings in N-ImageNet's layout, a tenth of them to test on: a bright edge before a moving camera.
+
+    `classes`: how many; 0 = one for each 1,500 recordings.
+    """
     contents = root / "contents"
     contents.mkdir(parents=True)
     num_contents = min(num_contents, count)
@@ -104,14 +107,14 @@ def write_recordings(root: Path, count: int, num_events: int, num_contents: int)
             "polarity": random.random(num_events) < 0.8,
         }
         np.savez_compressed(contents / f"{number}.npz", **columns)
-    classes = max(round(count / PER_CLASS), 1)
+    classes = classes or max(round(count / PER_CLASS), 1)
     names = "".join(f"n{number:08d} thing {number}\n" for number in range(classes))
     (root / "LOC_synset_mapping.txt").write_text(names, encoding="utf-8")
     for place in ("extracted_train", "extracted_val"):
         for number in range(classes):
             (root / place / f"n{number:08d}").mkdir(parents=True)
     for number in range(count):
-        place = "extracted_val" if number // classes % 10 == 9 else "extracted_train"
+        place = "extracted_val" if (number // classes + number % classes) % 10 == 9 else "extracted_train"
         folder = root / place / f"n{number % classes:08d}"
         copy, content = divmod(number, num_contents)
         if copy % 50_000 == 0 and copy:  # a file system allows so many links

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ctlev_core.api import normal_map as normal_map
     from ctlev_core.api import pck as pck
     from ctlev_core.api import read_events as read_events
+    from ctlev_core.api import read_frames as read_frames
+    from ctlev_core.api import read_imu as read_imu
     from ctlev_core.api import simulate as simulate
     from ctlev_core.api import simulate_video as simulate_video
     from ctlev_core.api import skeleton_map as skeleton_map
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "EventDataset", "TrainedGenerator", "frechet", "histogram", "load_generator", "mpjpe", "normal_map", "pck",
-    "read_events", "simulate", "simulate_video", "skeleton_map",
+    "read_events", "read_frames", "read_imu", "simulate", "simulate_video", "skeleton_map",
 ]  # fmt: skip
 
 _ELSEWHERE = {

@@ -6,7 +6,7 @@ Paths may be texts, arrays lists, and seeds have defaults. Options beyond these 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,6 +19,7 @@ from data_contracts.labels import Labels
 
 if TYPE_CHECKING:
     from ctlev_core.body.layer import BodyModel
+    from ctlev_core.events.camera_streams import CameraFrame, ImuSamples
     from ctlev_core.scoring.pose import Alignment
 
 JOINT_SETS_BY_COUNT = {13: "dhp19", 24: "smpl"}
@@ -36,6 +37,33 @@ def read_events(path: str | os.PathLike[str]) -> Events:
     from ctlev_core.events.files import read_events_file
 
     return read_events_file(Path(path))
+
+
+def read_frames(path: str | os.PathLike[str]) -> Iterator[CameraFrame]:
+    """The frames that a camera took beside its events, one after the other (AEDAT 4 files).
+
+    Returns:
+        Each with `t` (us, as of the events), `exposure_us` and `pixels`, [H, W] or [H, W, 3] uint8.
+    Raises:
+        DataError: no AEDAT 4 file, a cut or corrupt one, or not one stream of frames.
+    """
+    from ctlev_core.events.camera_streams import read_camera_frames
+
+    return read_camera_frames(Path(path))
+
+
+def read_imu(path: str | os.PathLike[str]) -> ImuSamples:
+    """The inertial measurements that a camera took beside its events (AEDAT 4 files).
+
+    Returns:
+        Columns `t` (us, as of the events), `temperature`, and [N, 3] `acceleration` (g), `rotation` (degrees a second)
+        and `magnetic_field` (uT).
+    Raises:
+        DataError: no AEDAT 4 file, a cut or corrupt one, or not one stream of measurements.
+    """
+    from ctlev_core.events import camera_streams
+
+    return camera_streams.read_imu(Path(path))
 
 
 def histogram(

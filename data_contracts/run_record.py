@@ -38,6 +38,7 @@ class RunRecord(BaseModel):
         wall_seconds: how long.
         cpu_seconds: of its process, meanwhile.
         process_peak_memory_mib: highest of its process while it ran.
+        rows: of its table; None in records of before this was noted.
     """
 
     # What a newer version of the code notes beside these is no damage.
@@ -54,6 +55,7 @@ class RunRecord(BaseModel):
     wall_seconds: float
     cpu_seconds: float
     process_peak_memory_mib: float
+    rows: int | None = None
 
 
 def read_run_record(folder: Path) -> RunRecord:

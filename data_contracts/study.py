@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -27,6 +28,11 @@ class Study(Frozen):
         default_factory=dict,
         description="groups of experiments that differ in their draw of training recordings alone, by what the tables "
         "call them, such as `5 recordings a class`; each group is one column",
+    )
+    pooled_tests: Literal["same", "own"] = Field(
+        "same",
+        description="`own`: experiments of a group are tested on recordings of their own, as with other people each; "
+        "otherwise other test recordings are an error",
     )
 
     @field_validator("experiments")

@@ -69,10 +69,18 @@ class Amounts:
         return self._rows[key]
 
     def work(self, key: str) -> float:
-        """Steps times batch of a training, frames times steps of a sampling, number of two-sample tests; else rows."""
-        if key in self._stages and self._stages[key].stage in _TWO_SAMPLE_TESTS:
-            return self._two_sample_tests(self._stages[key].arguments)
-        numbers = dict(_numbers(self._stages[key].arguments)) if key in self._stages else {}
+        """Of a training steps times batch, of a sampling frames times steps, of scores the frames that a model sees, of
+        two-sample tests their number; else rows.
+        """
+        stage = self._stages.get(key)
+        arguments = {} if stage is None else stage.arguments
+        if stage is not None and stage.stage in _TWO_SAMPLE_TESTS:
+            return self._two_sample_tests(arguments)
+        if stage is not None and stage.stage == "score_model":
+            frames = self.rows(arguments["data"]["manifest"])
+            held_out = frames.total - frames.training
+            return held_out if arguments.get("split") != "train" and held_out else frames.total
+        numbers = dict(_numbers(arguments))
         if "num_steps" in numbers:
             factors = "num_steps", "batch_size", "sequence_length", "gradient_accumulation"
             return math.prod(numbers.get(name, 1.0) for name in factors)

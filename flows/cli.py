@@ -223,7 +223,11 @@ _part(
 @app.command(rich_help_panel=PARTS)
 def simulate(
     source: Annotated[
-        Path, typer.Argument(help="a video, a folder of pictures, or a picture, moved in saccades", show_default=False)
+        Path,
+        typer.Argument(
+            help="a video, a folder of pictures, an AEDAT 4 file with frames, or a picture, moved in saccades",
+            show_default=False,
+        ),
     ],
     output: Annotated[
         Path, typer.Argument(help="event file; its suffix is its format, .parquet the smallest", show_default=False)
@@ -245,7 +249,10 @@ def simulate(
     max_displacement_px: Annotated[
         float, typer.Option(help="farthest movement between two drawn frames; smaller is slower and more exact")
     ] = 1.0,
-    gamma: Annotated[float, typer.Option(help="light is a stored value to this power")] = 2.2,
+    gamma: Annotated[
+        float | None,
+        typer.Option(help="light is a stored value to this power; default 2.2, AEDAT 4: 1", show_default=False),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="of the camera's pixels and noise")] = 0,
     format_name: Annotated[
         str, typer.Option("--format", help="format, where the suffix does not tell: evt2, evt3, ...")

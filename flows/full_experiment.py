@@ -150,6 +150,7 @@ def _study(study: Study) -> ManifestRef:
         training_sets=[[str(one) for one in part.all_training_sets] for part in parts.values()],
         generator_names=[part.generator_names for part in parts.values()],
         pooled=list(study.pooled.items()),
+        own_tests=study.pooled_tests == "own",
         num_generators=[part.num_generators for part in parts.values()],
         label=study.name,
     )

@@ -115,8 +115,13 @@ def predict_stages(
 
 
 def kind_of(stage: str, arguments: Mapping[str, Any], size: tuple[int, int] | None = None) -> str:
-    """Name of a stage, its plug-ins, and the size of its images, (width, height) px."""
-    names = sorted({str(item["plugin"]) for item in arguments.values() if _is_plugin(item)})
+    """Name of a stage, its plug-ins, and the size of its images, (width, height) px.
+
+    A classifier for each class is another kind than one for all.
+    """
+    plugins = [item for item in arguments.values() if _is_plugin(item)]
+    binary = [isinstance(item.get("options"), Mapping) and bool(item["options"].get("binary")) for item in plugins]
+    names = sorted({str(item["plugin"]) + each * ":binary" for item, each in zip(plugins, binary, strict=True)})
     return " ".join([stage, *names, *([] if size in (None, USUAL_SIZE) else [f"{size[0]}x{size[1]}"])])
 
 
@@ -189,7 +194,7 @@ def _at(group: Sequence[Measured], work: float) -> StageCost:
     def line(of: Any) -> float:
         first, last = float(of(low.cost)), float(of(high.cost))
         if high.work <= 1.05 * low.work or last <= first:
-            return last * max(work / max(high.work, 1e-9), 0.2) if work > high.work else min(first, last)
+            return last * work / high.work if work > high.work > 0 else min(first, last)
         slope = (last - first) / (high.work - low.work)
         return max(first + slope * (work - low.work), 0.2 * first)
 
@@ -220,7 +225,7 @@ def _records_in(home: Path) -> dict[str, tuple[dict[str, Any], Path]]:
 
 
 def _rows_made(records: Mapping[str, tuple[dict[str, Any], Path]]) -> dict[str, int]:
-    return {key: record["rows"] for key, (record, _) in records.items() if "rows" in record}
+    return {key: record["rows"] for key, (record, _) in records.items() if record.get("rows") is not None}
 
 
 def _measured(records: Mapping[str, tuple[dict[str, Any], Path]], *, alone: bool = False) -> list[Measured]:

@@ -35,7 +35,7 @@ from data_contracts.study import SPEED_VS_ERROR
 from tasks.stage import Output, stage
 
 
-@stage(version=12, schema=tables.REPORT)
+@stage(version=13, schema=tables.REPORT)
 def study_report(
     out: Output,
     reports: list[Manifest],
@@ -47,6 +47,7 @@ def study_report(
     generator_names: Sequence[Sequence[str]],
     pooled: Sequence[tuple[str, Sequence[str]]] = (),
     num_generators: Sequence[int] = (),
+    own_tests: bool = False,
 ) -> pa.Table:
     """Write `report.html`, `tables.tex` and `tables.md` over all experiments, and into a folder each what they report.
 
@@ -60,9 +61,10 @@ def study_report(
         generator_names: whose frames were compared, the experiment's own first.
         pooled: groups of experiments that differ in their draw of training recordings: names of the group and of these.
         num_generators: fine-tunings in each experiment; needed where some are pooled.
+        own_tests: experiments of a group have test recordings of their own.
 
     Raises:
-        DrawsDiffer: experiments of a group were tested on different samples.
+        DrawsDiffer: experiments of a group were tested on different samples, or, with `own_tests`, on the same.
     """
     parts = [
         _part(report.ref.path, name, trained, generators)
@@ -72,7 +74,7 @@ def study_report(
     ]
     measured = [read_speed_summary(report.ref.path) for report in reports[len(names) :]]
     folders = [*names, *(SPEED_VS_ERROR for _ in measured)]
-    groups = _groups(reports, parts, pooled, num_generators)
+    groups = _groups(reports, parts, pooled, num_generators, own_tests=own_tests)
     inside = {part.name for group in groups for part in group.parts}
     # Of a group, the page shows the samples of one experiment, and links to all.
     alone = [part for part in parts if part.name not in inside]
@@ -96,7 +98,7 @@ def study_report(
         steps=parts[0].summary.steps,
         colours=parts[0].summary.colours,
         sections=[
-            Chapter("By the number of recordings", pooled_sections(groups, scores)),
+            Chapter("Draws together" if own_tests else "By the number of recordings", pooled_sections(groups, scores)),
             *([overview] if groups and overview.rows else []),
             *useful,
             *study_chapters(alone, shown),
@@ -136,6 +138,8 @@ def _groups(
     parts: Sequence[Part],
     pooled: Sequence[tuple[str, Sequence[str]]],
     num_generators: Sequence[int],
+    *,
+    own_tests: bool,
 ) -> list[Group]:
     """The groups, with the scores of single samples of their experiments."""
     places = {part.name: number for number, part in enumerate(parts)}
@@ -143,7 +147,8 @@ def _groups(
     for name, members in pooled:
         numbers = [places[member] for member in members]
         samples = [pq.read_table(reports[number].ref.path / "samples.parquet") for number in numbers]
-        found.append(pool_parts(name, [parts[number] for number in numbers], samples, num_generators[numbers[0]]))
+        members_parts = [parts[number] for number in numbers]
+        found.append(pool_parts(name, members_parts, samples, num_generators[numbers[0]], own_tests=own_tests))
     return found
 
 

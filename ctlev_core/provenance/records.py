@@ -91,8 +91,9 @@ def _numbered(role: str) -> Iterator[str]:
 
 def _read(role: str, folder: Path) -> Record:
     try:
-        rows = pq.read_metadata(folder / MANIFEST_FILE).num_rows
-        return Record(role=role, rows=rows, **read_run_record(folder).model_dump())
+        noted = read_run_record(folder).model_dump()
+        noted["rows"] = pq.read_metadata(folder / MANIFEST_FILE).num_rows  # older records do not have it
+        return Record(role=role, **noted)
     except (OSError, ValueError) as error:
         raise DataError(f"{folder}: has no provenance record that can be read: {str(error)[:300]}") from error
 

@@ -1,9 +1,10 @@
 """Scores of training sets over several draws of the training recordings, and how sure they are.
 
-A group of experiments differs in its draw alone: which few recordings each class learnt from. All are tested on the
-same samples. A score is the mean over draws, trainings and samples. What varies is drawn with replacement:
+A group of experiments differs in its draw alone: which few recordings each class learnt from, or which people, motions
+and cameras there were. All are tested on the same samples, or each on samples of its own. A score is the mean over
+draws, trainings and samples. What varies is drawn with replacement:
 
-- test recordings, the same for all draws, training sets and trainings;
+- test recordings, the same for all training sets and trainings, and for all draws that share them;
 - draws, the same for all training_sets: differences of training sets are paired by draw;
 - within each draw fine-tunings of the generator, and within these classifier seeds, for each training set
   independently. Training t learnt from the frames of fine-tuning t % G. Every training has a classifier seed of its
@@ -13,11 +14,12 @@ same samples. A score is the mean over draws, trainings and samples. What varies
 Deviations of R repetitions are stretched by sqrt(R/(R - 1)), for drawing R with replacement makes the variance of their
 mean (R - 1)/R of what it is (Rao & Wu, Resampling Inference with Complex Survey Data, JASA 1988).
 
-The means of draws already vary with what was trained within them. Drawing again within draws would count that spread
-twice, so that deviations of each level are shrunk to the variance that the levels below do not explain (Davison &
-Hinkley, Bootstrap Methods and their Application, 1997, section 3.8; Carpenter, Goldstein & Rasbash, A Novel Bootstrap
-Procedure for Assessing the Relationship between Class Size and Achievement, JRSS C 2003). Together they have, for
-draws, the larger of the variance found between draws and that explained by the trainings within.
+The means of draws already vary with what was trained within them, and with recordings of their own. Drawing again
+within draws would count that spread twice, so that deviations of each level are shrunk to the variance that the levels
+below do not explain (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section 3.8; Carpenter,
+Goldstein & Rasbash, A Novel Bootstrap Procedure for Assessing the Relationship between Class Size and Achievement,
+JRSS C 2003). Together they have, for draws, the larger of the variance found between draws and that explained by what
+is within.
 
 Three draws say little about their own spread. Percentiles of replicates, or 1.96 standard deviations of them, cover the
 truth in only 82 % of studies where draws vary most. The interval is therefore the score and t standard deviations of
@@ -86,7 +88,7 @@ class _Varied:
     Attributes:
         value: its score.
         draws: [D] score of each draw.
-        recordings: [B] score of replicates of the test recordings.
+        recordings: [B] deviations of replicates of the test recordings.
         within: [B] deviations of replicates of fine-tunings and seeds.
         variance: of the mean of one draw, as trainings within explain it; NaN = one training, nothing known.
         freedom: degrees of freedom of that variance.
@@ -108,49 +110,59 @@ class PooledScores:
         num_draws: experiments.
         num_generators: fine-tunings in each.
         num_trainings: by training set, in each experiment.
-        num_samples: test samples that every training has a score of.
-        num_recordings: their recordings. With fewer than `MIN_RECORDINGS` there are no intervals.
+        num_samples: test samples that every training has a score of; with `own_tests` those of all draws.
+        num_recordings: their recordings. With fewer than `MIN_RECORDINGS` in a draw there are no intervals.
+        own_tests: each draw has test recordings of its own.
     """
 
-    def __init__(self, draws: Sequence[pa.Table], metric: str, num_generators: int, seed: int = 0) -> None:
+    def __init__(
+        self, draws: Sequence[pa.Table], metric: str, num_generators: int, seed: int = 0, *, own_tests: bool = False
+    ) -> None:
         """Args:
             draws: of each experiment the table of the schema `PAIRED_SAMPLES`.
             metric: which score.
             num_generators: fine-tunings of the generator in each experiment; training t used number t % G.
             seed: of the resampling.
+            own_tests: the experiments were tested on different samples, and were meant to be.
 
         Raises:
-            DrawsDiffer: experiments were tested on different samples.
+            DrawsDiffer: experiments were tested on different samples, or, with `own_tests`, some on the same.
             ValueError: fewer than two experiments, none scored by this metric, training sets with other numbers of
                 trainings in other draws, numbers that are no multiple of `num_generators`, or no sample scored by all.
         """
         if len(draws) < 2:
             raise ValueError(f"scores are pooled over at least two draws, got {len(draws)}")
         read = [_read(table, metric, number) for number, table in enumerate(draws)]
-        tested = read[0][0]
-        for number, (other, _) in enumerate(read[1:], 1):
-            if difference := other.differs_from(tested):
-                raise DrawsDiffer(f"draws 0 and {number} must be tested on the same samples, got {difference}")
-        self.num_draws, self.num_generators = len(draws), num_generators
+        tested = [one for one, _ in read]
+        _check_tests(tested, own_tests=own_tests)
+        self.num_draws, self.num_generators, self.own_tests = len(draws), num_generators, own_tests
         self.training_sets = tuple(name for name in read[0][1] if all(name in found for _, found in read))
-        values = {name: _stacked(name, [found[name] for _, found in read]) for name in self.training_sets}
-        self.num_trainings = {name: of_set.shape[1] for name, of_set in values.items()}
-        scored = ~np.any([np.isnan(of_set).any(axis=(0, 1)) for of_set in values.values()], axis=0)
-        scored &= tested.weights > 0
-        if not scored.any():
-            raise ValueError(f"none of the {len(scored)} samples is scored by every training of every draw")
-        names, index = np.unique(np.asarray(tested.recordings)[scored], return_inverse=True)
-        self.num_samples, self.num_recordings = int(scored.sum()), len(names)
+        values = {name: [found[name] for _, found in read] for name in self.training_sets}
+        self.num_trainings = {name: _count_trainings(name, of_set) for name, of_set in values.items()}
+        scored = [
+            ~np.any([np.isnan(of_set[draw]).any(axis=0) for of_set in values.values()], axis=0) & (one.weights > 0)
+            for draw, one in enumerate(tested)
+        ]
+        if not own_tests:
+            scored = [np.all(scored, axis=0)] * len(draws)
+        if not all(rows.any() for rows in scored):
+            raise ValueError(f"none of the {len(scored[0])} samples is scored by every training of every draw")
         random = np.random.default_rng(seed)
-        self._times = random.multinomial(len(names), np.full(len(names), 1 / len(names)), size=NUM_RESAMPLES)
+        # Draws that share their recordings share how often each of these is drawn.
+        pairs = list(zip(tested, scored, strict=True))
+        once = [_Recordings.draw(*pair, random) for pair in (pairs if own_tests else pairs[:1])]
+        recordings = once if own_tests else once * len(draws)
+        self.num_samples = sum(one.num_samples for one in once)
+        self.num_recordings = sum(len(one.weights) for one in once)
+        self._fewest_recordings = min(len(one.weights) for one in once)
+        self._freedom_of_recordings = float(sum(len(one.weights) - 1 for one in once))
         self._draw_weights = _stretched(random, self.num_draws, (NUM_RESAMPLES,))
-        weights = tested.weights[scored]
         self._of: dict[str, _Varied] = {}
         # In the order of names, so that the order of rows changes nothing.
         for name in sorted(self.training_sets):
-            sums = _add_up(values[name][..., scored] * weights, index, len(names))
+            sums = [one.add_up(of_draw) for one, of_draw in zip(recordings, values[name], strict=True)]
             groups = num_generators if _has_generator(name) else 1
-            self._of[name] = _vary(name, sums, np.bincount(index, weights), self._times, groups, random)
+            self._of[name] = _vary(name, sums, recordings, groups, random)
 
     def score(self, training_set: str) -> Difference:
         """Mean score of a training set, with its 95 % interval.
@@ -214,15 +226,19 @@ class PooledScores:
         """A weighted sum of scores with its interval, and the replicates of it [B], as wide as the interval."""
         parts = [(weight, self._of[name]) for name, weight in weights.items()]
         value = sum(weight * part.value for weight, part in parts)
-        if self.num_recordings < MIN_RECORDINGS:
+        if self._fewest_recordings < MIN_RECORDINGS:
             return Difference(value, float("nan"), float("nan")), np.full(1, np.nan)
         zeros = np.zeros(NUM_RESAMPLES)
-        replicates = sum((weight * (part.recordings - part.value) for weight, part in parts), zeros)
-        replicates *= stretch(self.num_recordings)
-        sampled = float(replicates.var()), float(self.num_recordings - 1)
+        replicates = sum((weight * part.recordings for weight, part in parts), zeros)
+        sampled = float(replicates.var()), self._freedom_of_recordings
         draws = sum((weight * part.draws for weight, part in parts), np.zeros(self.num_draws))
         within = [(weight**2 * part.variance, part.freedom) for weight, part in parts]
         deviations = sum((weight * part.within for weight, part in parts), zeros)
+        if self.own_tests:
+            # Scores of draws vary with their recordings as they do with their trainings.
+            within.append((sampled[0] * self.num_draws, sampled[1]))
+            more, repeated = _vary_draws(draws, self._draw_weights, deviations + replicates, within)
+            return _interval(value, more, [repeated])
         more, repeated = _vary_draws(draws, self._draw_weights, deviations, within)
         return _interval(value, replicates + more, [sampled, repeated])
 
@@ -246,7 +262,8 @@ def pool_values(values: np.ndarray, num_generators: int, seed: int = 0) -> Diffe
         raise ValueError(f"scores are pooled over at least two draws, got values of shape {values.shape}")
     random = np.random.default_rng(seed)
     draw_weights = _stretched(random, len(values), (NUM_RESAMPLES,))
-    part = _vary("scores", values[..., None], np.ones(1), np.ones((NUM_RESAMPLES, 1)), num_generators, random)
+    one = _Recordings(np.ones(1, bool), np.zeros(1, int), np.ones(1), np.ones(1), np.ones((NUM_RESAMPLES, 1)))
+    part = _vary("scores", list(values[..., None]), [one] * len(values), num_generators, random)
     more, repeated = _vary_draws(part.draws, draw_weights, part.within, [(part.variance, part.freedom)])
     return _interval(part.value, more, [repeated])[0]
 
@@ -298,18 +315,68 @@ def _encoded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
     return names[order].tolist(), np.argsort(order)[encoded.indices.to_numpy(zero_copy_only=False)]
 
 
-def _stacked(name: str, draws: Sequence[np.ndarray]) -> np.ndarray:
+def _count_trainings(name: str, draws: Sequence[np.ndarray]) -> int:
     counts = [len(values) for values in draws]
     if len(set(counts)) > 1:
         raise ValueError(f"training set {name!r} must have as many trainings in every draw, got {counts}")
-    return np.stack(draws)
+    return counts[0]
 
 
-def _add_up(values: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
-    """Values of samples [D, R, N] added up by recording: [D, R, `count`]."""
-    order = np.argsort(index, kind="stable")
-    starts = np.searchsorted(index[order], np.arange(count))
-    return np.add.reduceat(values[..., order], starts, axis=-1)
+def _check_tests(tested: Sequence[_Tested], *, own_tests: bool) -> None:
+    for number, other in enumerate(tested[1:], 1):
+        difference = other.differs_from(tested[0])
+        if difference and not own_tests:
+            raise DrawsDiffer(f"draws 0 and {number} must be tested on the same samples, got {difference}")
+    digests = [one.digest for one in tested]
+    if own_tests and len(set(digests)) < len(digests):
+        first = next(number for number, digest in enumerate(digests) if digests.count(digest) > 1)
+        again = digests.index(digests[first], first + 1)
+        raise DrawsDiffer(f"each draw must be tested on samples of its own, got the same for draws {first} and {again}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Recordings:
+    """The test recordings of a draw.
+
+    Attributes:
+        scored: [N] bool, the samples that count.
+        index: [S] recording of each of them.
+        sample_weights: [S].
+        weights: [n] of the recordings.
+        times: [B, n] how often each is drawn.
+    """
+
+    scored: np.ndarray
+    index: np.ndarray
+    sample_weights: np.ndarray
+    weights: np.ndarray
+    times: np.ndarray
+
+    @classmethod
+    def draw(cls, tested: _Tested, scored: np.ndarray, random: np.random.Generator) -> _Recordings:
+        """Those of scored samples."""
+        names, index = np.unique(np.asarray(tested.recordings)[scored], return_inverse=True)
+        times = random.multinomial(len(names), np.full(len(names), 1 / len(names)), size=NUM_RESAMPLES)
+        weights = tested.weights[scored]
+        return cls(scored, index, weights, np.bincount(index, weights), times)
+
+    @property
+    def num_samples(self) -> int:
+        """Samples that count."""
+        return len(self.index)
+
+    def add_up(self, values: np.ndarray) -> np.ndarray:
+        """Values of samples [R, N], weighted and added up by recording: [R, n]."""
+        order = np.argsort(self.index, kind="stable")
+        starts = np.searchsorted(self.index[order], np.arange(len(self.weights)))
+        return np.add.reduceat((values[:, self.scored] * self.sample_weights)[:, order], starts, axis=-1)
+
+    def deviations(self, sums: np.ndarray) -> np.ndarray:
+        """[B] of replicates of the recordings from the mean, which is of sums [n], stretched; zeros for one alone."""
+        if len(self.weights) < 2:
+            return np.zeros(len(self.times))
+        found = (self.times @ sums) / (self.times @ self.weights)
+        return (found - sums.sum() / self.weights.sum()) * stretch(len(self.weights))
 
 
 def _has_generator(training_set: str) -> bool:
@@ -325,41 +392,46 @@ def _stretched(random: np.random.Generator, count: int, shape: tuple[int, ...]) 
 
 
 def _vary(
-    name: str, sums: np.ndarray, counts: np.ndarray, times: np.ndarray, groups: int, random: np.random.Generator
+    name: str,
+    sums: Sequence[np.ndarray],
+    recordings: Sequence[_Recordings],
+    groups: int,
+    random: np.random.Generator,
 ) -> _Varied:
     """Replicates of one training set.
 
     Args:
         name: of the training set, for errors.
-        sums: [D, R, n] weighted values of each recording.
-        counts: [n] weights of each recording.
-        times: [B, n] how often each recording is drawn.
+        sums: of each draw [R, n] weighted values of each recording.
+        recordings: of each draw.
         groups: fine-tunings that its trainings take turns with.
         random: draws fine-tunings and seeds.
     """
-    num_draws, num_trainings, _ = sums.shape
+    num_draws, num_trainings = len(sums), len(sums[0])
     if num_trainings % groups:
         raise ValueError(
             f"training set {name!r}: the number of trainings must be a multiple of the {groups} fine-tunings, "
             f"got {num_trainings}"
         )
-    sampled = (times @ sums.mean(axis=(0, 1))) / (times @ counts)
+    pairs = list(zip(sums, recordings, strict=True))
+    sampled = np.mean([one.deviations(of_draw.mean(axis=0)) for of_draw, one in pairs], axis=0)
     seeds = num_trainings // groups
     # Training t = seed number t // G of fine-tuning t % G.
-    scores = (sums.sum(axis=-1) / counts.sum()).reshape(num_draws, seeds, groups)
+    scores = np.stack([of_draw.sum(axis=-1) / one.weights.sum() for of_draw, one in pairs])
+    scores = scores.reshape(num_draws, seeds, groups)
     tuned = _mean(scores)
     means = _mean(tuned)
     of_seeds = float(scores.var(axis=1, ddof=1).mean()) / seeds if seeds > 1 else 0.0
     of_tuned = float(tuned.var(axis=1, ddof=1).mean()) if groups > 1 else 0.0
     by_seed = seeds > 1 and of_seeds >= of_tuned
-    within = np.zeros(len(times))
+    within = np.zeros(len(sampled))
     for draw in range(num_draws):
         # One draw after the other: memory for one is enough.
         shrunk = math.sqrt(max(0.0, 1 - of_seeds / of_tuned)) if of_tuned else 0.0
-        drawn = _stretched(random, groups, (len(times),))
+        drawn = _stretched(random, groups, (len(sampled),))
         within += drawn @ (tuned[draw] - means[draw]) * shrunk
         for group in range(groups):
-            drawn = _stretched(random, seeds, (len(times),))
+            drawn = _stretched(random, seeds, (len(sampled),))
             within += drawn @ (scores[draw, :, group] - tuned[draw, group]) / groups
     if num_trainings == 1:
         variance, freedom = float("nan"), 0.0

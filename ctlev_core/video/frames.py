@@ -3,6 +3,7 @@
     a video file          anything that OpenCV reads; its own times, so that frame rates may vary
     a folder of pictures  in the order of their names; `timestamps.txt` (seconds, a line each) in it or beside it, or a
                           rate
+    an AEDAT 4 file       the frames that a camera took beside its events; they are light
     a picture             moved before the camera as N-MNIST's pictures were (`ctlev_core.render.saccades`)
 
 Stored pixels of 8 and 16 bits are light to the power of 1 / gamma; floating-point ones (.hdr, .tiff) are light.
@@ -21,6 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ctlev_core.events.camera_streams import read_camera_frames
+from ctlev_core.formats import aedat4
 from ctlev_core.render.saccades import NMNIST_PATH_PX, NMNIST_PATH_US, path_frames
 from ctlev_core.video.picture_files import PICTURE_SUFFIXES, list_folder, read_picture
 from data_contracts.errors import DataError
@@ -43,7 +46,7 @@ class FrameOptions:
         fps: frames a second, in the place of the file's times; needed for a folder without times.
         slow_motion: so many times slower than life the video plays.
         start_s, stop_s: the stretch of the video that is read, s of its own time; None = to its end.
-        gamma: light is a stored value to this power; 1 = values are light.
+        gamma: light is a stored value to this power; 1 = values are light, None = 2.2, and 1 of an AEDAT 4 file.
     """
 
     size: SensorSize | None = None
@@ -51,7 +54,7 @@ class FrameOptions:
     slow_motion: float = 1.0
     start_s: float = 0.0
     stop_s: float | None = None
-    gamma: float = GAMMA
+    gamma: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("fps", "slow_motion", "gamma"):
@@ -114,8 +117,9 @@ class Frames(abc.ABC):
 class _Light:
     """From pixels as they are stored to light on the sensor."""
 
-    def __init__(self, path: Path, options: FrameOptions) -> None:
-        self._path, self._gamma, self._size = path, np.float32(options.gamma), options.size
+    def __init__(self, path: Path, options: FrameOptions, usual_gamma: float = GAMMA) -> None:
+        self._path, self._size = path, options.size
+        self._gamma = np.float32(usual_gamma if options.gamma is None else options.gamma)
         self._of_bytes = (np.arange(256) / 255).astype(np.float32) ** self._gamma
         self._stored: tuple[int, int] | None = None
 
@@ -147,12 +151,14 @@ class _Light:
 class _StoredFrames(Frames):
     """Frames with a time each."""
 
+    usual_gamma = GAMMA
+
     def __init__(self, path: Path, options: FrameOptions, expected: int) -> None:
         self.path, self.options, self.expected = path, options, expected
 
     def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         options, first_s, last_us, count = self.options, None, -1, 0
-        self.num_skipped, light = 0, _Light(self.path, options)
+        self.num_skipped, light = 0, _Light(self.path, options, self.usual_gamma)
         self.shown = shown = list[Shown]()
         self.num_seen_to_end = num_read = 0
         for number, (time_s, stored) in enumerate(self._read()):
@@ -238,6 +244,24 @@ class _PictureFolder(_StoredFrames):
             yield time_s, read_picture(path)
 
 
+class _RecordedFrames(_StoredFrames):
+    """Those that an event camera took beside its events."""
+
+    usual_gamma = 1.0  # a sensor's pixels as they are, where videos are made for screens
+
+    def __init__(self, path: Path, options: FrameOptions) -> None:
+        super().__init__(path, options, 0)
+
+    def _read(self) -> Iterator[tuple[float, np.ndarray]]:
+        first_us: int | None = None
+        for number, frame in enumerate(read_camera_frames(self.path)):
+            first_us = frame.t if first_us is None else first_us
+            grey = frame.pixels.ndim == 2
+            stored = frame.pixels[..., None].repeat(3, axis=2) if grey else frame.pixels[..., ::-1]
+            fps = self.options.fps
+            yield number / fps if fps else (frame.t - first_us) / 1e6, np.ascontiguousarray(stored)
+
+
 class _StillPicture(Frames):
     """One picture that the camera looks at in saccades."""
 
@@ -275,7 +299,7 @@ def grey_levels(light: np.ndarray) -> np.ndarray:
 
 
 def open_frames(path: Path, options: FrameOptions, max_displacement_px: float = 1.0) -> Frames:
-    """The frames of a video file, of a folder of pictures, or of one picture.
+    """The frames of a video file, of a folder of pictures, of an AEDAT 4 recording, or of one picture.
 
     Args:
         path: the file or folder.
@@ -290,7 +314,7 @@ def open_frames(path: Path, options: FrameOptions, max_displacement_px: float = 
         raise DataError(f"{path}: expected a video, a folder of pictures or a picture, got nothing there")
     if path.suffix.lower() in PICTURE_SUFFIXES:
         return _StillPicture(path, options, max_displacement_px)
-    return _VideoFile(path, options)
+    return _RecordedFrames(path, options) if aedat4.sniff(path) else _VideoFile(path, options)
 
 
 def _open(path: Path):

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from davis_recording import SIZE, write_davis
 
 import ctlev_core as ctlev
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, BUNDLED_OBJECT_MODEL
@@ -47,6 +48,7 @@ def test_each_line_of_the_quick_start_runs(tmp_path, monkeypatch, random_events)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("CTLEV_HOME", raising=False)
     evt2.write(Path("recording.raw"), random_events)
+    write_davis(Path("davis.aedat4"))
     made_run(Path(".ctlev").absolute(), "pose")
     opened = []
     monkeypatch.setattr(ctlev, "EventDataset", opened.append)  # a folder is made in tests/flows/test_export_folder.py
@@ -68,6 +70,7 @@ def test_each_line_of_the_quick_start_runs(tmp_path, monkeypatch, random_events)
     exec(block, given)
     assert given["filmed"].sensor_size == (346, 260) and len(given["filmed"]) > 0
     assert len(given["events"]) == len(random_events) and opened == ["mine"]
+    assert next(given["pictures"]).pixels.shape == SIZE[::-1] and len(given["imu"]) == 700
     assert given["counts"].shape == (4, 2, 24, 32) and given["counts"].sum() == 2000
     assert given["error"] == 5.0 and 0 <= given["share"] <= 1
     assert given["normals"].shape == given["skeleton"].shape == (64, 64, 3)

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from ctlev_core import __version__
 from flows import cli
-from flows.preset_list import preset_names
+from flows.preset_list import PRESETS, preset_names, read_head
 
 COMMANDS = (
     "run", "plan", "prepare", "train", "synthesize", "evaluate", "baselines", "export-events", "speed-vs-error",
@@ -75,6 +75,20 @@ def test_plan_is_the_dry_run_of_the_script(tmp_path):
     )
     swept = invoke("plan", "smoke", "--set", "num_synthetic=9,12", "--home", str(tmp_path))
     assert swept[0] == 0 and "smoke_num_synthetic_9" in swept[1] and "study_report" in swept[1]
+
+
+@pytest.mark.parametrize("preset", ["smoke", "pose", "demo"])
+def test_a_plan_in_an_empty_home_takes_about_as_long_as_its_preset_says(tmp_path, preset):
+    """The costs that come with the project are of the amounts of work that a plan counts: half to twice the time."""
+    status, output, _ = invoke("plan", preset, "--home", str(tmp_path))
+    assert status == 0
+    (told,) = re.findall(r"the rest: about (.*?) with", output)
+    assert 0.5 < _seconds(told) / _seconds(read_head(PRESETS / f"{preset}.yaml").time) < 2
+
+
+def _seconds(text):
+    units = {"s": 1, "min": 60, "h": 3600}
+    return sum(int(number) * units[unit] for number, unit in re.findall(r"([0-9]+) (s|min|h)\b", text))
 
 
 @pytest.mark.parametrize(

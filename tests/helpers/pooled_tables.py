@@ -8,8 +8,10 @@ import pyarrow as pa
 from ctlev_core.provenance.scores import PAIRED_SAMPLES
 
 
-def samples_table(values: dict[str, np.ndarray], per_recording: int = 1, metric: str = "accuracy") -> pa.Table:
-    """Args: `values` [R, N] of each setting, `per_recording` samples of each recording."""
+def samples_table(
+    values: dict[str, np.ndarray], per_recording: int = 1, metric: str = "accuracy", digest: str = "d"
+) -> pa.Table:
+    """Args: `values` [R, N] of each setting, `per_recording` samples of each recording, `digest` of images."""
     parts = []
     for setting, of_setting in values.items():
         trainings, count = of_setting.shape
@@ -20,7 +22,7 @@ def samples_table(values: dict[str, np.ndarray], per_recording: int = 1, metric:
             "subject": [setting] * rows, "metric": [metric] * rows,
             "training": pa.array(np.repeat(np.arange(trainings), count), pa.int32()),
             "sample_id": ids * trainings, "recording_id": recordings * trainings, "value": of_setting.ravel(),
-            "weight": np.ones(rows), "samples_digest": ["d"] * rows,
+            "weight": np.ones(rows), "samples_digest": [digest] * rows,
         }  # fmt: skip
         parts.append(pa.table(columns).cast(PAIRED_SAMPLES.arrow()))
     return pa.concat_tables(parts)

@@ -1,9 +1,10 @@
 """The AEDAT 4 decoder in a process of its own, for what some corrupt files do to it ends a process: it panics while it
 panics, reads outside of its buffers, or asks for more memory than there is.
 
-Run as a program, this file decodes one file and writes to standard output: 8 bytes of length and that many of JSON
-{"streams": [...]}, then for each packet of events its length in bytes and its events as rows of `EVENT`. A packet of no
-length ends the file; {"error": ...} in the place of the first message, or a length of `FAILED`, is followed by a text.
+Run as a program, this file decodes the streams of one kind of one file (`events`, `frame`, `imus`) and writes to
+standard output: 8 bytes of length and that many of JSON {"streams": [...]}, then for each packet its length in bytes
+and its content: rows of `EVENT` or `IMU`, or `FRAME_HEAD` and pixels. A packet of no length ends the file; {"error":
+...} in the place of the first message, or a length of `FAILED`, is followed by a text.
 """
 
 from __future__ import annotations
@@ -19,6 +20,10 @@ from collections.abc import Iterator
 from typing import IO, Any
 
 EVENT = [("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")]
+_AXES = [f"{name}_{axis}" for name in ("accelerometer", "gyroscope", "magnetometer") for axis in "xyz"]
+IMU = [("t", "<u8"), ("temperature", "<f4"), *((name, "<f4") for name in _AXES)]
+FRAME_HEAD = struct.Struct("<QQQHHB")
+"""Start and end of the exposure, time stamp, us; width, height, channels."""
 FAILED = (1 << 64) - 1
 MAX_MEMORY_BYTES = 4 << 30
 """Of the decoding process. Packets of real recordings hold a few thousand events."""
@@ -30,15 +35,15 @@ class DecoderError(Exception):
 
 
 @contextlib.contextmanager
-def decoding(path: str) -> Iterator[tuple[list[dict[str, Any]], Iterator[bytes]]]:
-    """The event streams of a file, and one row of `EVENT` after the other, packet by packet.
+def decoding(path: str, kind: str = "events") -> Iterator[tuple[list[dict[str, Any]], Iterator[bytes]]]:
+    """The streams of a kind in a file, and the content of one packet of them after the other.
 
     Raises:
         DecoderError: here, and where packets are read.
     """
     # One thread each: the decoder uses one, and numpy's own would count against the memory limit.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-P", __file__, path]
+    command = [sys.executable, "-P", __file__, path, kind]
     process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
     )
@@ -69,7 +74,16 @@ def _send(content: bytes) -> None:
     sys.stdout.buffer.write(content)
 
 
-def _serve(path: str) -> None:
+def _content(packet: dict[str, Any], kind: str) -> bytes:
+    if kind != "frame":
+        return packet[kind].tobytes()
+    frame = packet[kind]
+    pixels, times = frame["pixels"], [int(frame[name]) for name in ("exposure_begin_t", "exposure_end_t", "t")]
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    return FRAME_HEAD.pack(*times, pixels.shape[1], pixels.shape[0], channels) + pixels.tobytes()
+
+
+def _serve(path: str, kind: str) -> None:
     import resource
 
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
@@ -80,12 +94,12 @@ def _serve(path: str) -> None:
         import aedat
 
         decoder = aedat.Decoder(path)
-        streams = [stream for stream in decoder.id_to_stream().values() if stream["type"] == "events"]
-        sizes = [{name: int(stream[name]) for name in ("width", "height")} for stream in streams]
+        streams = [stream for stream in decoder.id_to_stream().values() if stream["type"] == kind]
+        sizes = [{name: int(stream.get(name, 0)) for name in ("width", "height")} for stream in streams]
         _send(json.dumps({"streams": sizes}).encode())
         while (packet := next(decoder, None)) is not None:
-            if "events" in packet and len(packet["events"]):
-                _send(packet["events"].tobytes())
+            if kind in packet and len(packet[kind]):
+                _send(_content(packet, kind))
         _send(b"")
     except BaseException as error:  # a panic is no Exception
         sys.stdout.buffer.write(_LENGTH.pack(FAILED) + str(error).encode()[:300])
@@ -93,4 +107,4 @@ def _serve(path: str) -> None:
 
 
 if __name__ == "__main__":
-    _serve(sys.argv[1])
+    _serve(*sys.argv[1:])

@@ -47,6 +47,9 @@ _COMPARED = (
     (RECORDED, SYNTHETIC, "synthetic frames alone, against recorded frames alone"),
     ("random_weights", SYNTHETIC, "synthetic frames: pre-trained weights against random weights"),
     (SIMULATED, BOTH, "recorded and synthetic frames, against recorded and simulated frames"),
+    (with_recorded("event_gan"), BOTH, "recorded and synthetic frames, against recorded frames and Event-GAN's"),
+    (with_recorded("smpl_esim"), BOTH, "recorded and synthetic frames, against recorded frames and SMPL-ESIM's"),
+    (with_recorded(ORACLE), BOTH, "recorded and synthetic frames, against as many more recorded ones"),
 )
 """Before, after, and what the row is called."""
 _WITH_ORACLE = with_recorded(ORACLE)
@@ -97,7 +100,9 @@ class Group:
         return self.scores.difference(before, after) if {before, after} <= set(self.scores.training_sets) else None
 
 
-def pool_parts(name: str, parts: Sequence[Part], samples: Sequence[pa.Table], num_generators: int) -> Group:
+def pool_parts(
+    name: str, parts: Sequence[Part], samples: Sequence[pa.Table], num_generators: int, *, own_tests: bool = False
+) -> Group:
     """The group of some experiments.
 
     Args:
@@ -105,11 +110,12 @@ def pool_parts(name: str, parts: Sequence[Part], samples: Sequence[pa.Table], nu
         parts: the experiments.
         samples: of each the table of the schema `PAIRED_SAMPLES`.
         num_generators: fine-tunings in each.
+        own_tests: the experiments have test recordings of their own.
 
     Raises:
         DrawsDiffer, ValueError: as `PooledScores`.
     """
-    return Group(name, parts, PooledScores(samples, parts[0].metric, num_generators))
+    return Group(name, parts, PooledScores(samples, parts[0].metric, num_generators, own_tests=own_tests))
 
 
 def pooled_verdict(groups: Sequence[Group]) -> str:
@@ -228,7 +234,7 @@ def _score_table(groups: Sequence[Group]) -> Table:
         f"{_counts(groups)} In brackets 95 % intervals over test recordings, draws, fine-tunings and seeds. Bold: "
         "better than recorded frames alone, by a difference whose interval excludes 0."
     )
-    title = "Scores by training frames and number of recordings"
+    title = "Scores by training frames" + ("" if groups[0].scores.own_tests else " and number of recordings")
     return Table(title, ["trained on", *_names(groups)], body, caption=caption, bold=bold, footnotes=notes)
 
 
@@ -312,9 +318,12 @@ def _count(group: Group) -> str:
     frames = f" ({scores.num_samples:,} frames)" if scores.num_samples != scores.num_recordings else ""
     tunings = "fine-tuning" if scores.num_generators == 1 else "fine-tunings"
     seeds = trainings // scores.num_generators
-    of_each = f"{scores.num_generators} {tunings} of the generator in each draw, and {seeds} classifier "
+    of_each = f"{scores.num_generators} {tunings} of the generator in each draw, and {seeds} training "
     of_each += "seed for each of them" if seeds == 1 else "seeds for each of them"
+    drawn = "random draws of the training recordings"
+    if scores.own_tests:
+        drawn = "draws of recordings to train and test on"
     return (
-        f"{scores.num_recordings:,} test recordings{frames}, {scores.num_draws} random draws of the training "
-        f"recordings, {of_each} ({trainings} classifiers for each draw and row)"
+        f"{scores.num_recordings:,} test recordings{frames}, {scores.num_draws} {drawn}, {of_each} "
+        f"({trainings} trainings for each draw and row)"
     )

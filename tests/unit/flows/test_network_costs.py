@@ -11,6 +11,7 @@ from flows import network_costs
 from flows.amounts_of_work import Amounts, Rows
 from flows.costs import operations
 from flows.network_costs import network_cost
+from flows.stage_costs import Measured, StageCost, kind_of, predict_stages
 from tasks.stage import PlannedStage
 
 SIZE = (512, 512)
@@ -160,6 +161,48 @@ def test_rows_follow_from_the_recordings(tmp_path):
     # What is there already is counted and not guessed.
     known = Amounts({stage.key: stage for stage in stages}, {"b": 18, "d": 6})
     assert known.rows("b") == Rows(12, 18) and known.rows("c") == Rows(10, 16) and known.rows("d") == Rows(6, 6)
+
+
+def test_scores_take_the_frames_they_are_of_and_not_the_steps_of_the_training():
+    recorded = planned("encode", "a", recordings=ref("x"), num_train_recordings=90, num_test_recordings=60)
+    sampled = planned("sample", "b", conditions=ref("x"), count=40)
+    downstream = {"plugin": "downstream/classifier", "options": {"num_steps": 7, "batch_size": 4, "binary": None}}
+    scores = [
+        planned("score_model", name, data=ref(data), model=ref("m"), split=split, downstream=downstream)
+        for name, data, split in (("c", "a", "test"), ("d", "a", "train"), ("e", "b", "train"))
+    ]
+    amounts = Amounts({stage.key: stage for stage in (recorded, sampled, *scores)})
+    assert [amounts.work(key) for key in "cde"] == [60, 150, 40]
+
+
+def test_a_network_for_each_class_is_another_kind_than_one_for_all():
+    def kind(binary):
+        choice = {"plugin": "downstream/classifier", "options": {"num_steps": 7, "binary": binary}}
+        return kind_of("score_model", {"downstream": choice, "split": "test"}, SIZE)
+
+    assert kind(None) == "score_model downstream/classifier 512x512"
+    assert kind("balanced") == "score_model downstream/classifier:binary 512x512"
+
+
+def test_downstream_networks_of_large_images_have_costs_of_their_own():
+    """An epoch of ResNet-34 at 512 px takes far longer than one at 64 px, and its weights are 86 MB."""
+
+    def cost(size, steps):
+        encoding = {"plugin": "encodings/event_histogram", "options": {"image_size": list(size)}}
+        recorded = planned("encode", "a", recordings=ref("x"), encoding=encoding, num_train_recordings=90)
+        downstream = {"plugin": "downstream/classifier", "options": {"num_steps": steps, "batch_size": 2}}
+        training = planned("train_downstream", "b", training_sets=[ref("a")], downstream=downstream)
+        return predict_stages([training], of=[recorded, training])["b"]
+
+    small, few, many = cost((64, 64), 8), cost(SIZE, 8), cost(SIZE, 80)
+    assert few.seconds > 5 * small.seconds and 8 < many.seconds / few.seconds < 12
+    assert few.disk_bytes > 80e6 and few.memory_mib > 1200
+
+
+def test_what_took_time_without_any_work_does_not_make_work_endless():
+    """Realism of few frames is no test, and records of before rows were noted tell no frames at all."""
+    stage = planned("ingest", "a", num_train_recordings=30)
+    assert predict_stages([stage], [Measured("ingest", 0.0, StageCost(40.0, 700.0, 9))])["a"].seconds == 40.0
 
 
 def test_realism_is_as_many_two_sample_tests_as_have_enough_frames():

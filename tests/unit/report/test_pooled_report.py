@@ -32,7 +32,7 @@ def test_the_page_begins_with_the_answer_and_shows_each_group_once(study):
     page, _ = study
     texts = ["2 recordings a class: adding synthetic frames to the recorded ones helped: accuracy went from 0.6"]
     texts += ["It did more than augmented copies of the recorded frames do (+", "20 recordings a class: "]
-    texts += ["60 test recordings, 3 random draws of the training recordings, 5 fine-tunings", "and 3 classifier seeds"]
+    texts += ["60 test recordings, 3 random draws of the training recordings, 5 fine-tunings", "and 3 training seeds"]
     # In reading order: recorded frames, recorded ones with others, others alone, and what is no test score.
     texts += [">recorded</td>", ">recorded + synthetic</td>", ">recorded + augmented copies</td>"]
     texts += [">recorded + more recorded</td>", ">synthetic</td>", ">more recorded</td>"]

@@ -280,6 +280,7 @@ def test_provenance_record():
     assert record["upstream"] == {source.key: source.digest}
     assert record["digest"] == ref.digest and record["stage_version"] == 1
     assert record["wall_seconds"] >= 0 and record["process_peak_memory_mib"] > 1
+    assert record["rows"] == ref.rows == len(read_manifest(ref).table)
     assert record["versions"]["numpy"] == np.__version__
     arguments = json.loads((source.path / "run.json").read_text())["arguments"]
     assert arguments["seed"] == 3 and arguments["windows"]["num_events"] == 5
