@@ -29,7 +29,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import yaml
 from many_recordings import write_recordings
 from many_samples import POSES, run_stage
 
@@ -114,22 +113,21 @@ def measure(axis: str, largest: int | None) -> list[Point]:
 def run_classes(folder: Path, axis: str, *, rows: int, classes: int, side: int, workers: int) -> None:
     """An experiment with class names, in a home of its own."""
     write_recordings(folder / "raw", rows, EVENTS, 200, classes)
-    short = {"num_steps": 8, "batch_size": 16}
-    text = {
+    changed = {
         "name": "growth",
-        "extends": "n_imagenet",
-        "dataset": {"name": "n_imagenet", "options": {"root": str(folder / "raw"), "images_per_class": None}},
-        "encoding": {"options": {"image_size": [side, side]}},
-        "generator": {"options": {"num_steps": 4, "batch_size": 4}},
-        "sampling": {"num_inference_steps": 1},
+        "dataset.options.root": folder / "raw",
+        "dataset.options.images_per_class": "null",
+        "encoding.options.image_size": f"[{side}, {side}]",
+        "generator.options.num_steps": 4,
+        "generator.options.batch_size": 4,
+        "sampling.num_inference_steps": 1,
         "num_synthetic": rows,
-        "downstream": {"options": {"architecture": "resnet10-quarter", "head_width": 0, **short}},
-        "feature_extractor": {"options": short},
+        "downstream.options": "{num_steps: 8, batch_size: 16}",
+        "feature_extractor.options": "{num_steps: 8, batch_size: 16}",
     }
-    config = folder / "growth.yaml"
-    config.write_text(yaml.safe_dump(text))
+    options = [word for name, value in changed.items() for word in ("--set", f"{name}={value}")]
     workers = workers if axis == "workers" else 1
-    call("flows/full_experiment.py", "--preset", str(config), home=folder / "home", workers=workers)
+    call("flows/full_experiment.py", "--preset", "n_imagenet", *options, home=folder / "home", workers=workers)
 
 
 def run_poses(home: Path, rows: int) -> None:

@@ -97,7 +97,9 @@ def read_table(source: Path | pa.BufferReader, path: Path) -> pa.Table:
     """One Parquet file. `pq.read_table` would load pyarrow's datasets for it, and those pandas, a third of a second."""
     try:
         with pq.ParquetFile(source) as file:
-            return file.read()
+            # pyarrow's threads may let go of Python's memory after the interpreter has ended, which aborts the process:
+            # github.com/apache/arrow/issues/34314
+            return file.read(use_threads=not isinstance(source, pa.BufferReader))
     except OSError as error:
         if error.errno is not None:
             raise

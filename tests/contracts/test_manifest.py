@@ -2,6 +2,9 @@
 
 import hashlib
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +22,8 @@ from data_contracts.manifest import (
     read_manifest,
     write_manifest,
 )
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def training_table(steps=(1, 2)):
@@ -104,6 +109,20 @@ def test_same_content_has_the_same_digest(artefact, tmp_path):
 def test_changed_manifest_is_refused(artefact):
     with pytest.raises(DataError, match="content has changed; expected digest 000000000000"):
         read_manifest(ManifestRef(key=artefact.key, path=artefact.path, digest="0" * 64, rows=2))
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="only Linux lists the threads of a process")
+def test_reading_starts_no_threads_that_outlive_the_interpreter(artefact):
+    """pyarrow's own let go of what was read when they like; after the interpreter has ended that aborts the process."""
+    code = f"""if True:
+        import os
+        from pathlib import Path
+        from data_contracts.manifest import ManifestRef, read_manifest
+        before = len(os.listdir("/proc/self/task"))
+        read_manifest(ManifestRef(key={artefact.key!r}, path=Path({str(artefact.path)!r})))
+        print(len(os.listdir("/proc/self/task")) - before)"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert done.stdout == "0\n"
 
 
 def test_truncated_missing_and_altered_files_are_refused(artefact):
