@@ -28,6 +28,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from many_recordings import write_recordings
 from many_samples import POSES, run_stage
@@ -161,12 +162,13 @@ def call(*command: str, home: Path, workers: int) -> None:
 
 def read_records(home: Path, axis: str, amount: int) -> list[Point]:
     """A point for each stage that ran in a home."""
-    records: dict[str, list[dict[str, float]]] = {}
+    records: dict[str, list[dict[str, Any]]] = {}
     for path in sorted(home.glob("artefacts/*/*/run.json")):
         record = json.loads(path.read_text())
-        name = record["stage"] if home.name == "home" else f"{record['stage']}, {path_kind(record)}"
-        if home.name == "home" or record["stage"] in IN_PROCESS:
-            records.setdefault(name, []).append(record)
+        if home.name == "home":
+            records.setdefault(record["stage"], []).append(record)
+        elif record["stage"] in IN_PROCESS:
+            records.setdefault(f"{record['stage']}, {plugin_of(record['arguments'])}", []).append(record)
     return [
         Point(
             axis,
@@ -180,10 +182,8 @@ def read_records(home: Path, axis: str, amount: int) -> list[Point]:
     ]
 
 
-def path_kind(record: Mapping[str, object]) -> str:
-    """The plug-in of a stage that was run apart."""
-    arguments = record["arguments"]
-    assert isinstance(arguments, dict)
+def plugin_of(arguments: Mapping[str, Any]) -> str:
+    """Of a stage that was run apart."""
     plugin = next(arguments[name]["plugin"] for name in ("condition", "sampling") if name in arguments)
     return str(plugin).split("/")[-1]
 

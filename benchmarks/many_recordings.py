@@ -113,8 +113,10 @@ def write_recordings(root: Path, count: int, num_events: int, num_contents: int,
     for place in ("extracted_train", "extracted_val"):
         for number in range(classes):
             (root / place / f"n{number:08d}").mkdir(parents=True)
+    per_class = count // classes
+    learnt_from = per_class - max(per_class // 10, 1)
     for number in range(count):
-        place = "extracted_val" if (number // classes + number % classes) % 10 == 9 else "extracted_train"
+        place = "extracted_val" if number // classes >= learnt_from else "extracted_train"
         folder = root / place / f"n{number % classes:08d}"
         copy, content = divmod(number, num_contents)
         if copy % 50_000 == 0 and copy:  # a file system allows so many links
