@@ -12,8 +12,8 @@ steps) and single stages of skeletons and bodies. What a stage took is read from
     side       px of the images, of 200 recordings
     workers    processes, of 2,000 recordings
 
-A slope is that of a line in the chart, between its last two points: 0 = the same time for any amount, 1 = in
-proportion.
+Times are those of the processor, which other programs hardly change, along `workers` those of the clock. A slope is that
+of a line in the chart, between its last two points: 0 = the same time for any amount, 1 = in proportion.
 """
 
 from __future__ import annotations
@@ -66,6 +66,11 @@ class Point:
     seconds: float
     cpu_seconds: float
     peak_mib: float
+
+    @property
+    def time(self) -> float:
+        """Seconds of the clock where workers share the work, else of the processor."""
+        return self.seconds if self.axis == "workers" else self.cpu_seconds
 
 
 def main() -> None:
@@ -197,7 +202,7 @@ def print_axis(points: Sequence[Point]) -> None:
     for point in points:
         by_stage.setdefault(point.stage, {})[point.amount] = point
     for stage, found in sorted(by_stage.items()):
-        seconds = "".join(f"{found[amount].seconds:10.2f}" if amount in found else " " * 10 for amount in amounts)
+        seconds = "".join(f"{found[amount].time:10.2f}" if amount in found else " " * 10 for amount in amounts)
         first, last = found[min(found)], found[max(found)]
         print(f"{stage:36}{seconds}{slope(found):>8}{first.peak_mib:8.0f}{last.peak_mib:8.0f}")
 
@@ -205,9 +210,9 @@ def print_axis(points: Sequence[Point]) -> None:
 def slope(found: Mapping[int, Point]) -> str:
     """Of the last two points in a chart of logarithms; nothing where a stage is too quick to tell."""
     *_, before, last = [None, *(found[amount] for amount in sorted(found))]
-    if before is None or last is None or last.seconds < QUICK_S:
+    if before is None or last is None or last.time < QUICK_S:
         return ""
-    return f"{math.log(last.seconds / before.seconds) / math.log(last.amount / before.amount):.2f}"
+    return f"{math.log(last.time / before.time) / math.log(last.amount / before.amount):.2f}"
 
 
 def draw(points: Sequence[Point], path: Path) -> None:
@@ -222,11 +227,11 @@ def draw(points: Sequence[Point], path: Path) -> None:
         for stage in stages:
             own = sorted((one for one in points if (one.axis, one.stage) == (axis, stage)), key=lambda one: one.amount)
             amounts, colour = [one.amount for one in own], colours[stage]
-            panels[0, column].loglog(amounts, [one.seconds for one in own], "o-", ms=3, color=colour, label=stage)
+            panels[0, column].loglog(amounts, [one.time for one in own], "o-", ms=3, color=colour, label=stage)
             panels[1, column].semilogx(amounts, [one.peak_mib for one in own], "o-", ms=3, color=colour)
         panels[0, column].set_title(axis)
         panels[1, column].set_ylim(bottom=0)
-    panels[0, 0].set_ylabel("seconds")
+    panels[0, 0].set_ylabel("seconds of a processor, along workers of the clock")
     panels[1, 0].set_ylabel("peak memory of the process, MiB")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=5, fontsize=7)

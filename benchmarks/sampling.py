@@ -32,12 +32,8 @@ from torch import Tensor
 from training import make_rows
 
 from ctlev_core.diffusion.denoising import Denoiser
-from ctlev_core.diffusion.pretrained.loading import (
-    PretrainedModel,
-    conditions_to_tensor,
-    encode_prompts,
-    load_base_model,
-)
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, conditions_to_tensor, load_base_model
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import make_scheduler, sample_frames
 from ctlev_core.diffusion.solver_studies.trajectory_precision import PRECISIONS

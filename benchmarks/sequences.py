@@ -27,7 +27,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from ctlev_core import plugins  # noqa: E402
-from ctlev_core.diffusion.pretrained.loading import PretrainedModel, conditions_to_tensor, encode_prompts  # noqa: E402
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, conditions_to_tensor  # noqa: E402
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts  # noqa: E402
 from ctlev_core.diffusion.sampling.options import SamplingOptions, noise_seeds  # noqa: E402
 from ctlev_core.diffusion.sampling.sampling import decode_frames, load_for_sampling, sample_latents  # noqa: E402
 from ctlev_core.pixel_decoder.decoder import open_decoder  # noqa: E402

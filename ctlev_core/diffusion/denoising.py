@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core.diffusion.pretrained.prompts import prompt_arguments
+
 
 @dataclass(frozen=True)
 class Emphasis:
@@ -35,7 +37,7 @@ class Batch:
 
     Attributes:
         latents: [B, C, h, w] clean latents, already multiplied by the scaling factor.
-        embeddings: [B, L, D] prompt embeddings.
+        embeddings: [B, L, D] prompt embeddings, as `encode_prompts` gives them.
         conditions: [K, 3, H, W] condition images in [0, 1] of the first K <= B rows, or None; the other rows go through
             the U-Net alone.
         num_frames: of each stretch, whose rows lie behind one another and are equally noisy; 1 = images.
@@ -59,13 +61,13 @@ class Denoiser:
     def predict(self, noisy: Tensor, timesteps: Tensor, embeddings: Tensor, conditions: Tensor | None) -> Tensor:
         """The U-Net's output [B, C, h, w]; rows beyond those of `conditions` get no residuals."""
         if self.controlnet is None or conditions is None or len(conditions) == 0:
-            return self.unet(noisy, timesteps, encoder_hidden_states=embeddings).sample
+            return self.unet(noisy, timesteps, **prompt_arguments(self.unet, embeddings)).sample
         steered, total = len(conditions), len(noisy)
         down, middle = self.controlnet(
             noisy[:steered],
             timesteps[:steered],
-            encoder_hidden_states=embeddings[:steered],
             controlnet_cond=conditions,
+            **prompt_arguments(self.unet, embeddings[:steered]),
             return_dict=False,
         )
 
@@ -75,7 +77,7 @@ class Denoiser:
         return self.unet(
             noisy,
             timesteps,
-            encoder_hidden_states=embeddings,
+            **prompt_arguments(self.unet, embeddings),
             down_block_additional_residuals=[padded(residual) for residual in down],
             mid_block_additional_residual=padded(middle),
         ).sample

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import NoiseSchedule
-from ctlev_core.diffusion.pretrained.loading import PretrainedModel, conditions_to_tensor, encode_prompts
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, conditions_to_tensor
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from ctlev_core.diffusion.sampling.partial_denoising import (

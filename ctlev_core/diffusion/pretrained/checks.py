@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,11 @@ CLASSES = {
     "controlnet": ("ControlNetModel",),
     "vae": ("AutoencoderKL", "PatchAutoencoder"),
     "text_encoder": ("CLIPTextModel",),
+    "text_encoder_2": ("CLIPTextModelWithProjection",),
 }
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
+NUM_SIZES = 6
+"""Sizes in px that Stable Diffusion XL takes beside a prompt."""
 BETA_SCHEDULES = ("linear", "scaled_linear", "squaredcos_cap_v2")
 """Those that every solver of diffusers knows."""
 _EXTRA_CHANNELS = {
@@ -26,23 +29,27 @@ _EXTRA_CHANNELS = {
     5: "a U-Net with depth maps",
 }
 _TEXT_WIDTHS = {768: "Stable Diffusion v1", 1024: "Stable Diffusion 2", 1280: "SDXL's refiner", 2048: "SDXL"}
-_COPIED = ("conv_in.", "time_embedding.", "down_blocks.", "mid_block.")
+_COPIED = ("conv_in.", "time_embedding.", "add_embedding.", "down_blocks.", "mid_block.")
 
 logger = logging.getLogger(__name__)
 
 
 def check_parts(files: ModelFiles) -> None:
-    """Raise unless U-Net, autoencoder, text encoder, tokenizer, schedule and ControlNet fit one another.
+    """Raise unless U-Net, autoencoder, text encoders, tokenizers, schedule and ControlNet fit one another.
 
     Raises:
         DataError: what does not fit, expected and got.
     """
     for part in files.parts.values():
         _check_class(part)
-    unet, vae, text = (files.parts[name] for name in ("unet", "vae", "text_encoder"))
+    unet, vae = (files.parts[name] for name in ("unet", "vae"))
+    texts = [files.parts[name] for name in ("text_encoder", "text_encoder_2") if name in files.parts]
     _check_latents(unet, vae)
-    _check_prompts(unet, text)
-    _check_tokenizer(files, text)
+    _check_pooled(unet, texts)
+    _check_prompts(unet, texts)
+    for text, tokenizer in zip(texts, (files.tokenizer, files.tokenizer_2), strict=False):
+        assert tokenizer is not None
+        _check_tokenizer(tokenizer, text)
     check_schedule(files)
     if "controlnet" in files.parts:
         _check_controlnet(files.parts["controlnet"], unet, vae)
@@ -54,8 +61,6 @@ def _check_class(part: ModelPart) -> None:
     if named is not None and named not in known:
         what = "autoencoder" if part.name == "vae" else part.name
         raise DataError(f"{part.place}: {what} must be one of {', '.join(known)}, got {named!r}")
-    if part.config.get("addition_embed_type") == "text_time":
-        raise DataError(f"{part.place}: expected Stable Diffusion v1, got the {part.name} of Stable Diffusion XL")
 
 
 def _shape(part: ModelPart, name: str) -> tuple[int, ...]:
@@ -95,14 +100,37 @@ def _check_latents(unet: ModelPart, vae: ModelPart) -> None:
         raise DataError(f"{unet.place}: sample_size in its config must be the side of square latents, got {side!r}")
 
 
-def _check_prompts(unet: ModelPart, text: ModelPart) -> None:
-    makes = _channels(text, "embeddings.token_embedding.weight", "hidden_size", 1)
+def _check_pooled(unet: ModelPart, texts: Sequence[ModelPart]) -> None:
+    """Whether a U-Net takes the pooled embedding of a second text encoder, as wide as that makes it."""
+    takes = unet.config.get("addition_embed_type")
+    if takes not in (None, "text", "text_time"):
+        raise DataError(f"{unet.place}: addition_embed_type must be null, text or text_time, got {takes!r}")
+    if (takes == "text_time") != (len(texts) == 2):
+        raise DataError(
+            f"{unet.place}: this U-Net is of Stable Diffusion XL, whose second text encoder (text_encoder_2) is missing"
+            if takes == "text_time"
+            else f"{unet.place}: this U-Net takes one text encoder, but there is a second, {texts[1].place}"
+        )
+    if takes != "text_time":
+        return
+    pooled, sizes = _shape(texts[1], "text_projection.weight")[0], NUM_SIZES * _entry(unet, "addition_time_embed_dim")
+    wanted = _channels(unet, "add_embedding.linear_1.weight", "projection_class_embeddings_input_dim", 1) - sizes
+    if pooled != wanted:
+        raise DataError(
+            f"{unet.place}: the U-Net takes pooled embeddings {wanted} wide, the text encoder of "
+            f"{texts[1].place} makes {pooled}"
+        )
+
+
+def _check_prompts(unet: ModelPart, texts: Sequence[ModelPart]) -> None:
+    makes = sum(_channels(text, "embeddings.token_embedding.weight", "hidden_size", 1) for text in texts)
     for part_name, tensor in unet.tensors.items():
         if part_name.endswith(".attn2.to_k.weight") and tensor.shape[-1] != makes:
             takes = tensor.shape[-1]
             raise DataError(
                 f"{unet.place}: the U-Net takes prompt embeddings {takes} wide"
-                f"{_known_width(takes)}, the text encoder of {text.place} makes {makes}{_known_width(makes)}"
+                f"{_known_width(takes)}, the text encoder of {' and '.join(str(text.place) for text in texts)} makes "
+                f"{makes}{_known_width(makes)}"
             )
 
 
@@ -110,8 +138,7 @@ def _known_width(width: int) -> str:
     return f" ({_TEXT_WIDTHS[width]})" if width in _TEXT_WIDTHS else ""
 
 
-def _check_tokenizer(files: ModelFiles, text: ModelPart) -> None:
-    folder = files.tokenizer
+def _check_tokenizer(folder: Path, text: ModelPart) -> None:
     whole, vocabulary = folder / "tokenizer.json", folder / "vocab.json"
     if vocabulary.is_file() and (folder / "merges.txt").is_file():
         ids = read_json(vocabulary).values()

@@ -11,6 +11,8 @@ from typing import Any
 from ctlev_core.safe_files.tensor_files import StoredTensor, read_tensor_table
 from data_contracts.errors import DataError
 
+ZERO_EMPTY_PROMPT = "force_zeros_for_empty_prompt"
+"""Entry of `model_index.json` of Stable Diffusion XL."""
 _STEMS = ("diffusion_pytorch_model", "model", "pytorch_model")
 _OLD_ATTENTION = {".query.": ".to_q.", ".key.": ".to_k.", ".value.": ".to_v.", ".proj_attn.": ".to_out.0."}
 
@@ -20,7 +22,7 @@ class ModelPart:
     """One network of a base model.
 
     Attributes:
-        name: `unet`, `vae`, `text_encoder` or `controlnet`.
+        name: `unet`, `vae`, `text_encoder`, `text_encoder_2` or `controlnet`.
         place: the folder or file it comes from.
         config: as in diffusers' or transformers' `config.json`.
         tensors: where its weights are, by their names in diffusers or transformers.
@@ -38,15 +40,19 @@ class ModelFiles:
 
     Attributes:
         place: the folder or file that was asked for.
-        parts: `text_encoder`, `vae`, `unet`, and `controlnet` where there is one.
+        parts: `text_encoder`, `vae`, `unet`, and `text_encoder_2` and `controlnet` where there is one.
         tokenizer: folder of the tokenizer.
         scheduler_config: the noise schedule the base model was trained with.
+        tokenizer_2: folder of the tokenizer of `text_encoder_2`.
+        zero_empty_prompt: what `model_index.json` calls `force_zeros_for_empty_prompt`.
     """
 
     place: Path
     parts: dict[str, ModelPart]
     tokenizer: Path
     scheduler_config: dict[str, Any]
+    tokenizer_2: Path | None = None
+    zero_empty_prompt: bool = False
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -1,5 +1,5 @@
-"""Load pre-trained weights: any local diffusers folder or Stable Diffusion v1 file, or the bundled small base model
-alike.
+"""Load pre-trained weights: a local diffusers folder of Stable Diffusion v1, 2 or XL, a Stable Diffusion v1 file, or
+the bundled small base model alike.
 
 Nothing is downloaded, and no pickle is run: `docs/weights.md` says what is read and what is checked.
 """
@@ -21,7 +21,7 @@ import torch
 from ctlev_core.diffusion.motion_layers import MotionLayers
 from ctlev_core.diffusion.pretrained.adapters import check_base_model, is_adapter, merge_adapter, read_adapter
 from ctlev_core.diffusion.pretrained.checks import complete_schedule
-from ctlev_core.diffusion.pretrained.components import read_json
+from ctlev_core.diffusion.pretrained.components import ZERO_EMPTY_PROMPT, read_json
 from ctlev_core.diffusion.pretrained.model_building import build_model
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, read_base_model_files, read_parts
 from ctlev_core.processes import use_cores_for
@@ -29,9 +29,6 @@ from data_contracts.errors import DataError
 
 LIBRARIES = ("diffusers", "transformers")
 logger = logging.getLogger(__name__)
-
-PROMPT_BATCH = 128
-"""Prompts that go through the text encoder at once: 3 MB each with Stable Diffusion's, and there may be thousands."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +46,9 @@ class PretrainedModel:
         value_table: [256, 256], how values are drawn about those the networks expect; None = they are taken as they
             are.
         motion: layers that make consecutive frames from one another; None = each frame is made by itself.
+        tokenizer_2: of Stable Diffusion XL, as `tokenizer` for `text_encoder_2`; None = there is one text encoder.
+        text_encoder_2: token ids to prompt embeddings and a pooled one.
+        zero_empty_prompt: the empty prompt, of guidance, is zeros; else its embedding.
     """
 
     tokenizer: Any
@@ -60,6 +60,9 @@ class PretrainedModel:
     image_size: tuple[int, int]
     value_table: Any | None = None
     motion: MotionLayers | None = None
+    tokenizer_2: Any | None = None
+    text_encoder_2: Any | None = None
+    zero_empty_prompt: bool = False
 
     @property
     def scaling_factor(self) -> float:
@@ -111,6 +114,10 @@ def load_base_model(
     _use_cores_for(*models.values())
     unet, vae = models["unet"], models["vae"]
     side = unet.config.sample_size * 2 ** (len(vae.config.block_out_channels) - 1)
+    second = models.get("text_encoder_2")
+    tokenizer_2 = None
+    if second is not None and files.tokenizer_2 is not None:
+        tokenizer_2 = _load_tokenizer(files.tokenizer_2, second.config.max_position_embeddings)
     return PretrainedModel(
         tokenizer=_load_tokenizer(files.tokenizer, models["text_encoder"].config.max_position_embeddings),
         text_encoder=models["text_encoder"],
@@ -119,6 +126,9 @@ def load_base_model(
         controlnet=models.get("controlnet"),
         scheduler_config=complete_schedule(files),
         image_size=(side, side),
+        tokenizer_2=tokenizer_2,
+        text_encoder_2=second,
+        zero_empty_prompt=files.zero_empty_prompt,
     )
 
 
@@ -185,18 +195,22 @@ def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtyp
         library = source.stem
     scheduler.save_pretrained(folder / "scheduler")
     base_model.tokenizer.save_pretrained(folder / "tokenizer")
+    kind = "StableDiffusion" if base_model.text_encoder_2 is None else "StableDiffusionXL"
     index: dict[str, Any] = {
-        "_class_name": "StableDiffusionPipeline"
-        if base_model.controlnet is None
-        else "StableDiffusionControlNetPipeline",
+        "_class_name": f"{kind}Pipeline" if base_model.controlnet is None else f"{kind}ControlNetPipeline",
         "scheduler": ["diffusers", type(scheduler).__name__],
         "tokenizer": ["transformers", "CLIPTokenizer"],
         "vae": [library, type(base_model.vae).__name__],
-        "safety_checker": [None, None],
-        "feature_extractor": [None, None],
-        "requires_safety_checker": False,
     }
-    for name in ("text_encoder", "unet", "controlnet"):
+    if base_model.tokenizer_2 is None:
+        index |= {"safety_checker": [None, None], "feature_extractor": [None, None], "requires_safety_checker": False}
+    else:
+        base_model.tokenizer_2.save_pretrained(folder / "tokenizer_2")
+        index |= {
+            "tokenizer_2": ["transformers", "CLIPTokenizer"],
+            ZERO_EMPTY_PROMPT: base_model.zero_empty_prompt,
+        }
+    for name in ("text_encoder", "text_encoder_2", "unet", "controlnet"):
         model = getattr(base_model, name)
         if model is None:
             continue
@@ -218,22 +232,6 @@ def _library(model: Any) -> str:
     module = type(model).__module__
     top = module.split(".", 1)[0]
     return top if top in LIBRARIES else module
-
-
-def encode_prompts(base_model: PretrainedModel, prompts: list[str]) -> torch.Tensor:
-    """Prompt embeddings [N, L, D]; L is the length every prompt is padded or cut to. A cut prompt is logged."""
-    limit = base_model.tokenizer.model_max_length
-    tokens = base_model.tokenizer(
-        prompts, padding="max_length", max_length=limit, truncation=True, return_tensors="pt", verbose=False
-    )
-    for row in tokens.attention_mask.all(dim=1).nonzero().flatten().tolist():  # no padding: perhaps it did not fit
-        length = len(base_model.tokenizer(prompts[row], verbose=False).input_ids)
-        if length > limit:
-            logger.warning("prompt of %d tokens is cut to %d, its end is not heeded: %r", length, limit, prompts[row])
-    with torch.no_grad():
-        device = base_model.text_encoder.device
-        parts = [base_model.text_encoder(ids.to(device))[0] for ids in tokens.input_ids.split(PROMPT_BATCH)]
-    return torch.cat(parts)
 
 
 def encode_posterior(vae: Any, images: Any) -> tuple[torch.Tensor, torch.Tensor | None]:

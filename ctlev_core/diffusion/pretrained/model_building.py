@@ -56,10 +56,11 @@ def _make_model(part: ModelPart) -> Any:
 
     from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 
-    if part.name == "text_encoder":
-        from transformers import CLIPTextConfig, CLIPTextModel
+    if part.name in ("text_encoder", "text_encoder_2"):
+        from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
-        return CLIPTextModel(CLIPTextConfig.from_dict(part.config))
+        encoder = CLIPTextModel if part.name == "text_encoder" else CLIPTextModelWithProjection
+        return encoder(CLIPTextConfig.from_dict(part.config))
     classes: dict[str, Any] = {
         "unet": UNet2DConditionModel,
         "controlnet": ControlNetModel,

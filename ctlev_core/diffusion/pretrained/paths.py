@@ -6,7 +6,13 @@ import dataclasses
 from pathlib import Path
 
 from ctlev_core.diffusion.pretrained.checks import check_parts
-from ctlev_core.diffusion.pretrained.components import ModelFiles, ModelPart, read_json, read_part
+from ctlev_core.diffusion.pretrained.components import (
+    ZERO_EMPTY_PROMPT,
+    ModelFiles,
+    ModelPart,
+    read_json,
+    read_part,
+)
 from ctlev_core.diffusion.pretrained.single_file import (
     ENDINGS,
     files_beside,
@@ -149,8 +155,20 @@ def _read_folder(folder: Path) -> ModelFiles:
             f"{folder}: a diffusers folder has the subfolders {', '.join(COMPONENTS)}; "
             f"missing: {', '.join(missing)}; found: {', '.join(found) or 'none'}"
         )
-    if (folder / "text_encoder_2").is_dir():
-        raise DataError(f"{folder}: expected Stable Diffusion v1, got Stable Diffusion XL (it has text_encoder_2)")
-    parts = {name: read_part(name, folder / name) for name in ("text_encoder", "vae", "unet")}
-    schedule = read_json(folder / "scheduler" / "scheduler_config.json")
-    return ModelFiles(folder, parts, folder / "tokenizer", schedule)
+    if (folder / "text_encoder_3").is_dir():
+        raise DataError(f"{folder}: expected Stable Diffusion v1, 2 or XL, got Stable Diffusion 3 (text_encoder_3)")
+    names, is_xl = ["text_encoder", "vae", "unet"], (folder / "text_encoder_2").is_dir()
+    if is_xl:
+        names.append("text_encoder_2")
+        if not (folder / "tokenizer_2").is_dir():
+            raise DataError(f"{folder}: it has text_encoder_2, as Stable Diffusion XL; its tokenizer_2 is missing")
+    index = folder / "model_index.json"
+    told = read_json(index) if is_xl and index.is_file() else {}
+    return ModelFiles(
+        place=folder,
+        parts={name: read_part(name, folder / name) for name in names},
+        tokenizer=folder / "tokenizer",
+        scheduler_config=read_json(folder / "scheduler" / "scheduler_config.json"),
+        tokenizer_2=folder / "tokenizer_2" if is_xl else None,
+        zero_empty_prompt=bool(told.get(ZERO_EMPTY_PROMPT, is_xl)),
+    )

@@ -24,12 +24,12 @@ from ctlev_core.diffusion.patch_autoencoder import PATCH_PX, PatchAutoencoder, f
 from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
     conditions_to_tensor,
-    encode_prompts,
     images_to_tensor,
     load_base_model,
     save_base_model,
 )
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.pretraining import procedural_images
 from ctlev_core.diffusion.pretraining.architecture import IMAGE_SIZE, WIDTHS, PredictionType, build_base_model
 from ctlev_core.diffusion.pretraining.picture_scenes import picture_mixture, scene_of

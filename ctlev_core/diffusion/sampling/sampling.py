@@ -32,9 +32,9 @@ from ctlev_core.diffusion.pretrained.loading import (
     choose_device,
     conditions_to_tensor,
     decode_latents,
-    encode_prompts,
     load_base_model,
 )
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling.controlnet_reuse import EveryKthStep
 from ctlev_core.diffusion.sampling.controlnet_reuse import cached_condition_embedding as cached_condition_embedding
 from ctlev_core.diffusion.sampling.devices import device_names, run_on_devices, spread_over_cores

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctlev_core.diffusion.denoising import NoiseSchedule, generator_for
+from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, generator_for
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, decode_latents
 from data_contracts.errors import DataError
 
@@ -144,9 +144,8 @@ def _expected(
     timesteps = torch.full((len(latents),), timestep)
     noise = torch.randn(latents.shape, generator=generator_for(*entropy))
     noisy, _ = schedule.noised(latents, noise, timesteps)
-    predicted = base_model.unet(
-        noisy.to(device), timesteps.to(device), encoder_hidden_states=embeddings.to(device)
-    ).sample.float()
+    denoiser = Denoiser(base_model.unet)
+    predicted = denoiser.predict(noisy.to(device), timesteps.to(device), embeddings.to(device), None).float()
     clean = schedule.clean_of(predicted, noisy.to(device), timesteps.to(device))
     values = (decode_latents(base_model, clean) + 1) * 127.5
     return values.clamp(0, 255).round().long().permute(0, 2, 3, 1).cpu().numpy()

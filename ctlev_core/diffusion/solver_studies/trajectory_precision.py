@@ -20,9 +20,9 @@ from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
     choose_device,
     conditions_to_tensor,
-    encode_prompts,
     load_base_model,
 )
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import cached_condition_embedding
 from ctlev_core.diffusion.sampling.schedulers import make_scheduler

@@ -32,10 +32,10 @@ from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
     choose_device,
     conditions_to_tensor,
-    encode_prompts,
     load_base_model,
     save_base_model,
 )
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts, put_text_encoders_aside
 from ctlev_core.diffusion.sampling.options import OF_STUDENTS, SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import guided_predictions
 from ctlev_core.diffusion.sampling.schedulers import make_scheduler, student_config, trajectory_scheduler
@@ -287,7 +287,7 @@ def _embeddings(teacher: PretrainedModel, conditions: Conditions) -> tuple[Tenso
     """Embeddings [P + 1, L, D] of the distinct prompts and, last, of the empty one; and the row of each prompt."""
     prompts = sorted(set(conditions.prompts))
     table = encode_prompts(teacher, [*prompts, ""]).float().cpu()
-    teacher.text_encoder.to("cpu")
+    put_text_encoders_aside(teacher)
     return table, {prompt: row for row, prompt in enumerate(prompts)}
 
 

@@ -19,7 +19,8 @@ import torch
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
 from ctlev_core.diffusion.pretrained.fit import check_channel_order
-from ctlev_core.diffusion.pretrained.loading import PretrainedModel, encode_prompts
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts, put_text_encoders_aside
 from ctlev_core.diffusion.pretraining.architecture import break_zeros
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
 from ctlev_core.diffusion.sampling.options import SamplingOptions
@@ -131,7 +132,7 @@ def fine_tune(
         distributed=distributed,
     )
     check_cache(cache, conditions, latents_are_checked=latents is not None)
-    base_model.text_encoder.to("cpu")
+    put_text_encoders_aside(base_model)
     num_pictures = round(options.batch_size * options.rehearsal_share)
     rehearsal = Rehearsal(options.rehearsal, base_model.image_size[0]) if num_pictures else None
 

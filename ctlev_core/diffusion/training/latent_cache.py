@@ -12,12 +12,8 @@ from torch import Tensor
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.denoising import Batch
-from ctlev_core.diffusion.pretrained.loading import (
-    PretrainedModel,
-    conditions_to_tensor,
-    encode_posterior,
-    encode_prompts,
-)
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, conditions_to_tensor, encode_posterior
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.latent_files import Latents, check_latents, latents_in_memory, latents_of_run
 from ctlev_core.plugin_contracts import ConditionThatTurns

@@ -20,6 +20,7 @@ from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, gener
 from ctlev_core.diffusion.motion_files import MotionSettings
 from ctlev_core.diffusion.motion_layers import MotionLayers, new_adapter, save_motion_layers
 from ctlev_core.diffusion.pretrained.loading import choose_device, load_base_model
+from ctlev_core.diffusion.pretrained.prompts import put_text_encoders_aside
 from ctlev_core.diffusion.training.latent_cache import cache_latents, check_cache, check_training_data
 from ctlev_core.diffusion.training.loop import run_training, sample_rows
 from ctlev_core.diffusion.training.options import MotionOptions
@@ -72,7 +73,7 @@ def train_motion_layers(
     layers = MotionLayers(base_model.unet, adapter, MotionSettings(options.context, interval_us, options.shared_noise))
     cache = cache_latents(base_model, frames, conditions, folder=work)
     check_cache(cache, conditions)
-    base_model.text_encoder.to("cpu")
+    put_text_encoders_aside(base_model)
     order = np.random.default_rng([seed, SPLIT_STREAM]).permutation(len(firsts))
     num_held_back = min(options.num_validation, len(firsts) // 10)
     held_back = np.array([firsts[number][0] for number in order[:num_held_back]], np.int64)

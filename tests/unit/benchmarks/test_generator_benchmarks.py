@@ -13,11 +13,11 @@ from tiny_base_model import make_base_model, make_data
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule
 from ctlev_core.diffusion.pretrained.loading import (
     conditions_to_tensor,
-    encode_prompts,
     images_to_tensor,
     load_base_model,
     save_base_model,
 )
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_latents
 from data_contracts.labels import Conditions

@@ -14,8 +14,9 @@ from diffusers.pipelines.stable_diffusion.pipeline_stable_diffusion import Stabl
 from tiny_base_model import SIDE, make_base_model, shared_base_model
 from tiny_stable_diffusion import make_models, tiny_changes, write_folder
 
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_base_model, save_base_model
+from ctlev_core.diffusion.pretrained.loading import load_base_model, save_base_model
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, check_base_model_folder
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from data_contracts.errors import DataError
 
 

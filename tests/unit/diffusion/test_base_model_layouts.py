@@ -12,14 +12,9 @@ from safetensors.torch import load_file, save_file
 from tiny_stable_diffusion import CHANGES, make_models, tiny_changes, write_folder
 
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
-from ctlev_core.diffusion.pretrained.loading import (
-    PretrainedModel,
-    decode_latents,
-    encode_prompts,
-    load_base_model,
-    save_base_model,
-)
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, decode_latents, load_base_model, save_base_model
 from ctlev_core.diffusion.pretrained.paths import base_model_places, check_base_model_folder
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.generators import controlnet, stable_diffusion
 from data_contracts.config import GeneratorChoice
 from data_contracts.errors import DataError
@@ -303,11 +298,12 @@ def test_text_encoder_of_stable_diffusion_2(folder):
     refused(folder, r"takes prompt embeddings 12 wide, the text encoder .* makes 1024 \(Stable Diffusion 2\)")
 
 
-def test_stable_diffusion_xl(folder):
+def test_parts_of_stable_diffusion_xl(folder):
+    """Whole models of it: test_base_model_families.py."""
     change_json(folder / "unet" / "config.json", addition_embed_type="text_time")
-    refused(folder, "unet: expected Stable Diffusion v1, got the unet of Stable Diffusion XL")
+    refused(folder, r"unet: this U-Net is of Stable Diffusion XL, whose second text encoder .* is missing")
     (folder / "text_encoder_2").mkdir()
-    refused(folder, r"got Stable Diffusion XL \(it has text_encoder_2\)")
+    refused(folder, "it has text_encoder_2, as Stable Diffusion XL; its tokenizer_2 is missing")
 
 
 def test_other_classes(folder):

@@ -8,7 +8,7 @@ import torch
 from tiny_base_model import make_data, shared_base_model
 
 from ctlev_core.diffusion.denoising import NoiseSchedule
-from ctlev_core.diffusion.pretrained.loading import encode_prompts
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.partial_denoising import denoise, denoising_times, encode_frames, noise_to
 from ctlev_core.diffusion.sampling.sampling import guided_predictions

@@ -9,7 +9,7 @@ from scipy.fft import dctn
 
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder, fit_patch_autoencoder, patch_basis
-from ctlev_core.diffusion.pretrained.loading import encode_prompts
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.pretraining.architecture import build_base_model
 
 

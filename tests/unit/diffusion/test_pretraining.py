@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from ctlev_core.body.motion.procedural import HELD_OUT
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_base_model
+from ctlev_core.diffusion.pretrained.loading import load_base_model
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.pretraining import picture_styles, pretraining, procedural_images
 from ctlev_core.diffusion.pretraining.architecture import WORD_GAIN, learn_merges, train_tokenizer
 from ctlev_core.diffusion.pretraining.picture_styles import DataMixture

@@ -30,8 +30,9 @@ from tiny_stable_diffusion import (
 from transformers import CLIPTextModel
 
 from ctlev_core.diffusion.pretrained import single_file
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, load_base_model, save_base_model
+from ctlev_core.diffusion.pretrained.loading import load_base_model, save_base_model
 from ctlev_core.diffusion.pretrained.paths import base_model_places, check_base_model_folder
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from data_contracts.errors import DataError
 
 STABLE_DIFFUSION_V1 = {"unet": 859_520_964, "controlnet": 361_279_120, "vae": 83_653_863, "text_encoder": 123_060_480}

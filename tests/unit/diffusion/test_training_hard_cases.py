@@ -12,7 +12,8 @@ from tiny_base_model import CORPUS, make_base_model, make_data, shared_base_mode
 
 from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.pretrained.fit import check_channel_order
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, save_base_model
+from ctlev_core.diffusion.pretrained.loading import save_base_model
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.training import latent_files, trainer
@@ -272,7 +273,7 @@ def test_many_prompts_are_embedded_some_at_a_time(monkeypatch):
     base_model, taken = make_base_model(), []
     prompts = [f"a photo of a {word}" for word in ("cup", "ball", "human", "moving")]
     whole = encode_prompts(base_model, prompts)
-    monkeypatch.setattr("ctlev_core.diffusion.pretrained.loading.PROMPT_BATCH", 3)
+    monkeypatch.setattr("ctlev_core.diffusion.pretrained.prompts.PROMPT_BATCH", 3)
     base_model.text_encoder.register_forward_pre_hook(lambda module, inputs: taken.append(len(inputs[0])))
     torch.testing.assert_close(encode_prompts(base_model, prompts), whole)
     assert taken == [3, 1]

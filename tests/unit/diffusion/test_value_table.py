@@ -7,7 +7,8 @@ import pytest
 import torch
 from tiny_base_model import SIDE, make_base_model, make_data
 
-from ctlev_core.diffusion.pretrained.loading import encode_prompts, images_to_tensor, save_base_model
+from ctlev_core.diffusion.pretrained.loading import images_to_tensor, save_base_model
+from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling import value_table
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_checkpoint

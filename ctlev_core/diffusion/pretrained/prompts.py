@@ -1,0 +1,99 @@
+"""Prompts as U-Nets and ControlNets take them.
+
+Stable Diffusion v1 and 2 take the last layer of a text encoder, [L, D] for a prompt. Stable Diffusion XL takes the last
+layer but one of two text encoders side by side, the pooled embedding of the second, and six sizes in px. The latter
+follow the L rows here, in rows of the same width filled up with zeros: what is cached, drawn and moved is one tensor
+for every base model.
+
+Source: Podell et al., SDXL, 2023, sections 2.1 and 2.2; diffusers' `StableDiffusionXLPipeline`. Sizes are those of the
+images, which are never cropped: the original and the target size are the same.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ctlev_core.diffusion.pretrained.checks import NUM_SIZES
+
+if TYPE_CHECKING:
+    from ctlev_core.diffusion.pretrained.loading import PretrainedModel
+
+PROMPT_BATCH = 128
+"""Prompts that go through a text encoder at once: 3 MB each with Stable Diffusion's, and there may be thousands."""
+logger = logging.getLogger(__name__)
+
+
+def takes_pooled(config: Any) -> bool:
+    """Does a U-Net or ControlNet of that config take a pooled embedding and sizes?"""
+    return config.get("addition_embed_type") == "text_time"
+
+
+def encode_prompts(base_model: PretrainedModel, prompts: list[str]) -> Tensor:
+    """Prompt embeddings [N, L, D], of Stable Diffusion XL [N, L + R, D]; see the head of this file.
+
+    L is the length every prompt is padded or cut to. A cut prompt is logged.
+    """
+    limit = base_model.tokenizer.model_max_length
+    if base_model.text_encoder_2 is None or base_model.tokenizer_2 is None:
+        return _encode(base_model.tokenizer, base_model.text_encoder, prompts, limit)[0]
+    limit = min(limit, base_model.tokenizer_2.model_max_length)
+    first, _ = _encode(base_model.tokenizer, base_model.text_encoder, prompts, limit, last_but_one=True)
+    second, pooled = _encode(base_model.tokenizer_2, base_model.text_encoder_2, prompts, limit, last_but_one=True)
+    hidden = torch.cat([first, second], dim=-1)
+    if base_model.zero_empty_prompt:
+        said = torch.tensor([bool(prompt) for prompt in prompts], device=hidden.device)
+        hidden, pooled = hidden * said[:, None, None], pooled * said[:, None]
+    width, height = base_model.image_size
+    sizes = torch.tensor([height, width, 0, 0, height, width]).to(pooled).expand(len(prompts), -1)
+    further = torch.cat([pooled, sizes], dim=-1)
+    further = torch.nn.functional.pad(further, (0, -further.shape[-1] % hidden.shape[-1]))
+    return torch.cat([hidden, further.view(len(prompts), -1, hidden.shape[-1])], dim=1)
+
+
+def prompt_arguments(network: Any, embeddings: Tensor) -> dict[str, Any]:
+    """What a U-Net, or a ControlNet of it, is called with for embeddings of `encode_prompts`.
+
+    Args:
+        network: the U-Net.
+        embeddings: [B, L, D], of Stable Diffusion XL [B, L + R, D].
+    """
+    config = getattr(network, "config", None)
+    if config is None or not takes_pooled(config):
+        return {"encoder_hidden_states": embeddings}
+    width = config["projection_class_embeddings_input_dim"] - NUM_SIZES * config["addition_time_embed_dim"]
+    rows = -(-(width + NUM_SIZES) // embeddings.shape[-1])
+    pooled, sizes = embeddings[:, -rows:].flatten(1)[:, : width + NUM_SIZES].split([width, NUM_SIZES], dim=1)
+    return {
+        "encoder_hidden_states": embeddings[:, :-rows],
+        "added_cond_kwargs": {"text_embeds": pooled, "time_ids": sizes},
+    }
+
+
+def put_text_encoders_aside(base_model: PretrainedModel) -> None:
+    """To the memory of the CPU: prompts are embedded, and the networks need the card's."""
+    for encoder in filter(None, (base_model.text_encoder, base_model.text_encoder_2)):
+        encoder.to("cpu")
+
+
+@torch.no_grad()
+def _encode(
+    tokenizer: Any, encoder: Any, prompts: list[str], limit: int, *, last_but_one: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Embeddings [N, L, D] of a text encoder's last layer, or that before it, and what else it says first."""
+    tokens = tokenizer(
+        prompts, padding="max_length", max_length=limit, truncation=True, return_tensors="pt", verbose=False
+    )
+    for row in tokens.attention_mask.all(dim=1).nonzero().flatten().tolist():  # no padding: perhaps it did not fit
+        length = len(tokenizer(prompts[row], verbose=False).input_ids)
+        if length > limit:
+            logger.warning("prompt of %d tokens is cut to %d, its end is not heeded: %r", length, limit, prompts[row])
+    hidden, firsts = [], []
+    for ids in tokens.input_ids.split(PROMPT_BATCH):
+        made = encoder(ids.to(encoder.device), output_hidden_states=last_but_one)
+        firsts.append(made[0])
+        hidden.append(made.hidden_states[-2] if last_but_one else made[0])
+    return torch.cat(hidden), torch.cat(firsts)
