@@ -12,8 +12,8 @@ steps) and single stages of skeletons and bodies. What a stage took is read from
     side       px of the images, of 200 recordings
     workers    processes, of 2,000 recordings
 
-Times are those of the processor, which other programs hardly change, along `workers` those of the clock. A slope is that
-of a line in the chart, between its last two points: 0 = the same time for any amount, 1 = in proportion.
+Times are those of the processor, which other programs hardly change, along `workers` those of the clock. A slope is
+that of a line in the chart, between its last two points: 0 = the same time for any amount, 1 = in proportion.
 """
 
 from __future__ import annotations
