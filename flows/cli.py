@@ -304,6 +304,33 @@ def simulate(
     raise typer.Exit(simulate_file(source, output, frames, options))
 
 
+@app.command(rich_help_panel=PARTS)
+def record(
+    folder: Annotated[Path, typer.Argument(help="folder to make", show_default=False)],
+    recordings: Annotated[int, typer.Option(min=1, help="how many")] = 10,
+    split: Annotated[
+        str, typer.Option(help="whose people and motions: train, test, validation, or condition, everybody another")
+    ] = "condition",
+    rate: Annotated[float, typer.Option(help="labelled moments a second")] = 100.0,
+    suffix: Annotated[str, typer.Option(help="of the files of events: .parquet, .h5, .raw, ...")] = ".parquet",
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="an option of the studio: ctlev options studio"),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace what is there")] = False,
+) -> None:
+    """Simulate recordings of people with depth, optical flow, masks, boxes and joints."""
+    from flows.record import COUNTS, record_people
+
+    if split not in COUNTS:
+        raise typer.BadParameter(f"must be one of {', '.join(COUNTS)}, got {split!r}", param_hint="--split")
+    raise typer.Exit(
+        record_people(
+            folder, recordings, overrides or (), split=split, rate_hz=rate, suffix=suffix, overwrite=overwrite
+        )
+    )
+
+
 @app.command(rich_help_panel=STORE)
 def compare(run_a: Run, run_b: Run, home: Home = None) -> None:
     """Say what differs between two finished experiments: options, data, code and scores."""

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MOTIONS_OF_SPLIT", "SPLIT_NAMES", "VERSION", "Options", "list_recordings", "read_events", "read_intensity_frames",
-    "read_labels",
+    "read_labels", "read_scene",
 ]  # fmt: skip
 
 VERSION = 3
@@ -129,9 +129,13 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     return check_labels(seen, recording.recording_id)
 
 
-def read_events(recording: Recording, options: Options) -> Events:
+def read_events(recording: Recording, options: Options, *, marks: bool = False) -> Events:
     """Record the recording, as densely in time as its motion asks for, and send it through the sensor.
 
+    Args:
+        recording: which.
+        options: of the studio.
+        marks: whether events are marked as signal or noise (`Events.signal`).
     Raises:
         DataError: the recording is not one of the studio with these options, carries labels only, or has more than
             `max_events`.
@@ -142,7 +146,7 @@ def read_events(recording: Recording, options: Options) -> Events:
     if not recording.has_events:
         raise DataError(f"studio recording {recording.recording_id!r} has no events")
     *entropy, camera = _entropy(recording, options)
-    record = _record(recording, options)
+    record = read_scene(recording, options)
     sensor = int(np.random.default_rng([*entropy, camera, SENSOR_STREAM]).integers(options.num_sensors))
     try:
         events, _ = simulate_rendered(
@@ -156,6 +160,7 @@ def read_events(recording: Recording, options: Options) -> Events:
             speed_bound=record.speed_bound,
             background=record.background,
             max_events=options.max_events,
+            marks=marks,
         )
     except EventBudgetError as error:
         raise EventBudgetError(f"studio recording {recording.recording_id!r}: {error}", error.events) from None
@@ -171,7 +176,7 @@ def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:
     if options.intensity_rate_hz is None:
         raise DataError(f"studio recording {recording.recording_id!r} has no pictures without intensity_rate_hz")
     t_us = _times_us(options.intensity_rate_hz, options)
-    frames = _record(recording, options).render_frames(1e-6 * t_us)
+    frames = read_scene(recording, options).render_frames(1e-6 * t_us)
     return ImageTrack(np.rint(255.0 * frames).astype(np.uint8), t_us)
 
 
@@ -226,8 +231,12 @@ def _subject(recording: Recording, entropy: list[int], options: Options) -> Subj
     return sample_subject(np.random.default_rng([options.seed, SUBJECT_STREAM, *number]), colour=False)
 
 
-def _record(recording: Recording, options: Options) -> MovingBody:
-    """The person in motion, under a light and before a wall drawn at random."""
+def read_scene(recording: Recording, options: Options) -> MovingBody:
+    """The person in motion, under a light and before a wall drawn at random.
+
+    Raises:
+        DataError: the recording is not one of the studio with these options.
+    """
     from ctlev_core.body.motion.procedural import pose_at
     from ctlev_core.studio.moving_body import MovingBody
     from ctlev_core.studio.scene import sample_background, sample_light

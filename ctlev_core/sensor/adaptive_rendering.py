@@ -68,6 +68,7 @@ def simulate_rendered(
     speed_bound: SpeedBound | None = None,
     background: np.ndarray | None = None,
     max_events: int | None = None,
+    marks: bool = False,
 ) -> tuple[Events, np.ndarray]:
     """The events of a rendered scene, and the times at which it was rendered.
 
@@ -85,6 +86,7 @@ def simulate_rendered(
         speed_bound: how fast anything moves; without it pictures are compared instead.
         background: [H, W] what there is around a `Patch`; needed where `render` returns one.
         max_events: budget; None = as many as there are.
+        marks: whether events are marked as signal or noise (`Events.signal`).
     Returns:
         Events, and [F] int64, us: when frames were rendered, in ascending order.
     Raises:
@@ -105,7 +107,7 @@ def simulate_rendered(
     for time_us, frame in frames:
         size = (frame.shape[1], frame.shape[0])
         # The budget is counted here: a sensor with one keeps a copy of its state for every portion of frames.
-        sensor = sensor or Sensor(size, sensor_options, sensor_seed=sensor_seed, seed=seed)
+        sensor = sensor or Sensor(size, sensor_options, sensor_seed=sensor_seed, seed=seed, marks=marks)
         chunks.append(sensor.push(frame[None], np.array([time_us])))
         if max_events is not None and sensor.num_events > max_events:
             message = f"rendering: more than max_events = {max_events} events by t = {time_us} us of {stop_us} us"

@@ -20,6 +20,8 @@ from ctlev_core.studio.motion_bound import (
 from ctlev_core.studio.scene import BodyPainter, Camera, Light, Subject
 from data_contracts.errors import DataError
 
+VELOCITY_STEP_S = 5e-4
+"""Before and after a moment, for velocities: a tenth of the time between the studio's key poses."""
 SEGMENTS_AT_ONCE = 64
 """So many are posed together: 6 MB of vertices."""
 
@@ -121,6 +123,35 @@ class MovingBody:
         fraction = np.clip((times_s - self.t_s[key]) / (self.t_s[key + 1] - self.t_s[key]), 0.0, 1.0)[:, None]
         rotations = self._rotations[key] @ matrix_from_axis_angle(fraction[..., None] * self._turns[key])
         return rotations, self._transl[key] + fraction * (self._transl[key + 1] - self._transl[key])
+
+    @property
+    def camera(self) -> Camera:
+        """Who looks."""
+        return self._painter.camera
+
+    @property
+    def faces(self) -> np.ndarray:
+        """[F, 3] corners of the surface's triangles."""
+        return self._painter.body.faces
+
+    def surface_at(self, times_s: Sequence[float] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices [T, V, 3] m in the camera frame at T moments, and their velocities [T, V, 3] m/s, float64.
+
+        Velocities are differences over half a millisecond before and after, or less where the motion begins or ends.
+
+        Raises:
+            DataError: a time is not finite.
+        """
+        times_s = np.asarray(times_s, np.float64)
+        at_rest = len(self.t_s) == 1
+        before, after = (np.clip(times_s + by, self.t_s[0], self.t_s[-1]) for by in (-VELOCITY_STEP_S, VELOCITY_STEP_S))
+        now, first, last = (
+            self._painter.pose(*self.poses_at(each)).astype(np.float64) for each in (times_s, before, after)
+        )
+        if at_rest:
+            return now, np.zeros_like(now)
+        spans = np.where(after > before, after - before, np.inf)
+        return now, (last - first) / spans[:, None, None]
 
     def speed_bound(self, start_s: float, stop_s: float) -> float:
         """A speed in px/s that no vertex in the picture exceeds between two times, start before stop.

@@ -24,7 +24,8 @@ from flows.preset_list import PRESETS, preset_names, read_head
 
 COMMANDS = (
     "run", "plan", "prepare", "train", "synthesize", "evaluate", "baselines", "export-events", "speed-vs-error",
-    "realism-chain", "pretrain", "simulate", "regenerate", "compare", "verify", "prune", "show", "presets", "options",
+    "realism-chain", "pretrain", "simulate", "record", "regenerate", "compare", "verify", "prune", "show",
+    "presets", "options",
 )  # fmt: skip
 
 

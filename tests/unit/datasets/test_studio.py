@@ -204,7 +204,7 @@ def test_cameras_stand_around_the_same_performance():
     assert [view.recording_id for view in views] == [f"train/subject0_run_00001_cam{i}" for i in range(4)]
     assert len(studio.list_recordings(options)) == 4 * (24 + 40) + 26
     labels = [studio.read_labels(view, options) for view in views]
-    records = [studio._record(view, options) for view in views]
+    records = [studio.read_scene(view, options) for view in views]
     for track, record in zip(labels[1:], records[1:], strict=True):
         assert np.array_equal(track.t_us, labels[0].t_us)
         np.testing.assert_allclose(track.smpl_pose[:, 3:], labels[0].smpl_pose[:, 3:], atol=1e-5)
@@ -285,7 +285,7 @@ def test_pictures_show_what_the_labels_say(motion):
     """Between key poses too, where pictures go straight and labels follow the curve: within a millimetre."""
     options = changed(label_rate_hz=800.0)
     recording = next(r for r in of_split("test") if r.class_name == motion)
-    labels, record = studio.read_labels(recording, options), studio._record(recording, options)
+    labels, record = studio.read_labels(recording, options), studio.read_scene(recording, options)
     painter = record._painter
     rotations, transl = record.poses_at(1e-6 * labels.t_us)
     _, joints = joint_transforms(painter.body, rotations, painter.subject.betas, transl)
@@ -306,7 +306,7 @@ def test_events_are_nearly_those_of_many_more_pictures():
     options = changed(sensor_preset="ideal", sensor_size=(96, 96))
     recording = studio.list_recordings(options)[1]
     events = studio.read_events(recording, options)
-    record, t_us = studio._record(recording, options), np.arange(0, 250_001, 250)
+    record, t_us = studio.read_scene(recording, options), np.arange(0, 250_001, 250)
     dense = simulate_events(record.render_frames(1e-6 * t_us), t_us, PRESETS["ideal"], sensor_seed=0, seed=0)
     assert len(events) == pytest.approx(len(dense), rel=0.1)
     counts = [np.bincount(e.y.astype(int) * 96 + e.x, minlength=96 * 96) for e in (events, dense)]

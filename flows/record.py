@@ -1,0 +1,91 @@
+"""Simulated recordings of people with labels of every pixel and event: `ctlev record`."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from ctlev_core.datasets import studio
+from ctlev_core.duration_text import duration_text
+from ctlev_core.plugins import PluginError
+from ctlev_core.progress import ProgressBar
+from ctlev_core.studio.labelled_recordings import LABELS_FILE, CocoTable, write_labelled
+from data_contracts.errors import DataError
+from flows.command_line import apply_override
+from flows.simulate import find_writer
+
+COUNTS = {split: f"num_{split}_recordings" for split in studio.SPLIT_NAMES}
+
+
+def record_people(
+    folder: Path,
+    count: int,
+    overrides: Sequence[str] = (),
+    *,
+    split: str = "train",
+    rate_hz: float = 100.0,
+    suffix: str = ".parquet",
+    overwrite: bool = False,
+) -> int:
+    """Write recordings of the studio with their labels, and say what there is.
+
+    Args:
+        folder: is made, complete or not at all.
+        count: recordings.
+        overrides: options of the studio, `name=value`.
+        split: whose people and motions: a key of `COUNTS`.
+        rate_hz: labelled moments a second.
+        suffix: of the files of events, which says their format.
+        overwrite: replace a folder that is there.
+    Returns:
+        Exit status: 0 written, 2 wrong input.
+    """
+    started, partial = time.perf_counter(), folder.with_name(f".partial-{folder.name}")
+    try:
+        options = _options(count, overrides, split, rate_hz)
+        format_name = find_writer(Path(f"events{suffix}"))
+        if folder.exists() and not overwrite:
+            raise DataError(f"{folder}: is there already; --overwrite replaces it")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        table, num_events = CocoTable(options.joint_set), 0
+        recordings = [one for one in studio.list_recordings(options) if one.recording_id.startswith(f"{split}/")]
+        for recording in ProgressBar(recordings, desc="recordings", unit="recording"):
+            place = partial / recording.recording_id.replace("/", "_")
+            num_events += write_labelled(place, recording, options, suffix=suffix, format_name=format_name, table=table)
+        table.write(partial / LABELS_FILE)
+        if folder.exists():
+            shutil.rmtree(folder)
+        partial.rename(folder)
+    except (DataError, PluginError, ValueError, OSError) as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        print(f"error: {str(error).replace(str(partial), str(folder))}", file=sys.stderr)
+        return 2
+    width, height = options.sensor_size
+    print(
+        f"{len(recordings)} recordings of {width} x {height} px and {1e-6 * options.recording_duration_us:g} s, "
+        f"{num_events:,} events, labels {rate_hz:g} times a second: {folder}"
+    )
+    print(f"in {duration_text(time.perf_counter() - started)}")
+    return 0
+
+
+def _options(count: int, overrides: Sequence[str], split: str, rate_hz: float) -> studio.Options:
+    values: dict[str, Any] = {}
+    for override in overrides:
+        apply_override(values, override)
+    fixed = {name: count if name == COUNTS[split] else 0 for name in COUNTS.values()}
+    fixed |= {"label_rate_hz": rate_hz, "record_conditions": split == "condition"}
+    if wrong := sorted(values.keys() & fixed.keys()):
+        raise PluginError(f"--set {wrong[0]}: is given by the number of recordings, --split and --rate")
+    try:
+        return studio.Options.model_validate(values | fixed)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise PluginError(f"--set {'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -1,0 +1,94 @@
+"""`ctlev record`: what is written is read back by other readers, and agrees with itself."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from ctlev_core.events import files as event_files
+from ctlev_core.studio.labelled_recordings import BOX
+from ctlev_core.video.coco_masks import read_runs
+from flows.record import record_people
+
+SMALL = ("sensor_size=[48, 36]", "recording_duration_us=50_000")
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("record") / "people"
+    assert record_people(folder, 2, SMALL, split="condition", rate_hz=100.0) == 0
+    return folder
+
+
+def test_files_agree(people):
+    table = json.loads((people / "labels.json").read_text())
+    assert [video["name"] for video in table["videos"]] == sorted(
+        path.name for path in people.iterdir() if path.is_dir()
+    )
+    assert len(table["images"]) == 2 * 6 and len(table["categories"][0]["keypoints"]) == 13
+    by_image = {annotation["image_id"]: annotation for annotation in table["annotations"]}
+    for video in table["videos"]:
+        folder = people / video["name"]
+        events, maps = event_files.read_events_file(folder / "events.parquet"), np.load(folder / "maps.npz")
+        of_events, boxes = np.load(folder / "event_labels.npz"), np.load(folder / "boxes.npy")
+        assert events.sensor_size == (48, 36) and maps["t_us"].tolist() == list(range(0, 50_001, 10_000))
+        assert all(len(of_events[name]) == len(events) > 0 for name in ("instance", "depth", "flow", "signal"))
+        np.testing.assert_array_equal(events.signal, of_events["signal"])
+        assert boxes.dtype == BOX and set(boxes["t"]) <= set(maps["t_us"].tolist())
+        images = [image for image in table["images"] if image["video_id"] == video["id"]]
+        assert [image["t_us"] for image in images] == maps["t_us"].tolist()
+        for row, image in enumerate(images):
+            annotation, mask = by_image[image["id"]], maps["instance"][row] > 0
+            np.testing.assert_array_equal(read_runs(annotation["segmentation"], (48, 36)), mask)
+            assert annotation["area"] == mask.sum() and (mask == (maps["depth"][row] > 0)).all()
+            left, top, width, height = annotation["bbox"]
+            assert mask[top : top + height, left : left + width].sum() == mask.sum()
+            assert all(mask[edge].any() for edge in ((top,), (top + height - 1,)))
+            np.testing.assert_allclose([boxes[row][name] for name in "xywh"], annotation["bbox"])
+            points = np.reshape(annotation["keypoints"], (13, 3))
+            inside = points[points[:, 2] > 0][:, :2]
+            assert annotation["num_keypoints"] == len(inside) > 5
+            # Joints lie within the body.
+            assert ((inside >= (left - 2, top - 2)) & (inside <= (left + width + 2, top + height + 2))).all()
+        camera = json.loads((folder / "camera.json").read_text())
+        assert camera["size"] == [48, 36] and np.shape(camera["K"]) == (3, 3)
+
+
+def test_the_same_is_written_again(people, tmp_path):
+    assert record_people(tmp_path / "again", 2, SMALL, split="condition", rate_hz=100.0) == 0
+
+    def digests(folder):
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        return {path.relative_to(folder): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+    assert digests(people) == digests(tmp_path / "again")
+
+
+def test_events_in_another_format(tmp_path):
+    assert record_people(tmp_path / "raw", 1, SMALL, split="test", rate_hz=20.0, suffix=".raw") == 0
+    (path,) = (tmp_path / "raw").glob("*/events.raw")
+    assert len(event_files.read_events_file(path)) == len(np.load(path.with_name("event_labels.npz"))["signal"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"overrides": ("sensor_sise=[8, 8]",)}, "--set sensor_sise"),
+        ({"overrides": ("num_train_recordings=3",)}, "is given by the number of recordings, --split and --rate"),
+        ({"rate_hz": 0.0}, "--set label_rate_hz: Input should be greater than 0"),
+        ({"suffix": ".mp4"}, "no format is written with the suffix '.mp4'"),
+        ({"rate_hz": 10_000.0, "overrides": ("sensor_size=[1280, 720]", "recording_duration_us=1_000_000")}, "GiB"),
+    ],
+)
+def test_wrong_input_is_named_and_leaves_nothing(tmp_path, capsys, changes, message):
+    given = {"overrides": SMALL} | changes
+    overrides = given.pop("overrides")
+    assert record_people(tmp_path / "out", 1, overrides, **given) == 2
+    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_what_is_there_is_kept_unless_told(people, capsys):
+    before = sorted(people.iterdir())
+    assert record_people(people, 1, SMALL) == 2
+    assert "--overwrite replaces it" in capsys.readouterr().err and sorted(people.iterdir()) == before
