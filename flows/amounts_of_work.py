@@ -84,7 +84,7 @@ class Amounts:
         if "num_steps" in numbers:
             factors = "num_steps", "batch_size", "sequence_length", "gradient_accumulation"
             return math.prod(numbers.get(name, 1.0) for name in factors)
-        guided = 2.0 if numbers.get("guidance_scale", 1.0) > 1 else 1.0
+        guided = 1 + sum(numbers.get(name, 1.0) > 1 for name in ("guidance_scale", "autoguidance_scale"))
         return self.rows(key).total * numbers.get("num_inference_steps", 1.0) * guided
 
     def _two_sample_tests(self, arguments: Mapping[str, Any]) -> float:

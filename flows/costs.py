@@ -76,7 +76,8 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
     forward = operations("unet", width, height) + controlled * operations("controlnet", width, height)
     backward = training_operations(options["tune"], width, height)
     # As if guidance were at every step: where steps lie in its interval depends on the checkpoint's schedule.
-    evaluations = sampled["num_inference_steps"] * (2 if sampled["guidance_scale"] > 1 else 1)
+    guided = sum(sampled.get(name, 1.0) > 1 for name in ("guidance_scale", "autoguidance_scale"))
+    evaluations = sampled["num_inference_steps"] * (1 + guided)
     samples = experiment.num_synthetic * experiment.num_generators
     return Costs(
         images_trained=images,

@@ -156,7 +156,7 @@ def _distilling(
     learning = {name: getattr(student, name) for name in TrainingOptions.model_fields} | {"device": student.device}
     cost = _fine_tuning(options.model_copy(update={**learning, "tune": tune, "num_processes": None}), weights, size)
     forward = operations("unet", *size) + with_controlnet * operations("controlnet", *size)
-    each = math.ceil(student.teacher_evaluations / student.num_evaluations) * (2 if sampling.guidance_scale > 1 else 1)
+    each = math.ceil(student.teacher_evaluations / student.num_evaluations) * sampling.passes_a_step
     images = student.num_steps * student.batch_size * student.gradient_accumulation
     teacher = 4 * (weights["unet"] + weights.get("controlnet", 0))
     return replace(
@@ -169,7 +169,7 @@ def _distilling(
 
 def _sampling(options: SamplingOptions, weights: Mapping[str, int], rows: float, size: tuple[int, int]) -> NetworkCost:
     forward = operations("unet", *size) + ("controlnet" in weights) * operations("controlnet", *size)
-    evaluations = options.num_inference_steps * (2 if options.guidance_scale > 1 else 1)
+    evaluations = options.num_inference_steps * options.passes_a_step
     pixels, item, everything = size[0] * size[1], ITEM_BYTES[options.precision], sum(weights.values())
     batch, gpus = min(rows, options.batch_size), num_gpus(options.device)
     return NetworkCost(

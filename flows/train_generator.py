@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # torch, which most plans do without
 
 
 X = TypeVar("X", bound=Experiment)
-_OF_GUIDANCE = ("guidance_scale", "guidance_interval")
+_OF_GUIDANCE = ("guidance_scale", "guidance_interval", "autoguidance_scale", "autoguidance_layers")
 """Sampling options of a teacher that its student learns."""
 _OF_THE_TEACHER = ("scheduler", "num_inference_steps", "timestep_spacing", "controlnet_every", *_OF_GUIDANCE)
 """Sampling options that a student has no use for."""

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from ctlev_core.diffusion.compilation import Compile
-from data_contracts.config import RUN_SETTING, Frozen
+from data_contracts.config import ADDED_LATER, RUN_SETTING, Frozen
 
 Scheduler = Literal["unipc", "dpmpp_2m", "dpmpp_3m", "dpmpp_sde", "deis", "sa_solver", "ddim", "ddpm", "tcd"]
 Spacing = Literal["karras", "lu", "linspace", "trailing"]
@@ -60,6 +60,18 @@ class SamplingOptions(Frozen):
         description="time steps with guidance, as shares of the schedule, 0 = no noise; the others take half the work "
         "(Kynkaanniemi et al., NeurIPS 2024)",
     )
+    autoguidance_scale: float = Field(
+        default=1.0,
+        ge=1,
+        json_schema_extra=ADDED_LATER,
+        description="guidance away from the same network without some attention blocks, within guidance_interval; 1 = "
+        "none, twice as fast (Karras et al., NeurIPS 2024)",
+    )
+    autoguidance_layers: Literal["middle", "all"] = Field(
+        default="middle",
+        json_schema_extra=ADDED_LATER,
+        description="which attention blocks of the U-Net are left out for that",
+    )
     controlnet_every: int = Field(
         default=1, gt=0, description="the ControlNet is evaluated at every k-th step, its residuals reused between"
     )
@@ -105,6 +117,11 @@ class SamplingOptions(Frozen):
         description="auto, cpu, cuda, cuda:1 ...; several, as in cuda:0,cuda:1, or all: one process for each",
     )
 
+    @property
+    def passes_a_step(self) -> int:
+        """Of the networks, in a step with guidance."""
+        return 1 + (self.guidance_scale > 1) + (self.autoguidance_scale > 1)
+
     @model_validator(mode="before")
     @classmethod
     def _take_the_spacing_of_the_solver(cls, values: Any) -> Any:
@@ -124,6 +141,8 @@ class SamplingOptions(Frozen):
             return self
         if self.guidance_scale > 1:
             raise ValueError("scheduler tcd takes no guidance_scale: that of the teacher is distilled")
+        if self.autoguidance_scale > 1:
+            raise ValueError("scheduler tcd takes no autoguidance_scale: a student is not trained for it")
         if self.controlnet_every > 1:
             raise ValueError("scheduler tcd takes no controlnet_every: the few evaluations lie far apart")
         return self

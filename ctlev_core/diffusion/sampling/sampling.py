@@ -35,6 +35,7 @@ from ctlev_core.diffusion.pretrained.loading import (
     load_base_model,
 )
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts
+from ctlev_core.diffusion.sampling.autoguidance import attention_blocks, without_blocks
 from ctlev_core.diffusion.sampling.controlnet_reuse import EveryKthStep
 from ctlev_core.diffusion.sampling.controlnet_reuse import cached_condition_embedding as cached_condition_embedding
 from ctlev_core.diffusion.sampling.devices import device_names, run_on_devices, spread_over_cores
@@ -144,16 +145,27 @@ def guided_predictions(
     )
     denoiser = Denoiser(base_model.unet, controlnet)
     num_timesteps = base_model.scheduler_config.get("num_train_timesteps", 1000)
+    blocks = attention_blocks(base_model.unet, options.autoguidance_layers) if options.autoguidance_scale > 1 else []
+    # Another count of the ControlNet's calls, so that each network has its residuals.
+    worse = Denoiser(base_model.unet, None if controlnet is None else controlnet.again())
 
     def predict(noisy: Tensor, timestep: Tensor) -> Tensor:
         noisy = noisy.to(dtype)
+        once = timestep.expand(len(noisy)).to(device)
         if not _is_guided(timestep, num_timesteps, options):
-            timesteps = timestep.expand(len(noisy)).to(device)
-            return denoiser.predict(noisy, timesteps, embeddings, conditions).float()
-        timesteps = timestep.expand(2 * len(noisy)).to(device)
-        predicted = denoiser.predict(torch.cat([noisy, noisy]), timesteps, both, twice).float()
-        plain, prompted = predicted.chunk(2)
-        return plain + options.guidance_scale * (prompted - plain)
+            return denoiser.predict(noisy, once, embeddings, conditions).float()
+        if options.guidance_scale > 1:
+            timesteps = timestep.expand(2 * len(noisy)).to(device)
+            predicted = denoiser.predict(torch.cat([noisy, noisy]), timesteps, both, twice).float()
+            plain, prompted = predicted.chunk(2)
+            guided = plain + options.guidance_scale * (prompted - plain)
+        else:
+            guided = prompted = denoiser.predict(noisy, once, embeddings, conditions).float()
+        if not blocks:
+            return guided
+        with without_blocks(blocks):
+            bad = worse.predict(noisy, once, embeddings, conditions).float()
+        return guided + (options.autoguidance_scale - 1) * (prompted - bad)
 
     with cached_condition_embedding(base_model.controlnet, conditions):
         yield predict
@@ -161,7 +173,7 @@ def guided_predictions(
 
 def _is_guided(timestep: Tensor, num_timesteps: int, options: SamplingOptions) -> bool:
     low, high = options.guidance_interval
-    return options.guidance_scale > 1 and low <= float(timestep) / (num_timesteps - 1) <= high
+    return options.passes_a_step > 1 and low <= float(timestep) / (num_timesteps - 1) <= high
 
 
 @torch.no_grad()

@@ -311,7 +311,9 @@ def _identity(
 ) -> str:
     """Digest of what the saved state depends on."""
     weights = [file_digest(path) for path in sorted(checkpoint.rglob("*.safetensors"))]
-    guided = [guidance.guidance_scale, guidance.guidance_interval]
+    guided: list[Any] = [guidance.guidance_scale, guidance.guidance_interval]
+    if guidance.autoguidance_scale > 1:
+        guided += [guidance.autoguidance_scale, guidance.autoguidance_layers]
     digest = hashlib.sha256(json.dumps([cache_material(options), guided, seed, weights, conditions.prompts]).encode())
     if conditions.images is not None:
         digest.update(as_image_rows(conditions.images).digest().encode())
