@@ -17,6 +17,8 @@ _ENVIRONMENT = {
     "DO_NOT_TRACK": "1",
     "TRANSFORMERS_VERBOSITY": "error",
     "OMP_WAIT_POLICY": "PASSIVE",
+    # A process of tests a core: more threads only wait for one another.
+    "OMP_NUM_THREADS": "1",
 }
 for _name, _value in _ENVIRONMENT.items():
     os.environ.setdefault(_name, _value)
