@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MOTIONS_OF_SPLIT", "SPLIT_NAMES", "VERSION", "Options", "list_recordings", "read_events", "read_intensity_frames",
-    "read_labels", "read_scene",
+    "read_labels", "read_marked_events", "read_scene",
 ]  # fmt: skip
 
 VERSION = 3
@@ -129,17 +129,22 @@ def read_labels(recording: Recording, options: Options) -> Labels:
     return check_labels(seen, recording.recording_id)
 
 
-def read_events(recording: Recording, options: Options, *, marks: bool = False) -> Events:
+def read_events(recording: Recording, options: Options) -> Events:
     """Record the recording, as densely in time as its motion asks for, and send it through the sensor.
 
-    Args:
-        recording: which.
-        options: of the studio.
-        marks: whether events are marked as signal or noise (`Events.signal`).
     Raises:
         DataError: the recording is not one of the studio with these options, carries labels only, or has more than
             `max_events`.
     """
+    return _record(recording, options, marks=False)
+
+
+def read_marked_events(recording: Recording, options: Options) -> Events:
+    """The events of `read_events`, each marked as signal or noise (`Events.signal`)."""
+    return _record(recording, options, marks=True)
+
+
+def _record(recording: Recording, options: Options, *, marks: bool) -> Events:
     from ctlev_core.sensor.adaptive_rendering import RenderingOptions, simulate_rendered
     from ctlev_core.sensor.dvs_pixel import EventBudgetError
 

@@ -105,7 +105,7 @@ def write_labelled(
     """
     scene, labels = studio.read_scene(recording, options), studio.read_labels(recording, options)
     truth = ground_truth(scene, labels.t_us)
-    events = studio.read_events(recording, options, marks=True)
+    events = studio.read_marked_events(recording, options)
     of_events = label_events(events, truth)
     folder.mkdir(parents=True)
     write_event_chunks(folder / f"events{suffix}", [events], format_name)

@@ -28,6 +28,7 @@ def run(preset, home, num_label_only, *settings):
     return (home / "reports" / f"{preset}.html").read_text(), scores
 
 
+@pytest.mark.slow
 def test_sentences_become_event_frames_in_motion_and_bodies_are_scored(tmp_path):
     sentences = "poses.options.sentences=[a person walks then jumps]"
     report, scores = run("text_motion", tmp_path, 0, sentences, "num_synthetic=10")

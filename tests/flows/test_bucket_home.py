@@ -25,6 +25,7 @@ def records(home):
     return {path.parent.name: path.read_bytes() for path in (home / "artefacts").glob("*/*/run.json")}
 
 
+@pytest.mark.slow
 def test_two_machines_at_once_make_each_artefact_once_and_a_third_none(machine, bucket_url, tmp_path):
     asked = ("prepare_dataset", "--preset", "smoke", "--home", bucket_url)
     caches, running = [], []

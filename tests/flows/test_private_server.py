@@ -106,6 +106,7 @@ def test_the_port_is_never_free_between_its_choice_and_its_use(tmp_path, monkeyp
         started[0].wait()
 
 
+@pytest.mark.slow
 def test_a_server_started_as_the_docs_say_is_closed_to_others(tmp_path):
     with deployment_service.server(tmp_path) as service:
         place = {"PREFECT_API_URL": service.url, "PREFECT_API_AUTH_STRING": deployment_service.PASSWORD}

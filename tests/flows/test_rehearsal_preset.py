@@ -40,6 +40,7 @@ def home(tmp_path_factory):
     return tmp_path_factory.mktemp("rehearsal")
 
 
+@pytest.mark.slow
 def test_it_differs_from_the_paper_in_amounts_alone(home, monkeypatch):
     monkeypatch.setenv("CTLEV_HOME", str(home))
     rehearsal = load_study("rehearsal", ["stand_ins=tiny"])

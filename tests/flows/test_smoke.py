@@ -259,6 +259,7 @@ def test_changing_an_option_reruns_exactly_what_depends_on_it(smoke_home, overri
             assert (key != base[label][1]) == expected
 
 
+@pytest.mark.slow
 def test_each_flow_is_a_script_of_its_own_and_shares_the_store(smoke_home):
     before = digests(smoke_home)
     for name in ("prepare_dataset", "train_generator", "synthesize", "baselines", "evaluate"):

@@ -35,6 +35,7 @@ def study(smoke_home, tmp_path_factory):
     return home, before
 
 
+@pytest.mark.slow
 def test_a_study_runs_what_its_experiments_have_not_run_yet(study):
     home, before = study
     made = digests(home)

@@ -252,6 +252,7 @@ def distance(folder, teacher, count):
     return float((made - expected).square().mean().sqrt())
 
 
+@pytest.mark.slow
 def test_a_student_is_nearer_to_its_teacher_than_the_teacher_in_as_few_evaluations(tmp_path, teacher):
     options = OPTIONS.model_copy(
         update={

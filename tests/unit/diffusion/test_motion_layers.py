@@ -266,6 +266,7 @@ def test_only_the_layers_learn_and_a_killed_run_ends_the_same(tmp_path, checkpoi
     assert files_of(tmp_path / "killed" / "checkpoint") == whole
 
 
+@pytest.mark.slow
 def test_they_lower_the_loss_of_stretches_held_back(tmp_path, checkpoint):
     """Below that of the generator without them, which validation after a step of next to nothing gives."""
     losses = []

@@ -63,6 +63,7 @@ def test_the_first_failure_ends_the_other_processes(deed, error, message):
         assert "in act" in "".join(caught.value.__notes__)
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_frames_of_one(tmp_path, monkeypatch):
     from tiny_base_model import make_base_model, make_data
 

@@ -171,6 +171,7 @@ def test_a_wrong_factor_in_a_folder_is_noticed_before_training(frames, base_mode
         assert f"after scaling by {scaling_factor:g}" in message and "Stable Diffusion v1: 0.18215" in message
 
 
+@pytest.mark.slow
 def test_the_whole_route_learns_from_and_draws_frames_of_512_px(frames, base_model_of, tmp_path):
     base_model = base_model_of()
     conditions = Conditions(("an event image",) * 2)

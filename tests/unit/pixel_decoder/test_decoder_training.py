@@ -27,6 +27,7 @@ def make_pairs(count=40, *, seed=0, num_planes=1):
     return TrainingPairs(counts, [frames], None)
 
 
+@pytest.mark.slow
 def test_counts_are_drawn_as_the_training_frames_have_them(tmp_path):
     options = SMALL.model_copy(update={"num_steps": 250, "batch_size": 16, "learning_rate": 1e-3})
     network, classes, history = train_pixel_decoder(make_pairs(), options, seed=1, work=tmp_path)

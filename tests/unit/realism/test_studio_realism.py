@@ -56,6 +56,7 @@ def ratios(summaries, reference):
     return np.array([[summary.numbers[name] / reference.numbers[name] for name in STATISTICS] for summary in summaries])
 
 
+@pytest.mark.slow
 def test_every_statistic_is_of_the_same_order_of_magnitude(person):
     reference = summarise_events(person)
     assert set(STATISTICS) == set(reference.numbers)

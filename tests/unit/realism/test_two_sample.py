@@ -90,6 +90,7 @@ def compare(first: np.ndarray, second: np.ndarray, seed: int = 0, per_recording:
     return compare_frames(first, second, first_groups=groups[0], second_groups=groups[1], seed=seed)
 
 
+@pytest.mark.slow
 def test_frames_of_one_distribution_cannot_be_told_apart():
     found = [compare(noise(50, 0.1, 2 * seed), noise(50, 0.1, 2 * seed + 1), seed) for seed in range(3)]
     areas = [test.value for test in found]

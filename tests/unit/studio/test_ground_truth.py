@@ -101,7 +101,7 @@ def test_events_have_the_values_of_their_pixel_at_the_nearest_moment():
 
 def test_marked_events_are_the_same_and_those_of_signal_lie_on_the_person():
     recording = studio.list_recordings(OPTIONS)[0]
-    plain, marked = studio.read_events(recording, OPTIONS), studio.read_events(recording, OPTIONS, marks=True)
+    plain, marked = studio.read_events(recording, OPTIONS), studio.read_marked_events(recording, OPTIONS)
     for name in ("t", "x", "y", "p"):
         np.testing.assert_array_equal(getattr(plain, name), getattr(marked, name))
     assert plain.signal is None and 0.05 < marked.signal.mean() < 1

@@ -95,6 +95,7 @@ def values(rows, metric):
     return {row["subject"]: row["value"] for row in rows if row["metric"] == metric}
 
 
+@pytest.mark.slow
 def test_generators_and_shuffled_time_stand_beside_recorded_stretches(tmp_path, run):
     count = 80
     frames = recorded(tmp_path / "recorded", moving_dots(count, 3, 0), moving_dots(count, 3, 1))
@@ -127,6 +128,7 @@ def test_generators_and_shuffled_time_stand_beside_recorded_stretches(tmp_path, 
     assert all(row["low"] <= row["value"] <= row["high"] for row in rows if row["metric"] != "c2st")
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_numbers(tmp_path, run):
     frames = recorded(tmp_path / "recorded", moving_dots(45, 2, 0), moving_dots(45, 2, 1))
     made = synthetic(tmp_path / "made", moving_dots(45, 2, 2))
