@@ -31,7 +31,7 @@ def attention_blocks(unet: Any, layers: str) -> list[nn.Module]:
     from diffusers.models.attention import BasicTransformerBlock
 
     part = unet.mid_block if layers == "middle" else unet
-    found = [module for module in part.modules() if isinstance(module, BasicTransformerBlock)]
+    found: list[nn.Module] = [module for module in part.modules() if isinstance(module, BasicTransformerBlock)]
     if not found:
         raise DataError(f"autoguidance_layers {layers!r}: this U-Net has no attention blocks there")
     return found
