@@ -79,41 +79,44 @@ def main() -> None:
     parser.add_argument("--axes", nargs="+", choices=AMOUNTS, default=list(AMOUNTS))
     parser.add_argument("--largest", type=int, help="number of rows")
     parser.add_argument("--figure", type=Path, help="write the chart here")
-    parser.add_argument("--found", type=Path, help="write all that was found here, or read it, if it is there")
+    parser.add_argument(
+        "--found", type=Path, help="keep what was found here; what is there already is not measured again"
+    )
     parser.add_argument("--poses", type=int, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.poses:
         make_poses(chosen.poses)
         return
-    if chosen.found and chosen.found.is_file():
-        points = [Point(**one) for one in json.loads(chosen.found.read_text())]
-    else:
-        points = [point for axis in chosen.axes for point in measure(axis, chosen.largest)]
-        if chosen.found:
-            chosen.found.write_text(json.dumps([asdict(point) for point in points]))
+    known = chosen.found is not None and chosen.found.is_file()
+    points = [Point(**one) for one in json.loads(chosen.found.read_text())] if known else []
+    for axis in chosen.axes:
+        for amount in AMOUNTS[axis]:
+            is_known = any((point.axis, point.amount) == (axis, amount) for point in points)
+            if is_known or (axis == "rows" and amount > (chosen.largest or math.inf)):
+                continue
+            points += measure(axis, amount)
+            if chosen.found:
+                chosen.found.write_text(json.dumps([asdict(point) for point in points]))
     for axis in dict.fromkeys(point.axis for point in points):
         print_axis([point for point in points if point.axis == axis])
     if chosen.figure:
         draw(points, chosen.figure)
 
 
-def measure(axis: str, largest: int | None) -> list[Point]:
-    """All points of an axis."""
-    points = []
-    for amount in AMOUNTS[axis]:
-        if axis == "rows" and amount > (largest or math.inf):
-            break
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            if axis == "rows":
-                run_poses(folder / "poses", amount)
-            numbers = {"rows": 2_000, "classes": 10, "side": 64} | ({"rows": 200} if axis == "side" else {})
-            run_classes(folder, axis, **(numbers | ({axis: amount} if axis != "workers" else {})), workers=amount)
-            found = [*read_records(folder / "home", axis, amount), *read_records(folder / "poses", axis, amount)]
-        seconds = sum(point.seconds for point in found)
-        print(f"{axis} {amount:,}: {seconds:.0f} s in stages", file=sys.stderr, flush=True)
-        points += found
-    return points
+def measure(axis: str, amount: int) -> list[Point]:
+    """The points of an amount."""
+    numbers = {"rows": 200 if axis == "side" else 2_000, "classes": 10, "side": 64}
+    if axis != "workers":
+        numbers[axis] = amount
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if axis == "rows":
+            run_poses(folder / "poses", amount)
+        run_classes(folder, axis, **numbers, workers=amount)
+        found = [*read_records(folder / "home", axis, amount), *read_records(folder / "poses", axis, amount)]
+    seconds = sum(point.seconds for point in found)
+    print(f"{axis} {amount:,}: {seconds:.0f} s in stages", file=sys.stderr, flush=True)
+    return found
 
 
 def run_classes(folder: Path, axis: str, *, rows: int, classes: int, side: int, workers: int) -> None:
