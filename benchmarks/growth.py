@@ -87,16 +87,18 @@ def main() -> None:
     if chosen.poses:
         make_poses(chosen.poses)
         return
-    known = chosen.found is not None and chosen.found.is_file()
-    points = [Point(**one) for one in json.loads(chosen.found.read_text())] if known else []
+    found: Path | None = chosen.found
+    points = []
+    if found is not None and found.is_file():
+        points = [Point(**one) for one in json.loads(found.read_text())]
     for axis in chosen.axes:
         for amount in AMOUNTS[axis]:
             is_known = any((point.axis, point.amount) == (axis, amount) for point in points)
             if is_known or (axis == "rows" and amount > (chosen.largest or math.inf)):
                 continue
             points += measure(axis, amount)
-            if chosen.found:
-                chosen.found.write_text(json.dumps([asdict(point) for point in points]))
+            if found is not None:
+                found.write_text(json.dumps([asdict(point) for point in points]))
     for axis in dict.fromkeys(point.axis for point in points):
         print_axis([point for point in points if point.axis == axis])
     if chosen.figure:
