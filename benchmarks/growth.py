@@ -9,7 +9,6 @@ steps) and single stages of skeletons and bodies. What a stage took is read from
 
     rows       recordings and frames generated, tens to tens of thousands, of ten classes
     classes    of 2,000 recordings
-    side       px of the images, of 200 recordings
     workers    processes, of 2,000 recordings
 
 Times are those of the processor, which other programs hardly change, along `workers` those of the clock. A slope is
@@ -45,7 +44,6 @@ EVENTS = 200
 AMOUNTS: Mapping[str, Sequence[int]] = {
     "rows": (20, 200, 2_000, 20_000),
     "classes": (2, 10, 100, 1_000),
-    "side": (32, 64, 128, 256),
     "workers": (1, 2, 4),
 }
 IN_PROCESS = ("condition_samples", "simulate")
@@ -107,7 +105,7 @@ def main() -> None:
 
 def measure(axis: str, amount: int) -> list[Point]:
     """The points of an amount."""
-    numbers = {"rows": 200 if axis == "side" else 2_000, "classes": 10, "side": 64}
+    numbers = {"rows": 2_000, "classes": 10}
     if axis != "workers":
         numbers[axis] = amount
     with tempfile.TemporaryDirectory() as name:
@@ -121,14 +119,13 @@ def measure(axis: str, amount: int) -> list[Point]:
     return found
 
 
-def run_classes(folder: Path, axis: str, *, rows: int, classes: int, side: int, workers: int) -> None:
+def run_classes(folder: Path, axis: str, *, rows: int, classes: int, workers: int) -> None:
     """An experiment with class names, in a home of its own."""
     write_recordings(folder / "raw", rows, EVENTS, 200, classes)
     changed = {
         "name": "growth",
         "dataset.options.root": folder / "raw",
         "dataset.options.images_per_class": "null",
-        "encoding.options.image_size": f"[{side}, {side}]",
         "generator.options.num_steps": 4,
         "generator.options.batch_size": 4,
         "sampling.num_inference_steps": 1,
