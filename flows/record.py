@@ -55,7 +55,7 @@ def record_people(
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         table, num_events = CocoTable(options.joint_set), 0
-        recordings = [one for one in studio.list_recordings(options) if one.recording_id.startswith(f"{split}/")]
+        recordings = studio.list_recordings(options)
         for recording in ProgressBar(recordings, desc="recordings", unit="recording"):
             place = partial / recording.recording_id.replace("/", "_")
             num_events += write_labelled(place, recording, options, suffix=suffix, format_name=format_name, table=table)

@@ -65,12 +65,10 @@ def read_camera_frames(path: Path) -> Iterator[CameraFrame]:
     head = aedat4_process.FRAME_HEAD
     for packet in _packets(path, "frame", "frames"):
         begin, end, t, width, height, channels = head.unpack_from(packet)
-        pixels = np.frombuffer(packet, np.uint8, offset=head.size)
-        shape = (height, width) if channels == 1 else (height, width, channels)
+        pixels = np.frombuffer(packet, np.uint8, offset=head.size).reshape(height, width, channels)
         exposure_us = max(end - begin, 0) if begin else 0
-        pixels = pixels.reshape(shape)
-        colours = pixels[..., :3] if channels > 3 else pixels
-        yield CameraFrame(begin + exposure_us // 2 if begin else t, exposure_us, colours)
+        seen = pixels[..., 0] if channels == 1 else pixels[..., :3]
+        yield CameraFrame(begin + exposure_us // 2 if begin else t, exposure_us, seen)
 
 
 def read_imu(path: Path) -> ImuSamples:
@@ -95,10 +93,5 @@ def _packets(path: Path, kind: str, what: str) -> Iterator[bytes]:
     if not path.is_file() or not aedat4.sniff(path):
         found = "another file" if path.is_file() else "a folder" if path.is_dir() else "nothing there"
         raise DataError(f"{path}: {what} are read from AEDAT 4 files, got {found}")
-    try:
-        with aedat4_process.decoding(str(path), kind) as (streams, packets):
-            if len(streams) != 1:
-                raise DataError(f"{path}: expected one stream of {what}, got {len(streams)}")
-            yield from packets
-    except aedat4_process.DecoderError as error:
-        raise DataError(f"{path}: not a complete AEDAT 4 file, the decoder says: {error}") from error
+    with aedat4.one_stream(path, kind, f"stream of {what}") as (_, packets):
+        yield from packets

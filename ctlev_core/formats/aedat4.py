@@ -7,9 +7,11 @@ Source: iniVation, "AEDAT 4.0 file format"; decoded by the `aedat` package, in a
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,16 +87,31 @@ def _table_position(header: bytes) -> int:
     return _LONG.unpack_from(header, table + place)[0] if place else -1
 
 
-def _read_packets(path: Path) -> Iterator[Events]:
-    """An empty chunk, then one a packet."""
+@contextlib.contextmanager
+def one_stream(path: Path, kind: str, what: str) -> Iterator[tuple[dict[str, Any], Iterator[bytes]]]:
+    """The one stream of a kind that a file must have, and the content of one packet of it after the other.
+
+    Args:
+        path: the file.
+        kind: as of `aedat4_process`.
+        what: names it in the message.
+    Raises:
+        DataError: here, and where packets are read: a cut or corrupt file, or no or several such streams.
+    """
     try:
-        with aedat4_process.decoding(str(path)) as (streams, packets):
+        with aedat4_process.decoding(str(path), kind) as (streams, packets):
             if len(streams) != 1:
-                raise DataError(f"{path}: expected one event stream, got {len(streams)}")
-            sensor_size = (streams[0]["width"], streams[0]["height"])
-            yield from event_chunks.check_chunks(_events(packets, sensor_size), str(path))
+                raise DataError(f"{path}: expected one {what}, got {len(streams)}")
+            yield streams[0], packets
     except aedat4_process.DecoderError as error:
         raise DataError(f"{path}: not a complete AEDAT 4 file, the decoder says: {error}") from error
+
+
+def _read_packets(path: Path) -> Iterator[Events]:
+    """An empty chunk, then one a packet."""
+    with one_stream(path, "events", "event stream") as (stream, packets):
+        sensor_size = stream["width"], stream["height"]
+        yield from event_chunks.check_chunks(_events(packets, sensor_size), str(path))
 
 
 def _events(packets: Iterator[bytes], sensor_size: SensorSize) -> Iterator[Events]:

@@ -33,6 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pyarrow as pa
@@ -323,15 +324,16 @@ def _count_trainings(name: str, draws: Sequence[np.ndarray]) -> int:
 
 
 def _check_tests(tested: Sequence[_Tested], *, own_tests: bool) -> None:
-    for number, other in enumerate(tested[1:], 1):
-        difference = other.differs_from(tested[0])
-        if difference and not own_tests:
+    """Raise unless draws were tested on the same samples, or each on its own."""
+    seen: dict[str, int] = {}
+    for number, one in enumerate(tested):
+        if not own_tests and (difference := one.differs_from(tested[0])):
             raise DrawsDiffer(f"draws 0 and {number} must be tested on the same samples, got {difference}")
-    digests = [one.digest for one in tested]
-    if own_tests and len(set(digests)) < len(digests):
-        first = next(number for number, digest in enumerate(digests) if digests.count(digest) > 1)
-        again = digests.index(digests[first], first + 1)
-        raise DrawsDiffer(f"each draw must be tested on samples of its own, got the same for draws {first} and {again}")
+        first = seen.setdefault(one.digest, number)
+        if own_tests and first != number:
+            raise DrawsDiffer(
+                f"each draw must be tested on samples of its own, got the same for draws {first} and {number}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,17 +367,26 @@ class _Recordings:
         """Samples that count."""
         return len(self.index)
 
+    @cached_property
+    def _order(self) -> np.ndarray:
+        """[S] samples, recording by recording."""
+        return np.argsort(self.index, kind="stable")
+
+    @cached_property
+    def _drawn_weights(self) -> np.ndarray:
+        """[B] of all recordings drawn."""
+        return self.times @ self.weights
+
     def add_up(self, values: np.ndarray) -> np.ndarray:
         """Values of samples [R, N], weighted and added up by recording: [R, n]."""
-        order = np.argsort(self.index, kind="stable")
-        starts = np.searchsorted(self.index[order], np.arange(len(self.weights)))
-        return np.add.reduceat((values[:, self.scored] * self.sample_weights)[:, order], starts, axis=-1)
+        starts = np.searchsorted(self.index[self._order], np.arange(len(self.weights)))
+        return np.add.reduceat((values[:, self.scored] * self.sample_weights)[:, self._order], starts, axis=-1)
 
     def deviations(self, sums: np.ndarray) -> np.ndarray:
         """[B] of replicates of the recordings from the mean, which is of sums [n], stretched; zeros for one alone."""
         if len(self.weights) < 2:
             return np.zeros(len(self.times))
-        found = (self.times @ sums) / (self.times @ self.weights)
+        found = (self.times @ sums) / self._drawn_weights
         return (found - sums.sum() / self.weights.sum()) * stretch(len(self.weights))
 
 

@@ -11,6 +11,7 @@ Source: Longuet-Higgins & Prazdny, The Interpretation of a Moving Retinal Image,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -40,10 +41,10 @@ class GroundTruth:
     depth: np.ndarray
     flow: np.ndarray
 
-    @property
+    @cached_property
     def instance(self) -> np.ndarray:
         """[T, H, W] uint8: 1 = the person, 0 = the background."""
-        return (self.depth > 0).astype(np.uint8) * PERSON
+        return instance_of(self.depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,4 +98,9 @@ def label_events(events: Events, truth: GroundTruth) -> EventLabels:
     nearest = np.where(events.t - truth.t_us[before] <= truth.t_us[after] - events.t, before, after)
     place = nearest, events.y.astype(np.int64), events.x.astype(np.int64)
     depth = truth.depth[place]
-    return EventLabels((depth > 0).astype(np.uint8) * PERSON, depth, truth.flow[place])
+    return EventLabels(instance_of(depth), depth, truth.flow[place])
+
+
+def instance_of(depth: np.ndarray) -> np.ndarray:
+    """uint8 of depths, m: 1 = the person, 0 = the background, which has none."""
+    return (depth > 0).astype(np.uint8) * PERSON

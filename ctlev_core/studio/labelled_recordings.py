@@ -14,7 +14,7 @@ rows of DSEC-Detection's `tracks.npy` (Gehrig & Scaramuzza, Nature 2024), which 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +49,12 @@ class CocoTable:
         self._images: list[dict[str, Any]] = []
         self._annotations: list[dict[str, Any]] = []
 
-    def add(self, name: str, labels: Labels, truth: GroundTruth) -> None:
-        """The labels of a recording of a name, at the moments of its maps."""
+    def add(self, name: str, labels: Labels, truth: GroundTruth, boxes: Sequence[list[int] | None]) -> None:
+        """The labels of a recording of a name at the moments of its maps, and the boxes of these (`boxes_of`)."""
         _, height, width = truth.depth.shape
         video = {"id": len(self._videos) + 1, "name": name, "width": width, "height": height}
         self._videos.append(video)
-        for row, (mask, box) in enumerate(zip(truth.instance > 0, boxes_of(truth), strict=True)):
+        for row, (mask, box) in enumerate(zip(truth.instance > 0, boxes, strict=True)):
             image, time = {"id": len(self._images) + 1}, {"t_us": int(truth.t_us[row])}
             place = {"video_id": video["id"], "frame_id": row, "width": width, "height": height, "file_name": name}
             self._images.append(image | place | time)
@@ -120,11 +120,12 @@ def write_labelled(
         flow=of_events.flow,
         signal=events.signal,
     )
-    found = [(time, box) for time, box in zip(truth.t_us.tolist(), boxes_of(truth), strict=True) if box]
-    np.save(folder / BOXES_FILE, np.array([(time, *box, 0, 1.0, PERSON) for time, box in found], BOX))
+    boxes = list(boxes_of(truth))
+    rows = [(time, *box, 0, 1.0, PERSON) for time, box in zip(truth.t_us.tolist(), boxes, strict=True) if box]
+    np.save(folder / BOXES_FILE, np.array(rows, BOX))
     camera = {"K": scene.camera.K.tolist(), "size": list(scene.camera.image_size)}
     (folder / CAMERA_FILE).write_text(json.dumps(camera) + "\n", encoding="utf-8")
-    table.add(folder.name, labels, truth)
+    table.add(folder.name, labels, truth, boxes)
     return len(events)
 
 

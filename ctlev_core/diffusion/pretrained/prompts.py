@@ -27,11 +27,6 @@ PROMPT_BATCH = 128
 logger = logging.getLogger(__name__)
 
 
-def takes_pooled(config: Any) -> bool:
-    """Does a U-Net or ControlNet of that config take a pooled embedding and sizes?"""
-    return config.get("addition_embed_type") == "text_time"
-
-
 def encode_prompts(base_model: PretrainedModel, prompts: list[str]) -> Tensor:
     """Prompt embeddings [N, L, D], of Stable Diffusion XL [N, L + R, D]; see the head of this file.
 
@@ -62,7 +57,7 @@ def prompt_arguments(network: Any, embeddings: Tensor) -> dict[str, Any]:
         embeddings: [B, L, D], of Stable Diffusion XL [B, L + R, D].
     """
     config = getattr(network, "config", None)
-    if config is None or not takes_pooled(config):
+    if config is None or config.get("addition_embed_type") != "text_time":
         return {"encoder_hidden_states": embeddings}
     width = config["projection_class_embeddings_input_dim"] - NUM_SIZES * config["addition_time_embed_dim"]
     rows = -(-(width + NUM_SIZES) // embeddings.shape[-1])

@@ -57,10 +57,6 @@ class EveryKthStep:
         self._network, self._k, self._calls, self._num_rows = network, k, 0, 0
         self._residuals: Any = None
 
-    def again(self) -> EveryKthStep:
-        """The same for other calls."""
-        return EveryKthStep(self._network, self._k)
-
     def __call__(self, noisy: Tensor, *arguments: Any, **named: Any) -> Any:
         """As the ControlNet's call: the residuals of the down blocks and of the middle one."""
         if len(noisy) != self._num_rows:

@@ -140,14 +140,11 @@ def guided_predictions(
     if options.guidance_scale > 1:
         both = torch.cat([empty_embedding.to(embeddings).expand_as(embeddings), embeddings])
         twice = None if conditions is None else torch.cat([conditions, conditions])
-    controlnet = (
-        None if base_model.controlnet is None else EveryKthStep(base_model.controlnet, options.controlnet_every)
-    )
-    denoiser = Denoiser(base_model.unet, controlnet)
+    denoiser = _denoiser(base_model, options)
     num_timesteps = base_model.scheduler_config.get("num_train_timesteps", 1000)
     blocks = attention_blocks(base_model.unet, options.autoguidance_layers) if options.autoguidance_scale > 1 else []
-    # Another count of the ControlNet's calls, so that each network has its residuals.
-    worse = Denoiser(base_model.unet, None if controlnet is None else controlnet.again())
+    # With a count of its own of the ControlNet's calls.
+    worse = _denoiser(base_model, options)
 
     def predict(noisy: Tensor, timestep: Tensor) -> Tensor:
         noisy = noisy.to(dtype)
@@ -169,6 +166,13 @@ def guided_predictions(
 
     with cached_condition_embedding(base_model.controlnet, conditions):
         yield predict
+
+
+def _denoiser(base_model: PretrainedModel, options: SamplingOptions) -> Denoiser:
+    """The networks, of which the ControlNet is evaluated as often as is asked for."""
+    if base_model.controlnet is None:
+        return Denoiser(base_model.unet)
+    return Denoiser(base_model.unet, EveryKthStep(base_model.controlnet, options.controlnet_every))
 
 
 def _is_guided(timestep: Tensor, num_timesteps: int, options: SamplingOptions) -> bool:
