@@ -15,7 +15,7 @@ from ctlev_core.datasets import studio
 from ctlev_core.duration_text import duration_text
 from ctlev_core.plugins import PluginError
 from ctlev_core.progress import ProgressBar
-from ctlev_core.studio.labelled_recordings import LABELS_FILE, CocoTable, write_labelled
+from ctlev_core.studio.labelled_recordings import EVENT_LABELS_FILE, LABELS_FILE, CocoTable, write_labelled
 from data_contracts.errors import DataError
 from flows.command_line import apply_override
 from flows.simulate import find_writer
@@ -28,7 +28,7 @@ def record_people(
     count: int,
     overrides: Sequence[str] = (),
     *,
-    split: str = "train",
+    split: str = "condition",
     rate_hz: float = 100.0,
     suffix: str = ".parquet",
     overwrite: bool = False,
@@ -42,7 +42,7 @@ def record_people(
         split: whose people and motions: a key of `COUNTS`.
         rate_hz: labelled moments a second.
         suffix: of the files of events, which says their format.
-        overwrite: replace a folder that is there.
+        overwrite: replace a folder that is there, if it holds recordings of this command.
     Returns:
         Exit status: 0 written, 2 wrong input.
     """
@@ -50,8 +50,7 @@ def record_people(
     try:
         options = _options(count, overrides, split, rate_hz)
         format_name = find_writer(Path(f"events{suffix}"))
-        if folder.exists() and not overwrite:
-            raise DataError(f"{folder}: is there already; --overwrite replaces it")
+        _check_free(folder, overwrite=overwrite)
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         table, num_events = CocoTable(options.joint_set), 0
@@ -74,6 +73,16 @@ def record_people(
     )
     print(f"in {duration_text(time.perf_counter() - started)}")
     return 0
+
+
+def _check_free(folder: Path, *, overwrite: bool) -> None:
+    """Raise where recordings would take the place of what nobody asked to replace, or of what is none of ours."""
+    if not folder.exists():
+        return
+    if not overwrite:
+        raise DataError(f"{folder}: is there already; --overwrite replaces it")
+    if not (folder / LABELS_FILE).is_file() or not list(folder.glob(f"*/{EVENT_LABELS_FILE}")):
+        raise DataError(f"{folder}: --overwrite replaces folders that `ctlev record` made, and this is none")
 
 
 def _options(count: int, overrides: Sequence[str], split: str, rate_hz: float) -> studio.Options:

@@ -92,3 +92,15 @@ def test_what_is_there_is_kept_unless_told(people, capsys):
     before = sorted(people.iterdir())
     assert record_people(people, 1, SMALL) == 2
     assert "--overwrite replaces it" in capsys.readouterr().err and sorted(people.iterdir()) == before
+
+
+def test_what_is_of_this_command_is_replaced_and_nothing_else(tmp_path, capsys):
+    own, other = tmp_path / "own", tmp_path / "other"
+    assert record_people(own, 2, SMALL, rate_hz=20.0) == record_people(own, 1, SMALL, rate_hz=20.0, overwrite=True) == 0
+    assert len([path for path in own.iterdir() if path.is_dir()]) == 1
+    other.mkdir()
+    (other / "labels.json").write_text("mine")
+    for folder in (other, other / "labels.json"):
+        assert record_people(folder, 1, SMALL, overwrite=True) == 2
+        assert "folders that `ctlev record` made, and this is none" in capsys.readouterr().err
+    assert (other / "labels.json").read_text() == "mine" and sorted(tmp_path.iterdir()) == [other, own]
