@@ -133,6 +133,25 @@ def test_neighbour_scores_agree_with_a_loop(seed, n, m, k, offset):
     assert compute_prdc(judged, reference, k) == pytest.approx(slow_prdc(judged, reference, k))
 
 
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10_000), st.integers(200, 700), st.integers(1, 5), st.sampled_from([0.1, 1.0, 8.0]))
+def test_neighbours_among_many_rows_are_the_nearest(seed, n, k, steps):
+    judged, reference = np.round(steps * normal(seed, n, 3)), np.round(steps * normal(seed + 1, 431, 3))
+    squared = [
+        np.square(a[:, None] - b).sum(axis=2)
+        for a, b in ((judged, judged), (reference, reference), (reference, judged))
+    ]
+    made, real = (np.sort(each, axis=1)[:, k] for each in squared[:2])
+    inside = squared[2] <= real[:, None]
+    expected = {
+        "precision": inside.any(axis=0).mean(),
+        "recall": (squared[2] <= made).any(axis=1).mean(),
+        "density": inside.sum() / (k * n),
+        "coverage": inside.any(axis=1).mean(),
+    }
+    assert compute_prdc(judged, reference, k) == pytest.approx(expected)
+
+
 def test_neighbour_scores_where_rows_repeat_and_far_from_the_origin():
     a = normal(3, 50)
     identical = compute_prdc(a, a.copy(), 3)
