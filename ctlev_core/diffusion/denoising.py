@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core.diffusion.flow_matching import FlowSchedule, refuse_flow
+from ctlev_core.diffusion.pretrained.model_kinds import is_flow, is_transformer
 from ctlev_core.diffusion.pretrained.prompts import prompt_arguments
 
 
@@ -38,8 +40,8 @@ class Batch:
     Attributes:
         latents: [B, C, h, w] clean latents, already multiplied by the scaling factor.
         embeddings: [B, L, D] prompt embeddings, as `encode_prompts` gives them.
-        conditions: [K, 3, H, W] condition images in [0, 1] of the first K <= B rows, or None; the other rows go through
-            the U-Net alone.
+        conditions: of the first K <= B rows what `control_input` makes of condition images, or None; the other rows go
+            through the U-Net alone.
         num_frames: of each stretch, whose rows lie behind one another and are equally noisy; 1 = images.
         shared_noise: share of the noise's variance that the frames of a stretch have in common.
     """
@@ -53,13 +55,15 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class Denoiser:
-    """U-Net and ControlNet as one function of (noisy latents, time step, prompt, condition)."""
+    """U-Net or transformer, and ControlNet, as one function of (noisy latents, time step, prompt, condition)."""
 
     unet: Any
     controlnet: Any | None = None
 
     def predict(self, noisy: Tensor, timesteps: Tensor, embeddings: Tensor, conditions: Tensor | None) -> Tensor:
-        """The U-Net's output [B, C, h, w]; rows beyond those of `conditions` get no residuals."""
+        """The network's output [B, C, h, w]; rows beyond those of `conditions` get no residuals."""
+        if is_transformer(self.unet):
+            return self._predict_by_transformer(noisy, timesteps, embeddings, conditions)
         if self.controlnet is None or conditions is None or len(conditions) == 0:
             return self.unet(noisy, timesteps, **prompt_arguments(self.unet, embeddings)).sample
         steered, total = len(conditions), len(noisy)
@@ -70,17 +74,38 @@ class Denoiser:
             **prompt_arguments(self.unet, embeddings[:steered]),
             return_dict=False,
         )
-
-        def padded(residual: Tensor) -> Tensor:
-            return torch.nn.functional.pad(residual, (0, 0) * 3 + (0, total - steered))
-
         return self.unet(
             noisy,
             timesteps,
             **prompt_arguments(self.unet, embeddings),
-            down_block_additional_residuals=[padded(residual) for residual in down],
-            mid_block_additional_residual=padded(middle),
+            down_block_additional_residuals=[_padded(residual, total) for residual in down],
+            mid_block_additional_residual=_padded(middle, total),
         ).sample
+
+    def _predict_by_transformer(
+        self, noisy: Tensor, timesteps: Tensor, embeddings: Tensor, conditions: Tensor | None
+    ) -> Tensor:
+        residuals = None
+        if self.controlnet is not None and conditions is not None and len(conditions):
+            steered, arguments = len(conditions), prompt_arguments(self.unet, embeddings[: len(conditions)])
+            if self.controlnet.config.get("force_zeros_for_pooled_projection"):
+                arguments["pooled_projections"] = torch.zeros_like(arguments["pooled_projections"])
+            made = self.controlnet(
+                noisy[:steered], controlnet_cond=conditions, timestep=timesteps[:steered], **arguments, return_dict=False
+            )[0]
+            residuals = [_padded(residual, len(noisy)) for residual in made]
+        return self.unet(
+            noisy,
+            timestep=timesteps,
+            **prompt_arguments(self.unet, embeddings),
+            block_controlnet_hidden_states=residuals,
+            return_dict=False,
+        )[0]
+
+
+def _padded(residual: Tensor, total: int) -> Tensor:
+    """[B, ...] with rows of zeros up to `total`."""
+    return torch.nn.functional.pad(residual, (0, 0) * (residual.ndim - 1) + (0, total - len(residual)))
 
 
 def generator_for(*entropy: int) -> torch.Generator:
@@ -96,6 +121,7 @@ class NoiseSchedule:
     """
 
     def __init__(self, scheduler_config: dict[str, Any]) -> None:
+        refuse_flow(scheduler_config, "a noise schedule with alpha_bar")
         from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
         self._scheduler: Any = DDPMScheduler.from_config(scheduler_config)
@@ -104,6 +130,14 @@ class NoiseSchedule:
             raise ValueError(f"prediction_type must be epsilon, v_prediction or sample, got {self.prediction_type!r}")
         self.alphas_cumprod = self._scheduler.alphas_cumprod
         self.num_timesteps = len(self.alphas_cumprod)
+
+    def draw(self, count: int, emphasis: Emphasis, generator: torch.Generator) -> Tensor:
+        """Time steps [count] int64 of a training."""
+        return emphasis.draw(count, self.num_timesteps, generator)
+
+    def told(self, timesteps: Tensor) -> Tensor:
+        """What the network is told of time steps [B]: themselves."""
+        return timesteps
 
     def noised(self, latents: Tensor, noise: Tensor, timesteps: Tensor) -> tuple[Tensor, Tensor]:
         """Noisy latents, and the target: the noise, the latents, or v = sqrt(a) noise - sqrt(1 - a) latents."""
@@ -153,23 +187,28 @@ class NoiseSchedule:
         return clipped if self.prediction_type == "v_prediction" else clipped / signal.clamp(min=1e-8)
 
 
+def noise_schedule(scheduler_config: dict[str, Any]) -> NoiseSchedule | FlowSchedule:
+    """The noise that a base model was trained with."""
+    return FlowSchedule(scheduler_config) if is_flow(scheduler_config) else NoiseSchedule(scheduler_config)
+
+
 def denoising_loss(
     denoiser: Denoiser,
-    schedule: NoiseSchedule,
+    schedule: NoiseSchedule | FlowSchedule,
     batch: Batch,
     generator: torch.Generator,
     emphasis: Emphasis = PLAIN,
 ) -> Tensor:
     """Weighted mean squared error of the prediction at random time steps; noise comes from the CPU stream."""
     num_draws = len(batch.latents) // batch.num_frames
-    timesteps = emphasis.draw(num_draws, schedule.num_timesteps, generator).repeat_interleave(batch.num_frames)
+    timesteps = schedule.draw(num_draws, emphasis, generator).repeat_interleave(batch.num_frames)
     noise = torch.randn(batch.latents.shape, generator=generator)
     if batch.shared_noise:
         shared = torch.randn((num_draws, *noise.shape[1:]), generator=generator)
         noise = mix_noise(noise, shared.repeat_interleave(batch.num_frames, 0), batch.shared_noise)
     device = batch.latents.device
     noisy, target = schedule.noised(batch.latents, noise.to(device), timesteps.to(device))
-    predicted = denoiser.predict(noisy, timesteps.to(device), batch.embeddings, batch.conditions)
+    predicted = denoiser.predict(noisy, schedule.told(timesteps.to(device)), batch.embeddings, batch.conditions)
     error = (predicted.float() - target.float()).square().mean(dim=(1, 2, 3))
     return (schedule.loss_weights(timesteps, emphasis).to(device) * error).mean()
 
@@ -183,7 +222,7 @@ def mix_noise(own: Tensor, shared: Tensor, share: float) -> Tensor:
 
 
 def validation_losses(
-    denoiser: Denoiser, schedule: NoiseSchedule, batch: Batch, *, seed: int, batch_size: int
+    denoiser: Denoiser, schedule: NoiseSchedule | FlowSchedule, batch: Batch, *, seed: int, batch_size: int
 ) -> tuple[float, float]:
     """Unweighted loss with the true and with shuffled conditions, over the same noise.
 

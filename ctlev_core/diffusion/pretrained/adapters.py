@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctlev_core.diffusion.pretrained.components import read_json
+from ctlev_core.diffusion.pretrained.model_kinds import is_transformer
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, base_model_places
 from ctlev_core.safe_files.tensor_files import read_tensor_table
 from data_contracts.errors import DataError
@@ -35,8 +36,6 @@ BASE_MODEL = "CTLEV_BASE_MODEL"
 """Where the base model of an adapter lies, if it is no longer where it was."""
 FOLDERS = {"unet": ".", "controlnet": "controlnet"}
 """Where the weights of a network lie."""
-PREFIXES = {"unet": "unet.", "controlnet": ""}
-"""Of the names of its weights, as diffusers expects them."""
 _BUNDLED = "bundled/"
 
 
@@ -55,6 +54,13 @@ class Adapter:
     controlnet: Path | None
     networks: tuple[str, ...]
     digest: str
+
+
+def prefix_of(name: str, network: Any) -> str:
+    """Of the names of a network's additions, as diffusers expects them; `name` is one of `FOLDERS`."""
+    if name == "controlnet":
+        return ""
+    return "transformer." if is_transformer(network) else "unet."
 
 
 def is_adapter(checkpoint: Path) -> bool:
@@ -132,7 +138,8 @@ def merge_adapter(network: nn.Module, name: str, checkpoint: Path) -> None:
     from ctlev_core.diffusion.pretrained.model_building import load_tensor
 
     path = checkpoint / FOLDERS[name] / WEIGHTS_FILE
-    stored = {key.removeprefix(PREFIXES[name]): tensor for key, tensor in read_tensor_table(path).items()}
+    prefix = prefix_of(name, network)
+    stored = {key.removeprefix(prefix): tensor for key, tensor in read_tensor_table(path).items()}
     modules = sorted(key.removesuffix(".lora_A.weight") for key in stored if key.endswith(".lora_A.weight"))
     expected = {f"{module}.lora_{part}.weight" for module in modules for part in "AB"}
     if not modules or expected != stored.keys():

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ctlev_core.diffusion.pretrained.components import ModelFiles, ModelPart, read_json
+from ctlev_core.diffusion.pretrained.model_kinds import is_flow
 from data_contracts.errors import DataError
 
 CLASSES = {
@@ -41,7 +42,7 @@ def check_parts(files: ModelFiles) -> None:
         DataError: what does not fit, expected and got.
     """
     for part in files.parts.values():
-        _check_class(part)
+        check_class(part, CLASSES[part.name])
     unet, vae = (files.parts[name] for name in ("unet", "vae"))
     texts = [files.parts[name] for name in ("text_encoder", "text_encoder_2") if name in files.parts]
     _check_latents(unet, vae)
@@ -49,21 +50,21 @@ def check_parts(files: ModelFiles) -> None:
     _check_prompts(unet, texts)
     for text, tokenizer in zip(texts, (files.tokenizer, files.tokenizer_2), strict=False):
         assert tokenizer is not None
-        _check_tokenizer(tokenizer, text)
+        check_tokenizer(tokenizer, text)
     check_schedule(files)
     if "controlnet" in files.parts:
         _check_controlnet(files.parts["controlnet"], unet, vae)
 
 
-def _check_class(part: ModelPart) -> None:
-    known = CLASSES[part.name]
+def check_class(part: ModelPart, known: Sequence[str]) -> None:
+    """Raise `DataError` where a config names another class than those."""
     named = part.config.get("_class_name") or (part.config.get("architectures") or [None])[0]
     if named is not None and named not in known:
         what = "autoencoder" if part.name == "vae" else part.name
         raise DataError(f"{part.place}: {what} must be one of {', '.join(known)}, got {named!r}")
 
 
-def _shape(part: ModelPart, name: str) -> tuple[int, ...]:
+def shape_of(part: ModelPart, name: str) -> tuple[int, ...]:
     """Of the weight of that name, with or without the prefix that transformers gave up."""
     for candidate in (name, f"text_model.{name}"):
         if candidate in part.tensors:
@@ -71,15 +72,20 @@ def _shape(part: ModelPart, name: str) -> tuple[int, ...]:
     raise DataError(f"{part.place}: {part.name} has no weight {name!r}; it holds {len(part.tensors)} others")
 
 
-def _entry(part: ModelPart, name: str) -> Any:
+def entry_of(part: ModelPart, name: str) -> Any:
+    """Of a config.
+
+    Raises:
+        DataError: there is none.
+    """
     if name not in part.config:
         raise DataError(f"{part.place}: the config of {part.name} has no entry {name!r}")
     return part.config[name]
 
 
-def _channels(part: ModelPart, name: str, entry: str, axis: int) -> int:
+def channels_of(part: ModelPart, name: str, entry: str, axis: int) -> int:
     """A width as its weights have it; the config must agree."""
-    shape, told = _shape(part, name), _entry(part, entry)
+    shape, told = shape_of(part, name), entry_of(part, entry)
     told = told[0] if isinstance(told, list) else told
     if len(shape) <= axis or shape[axis] != told:
         raise DataError(f"{part.place}: config.json says {entry} {told}, weight {name} has shape {list(shape)}")
@@ -87,14 +93,14 @@ def _channels(part: ModelPart, name: str, entry: str, axis: int) -> int:
 
 
 def _check_latents(unet: ModelPart, vae: ModelPart) -> None:
-    makes, takes = int(_entry(vae, "latent_channels")), _shape(unet, "conv_in.weight")[1]
+    makes, takes = int(entry_of(vae, "latent_channels")), shape_of(unet, "conv_in.weight")[1]
     if takes != makes:
         what = f" ({_EXTRA_CHANNELS[takes]})" if makes == 4 and takes in _EXTRA_CHANNELS else ""
         raise DataError(
             f"{unet.place}: the U-Net takes {takes} latent channels{what}, the autoencoder of {vae.place} makes {makes}"
         )
-    _channels(unet, "conv_in.weight", "in_channels", 1)
-    _channels(unet, "conv_in.weight", "block_out_channels", 0)
+    channels_of(unet, "conv_in.weight", "in_channels", 1)
+    channels_of(unet, "conv_in.weight", "block_out_channels", 0)
     side = unet.config.get("sample_size")
     if not isinstance(side, int) or side <= 0:
         raise DataError(f"{unet.place}: sample_size in its config must be the side of square latents, got {side!r}")
@@ -113,8 +119,8 @@ def _check_pooled(unet: ModelPart, texts: Sequence[ModelPart]) -> None:
         )
     if takes != "text_time":
         return
-    pooled, sizes = _shape(texts[1], "text_projection.weight")[0], NUM_SIZES * _entry(unet, "addition_time_embed_dim")
-    wanted = _channels(unet, "add_embedding.linear_1.weight", "projection_class_embeddings_input_dim", 1) - sizes
+    pooled, sizes = shape_of(texts[1], "text_projection.weight")[0], NUM_SIZES * entry_of(unet, "addition_time_embed_dim")
+    wanted = channels_of(unet, "add_embedding.linear_1.weight", "projection_class_embeddings_input_dim", 1) - sizes
     if pooled != wanted:
         raise DataError(
             f"{unet.place}: the U-Net takes pooled embeddings {wanted} wide, the text encoder of "
@@ -123,7 +129,7 @@ def _check_pooled(unet: ModelPart, texts: Sequence[ModelPart]) -> None:
 
 
 def _check_prompts(unet: ModelPart, texts: Sequence[ModelPart]) -> None:
-    makes = sum(_channels(text, "embeddings.token_embedding.weight", "hidden_size", 1) for text in texts)
+    makes = sum(channels_of(text, "embeddings.token_embedding.weight", "hidden_size", 1) for text in texts)
     for part_name, tensor in unet.tensors.items():
         if part_name.endswith(".attn2.to_k.weight") and tensor.shape[-1] != makes:
             takes = tensor.shape[-1]
@@ -138,7 +144,8 @@ def _known_width(width: int) -> str:
     return f" ({_TEXT_WIDTHS[width]})" if width in _TEXT_WIDTHS else ""
 
 
-def _check_tokenizer(folder: Path, text: ModelPart) -> None:
+def check_tokenizer(folder: Path, text: ModelPart) -> None:
+    """Raise `DataError` unless CLIP's tokenizer is there and its tokens have embeddings."""
     whole, vocabulary = folder / "tokenizer.json", folder / "vocab.json"
     if vocabulary.is_file() and (folder / "merges.txt").is_file():
         ids = read_json(vocabulary).values()
@@ -151,7 +158,12 @@ def _check_tokenizer(folder: Path, text: ModelPart) -> None:
     else:
         raise DataError(f"{folder}: no tokenizer; expected vocab.json and merges.txt, or tokenizer.json")
     highest = max((number for number in ids if isinstance(number, int)), default=-1)
-    rows = _shape(text, "embeddings.token_embedding.weight")[0]
+    check_vocabulary(folder, highest, text, "embeddings.token_embedding.weight")
+
+
+def check_vocabulary(folder: Path, highest: int, text: ModelPart, embeddings: str) -> None:
+    """Raise `DataError` unless token ids up to `highest` are rows of a text encoder's weight `embeddings`."""
+    rows = shape_of(text, embeddings)[0]
     if not 0 <= highest < rows:
         raise DataError(f"{folder}: token ids reach {highest}, the text encoder of {text.place} has {rows} embeddings")
 
@@ -199,6 +211,8 @@ def complete_schedule(files: ModelFiles) -> dict[str, Any]:
     Early Stable Diffusion configs do not say what the network predicts: the noise. Several classes clip the images they
     predict to [-1, 1] unless told not to, which is wrong for latents.
     """
+    if is_flow(files.scheduler_config):
+        return dict(files.scheduler_config)
     config = {"prediction_type": "epsilon", **files.scheduler_config, "clip_sample": False, "thresholding": False}
     if files.scheduler_config.get("clip_sample"):
         logger.warning("%s: clip_sample of its scheduler config is ignored: latents go beyond [-1, 1]", files.place)
@@ -222,13 +236,18 @@ def _check_controlnet(controlnet: ModelPart, unet: ModelPart, vae: ModelPart) ->
             f"{controlnet.place}: this ControlNet is made for another U-Net, or a part of it is missing: "
             f"{len(different)} weights are only in one of them, such as {different[0]}"
         )
-    stages = len(_entry(controlnet, "conditioning_embedding_out_channels"))
-    levels = len(_entry(vae, "block_out_channels"))
+    stages = len(entry_of(controlnet, "conditioning_embedding_out_channels"))
+    levels = len(entry_of(vae, "block_out_channels"))
     if stages != levels:
         raise DataError(
             f"{controlnet.place}: the ControlNet reduces condition images {2 ** (stages - 1)} times, "
             f"the autoencoder of {vae.place} reduces images {2 ** (levels - 1)} times"
         )
+    check_channel_order_of(controlnet)
+
+
+def check_channel_order_of(controlnet: ModelPart) -> None:
+    """Raise `DataError` unless a ControlNet's config has a channel order that there is."""
     order = controlnet.config.get("controlnet_conditioning_channel_order", "rgb")
     if order not in ("rgb", "bgr"):
         raise DataError(f"{controlnet.place}: channel order must be 'rgb' or 'bgr', got {order!r}")

@@ -22,7 +22,7 @@ class ModelPart:
     """One network of a base model.
 
     Attributes:
-        name: `unet`, `vae`, `text_encoder`, `text_encoder_2` or `controlnet`.
+        name: `unet` (also a transformer), `vae`, `text_encoder`, `text_encoder_2`, `text_encoder_3` or `controlnet`.
         place: the folder or file it comes from.
         config: as in diffusers' or transformers' `config.json`.
         tensors: where its weights are, by their names in diffusers or transformers.
@@ -40,11 +40,12 @@ class ModelFiles:
 
     Attributes:
         place: the folder or file that was asked for.
-        parts: `text_encoder`, `vae`, `unet`, and `text_encoder_2` and `controlnet` where there is one.
+        parts: `text_encoder`, `vae`, `unet`, and `text_encoder_2`, `text_encoder_3` and `controlnet` where there is one.
         tokenizer: folder of the tokenizer.
         scheduler_config: the noise schedule the base model was trained with.
         tokenizer_2: folder of the tokenizer of `text_encoder_2`.
         zero_empty_prompt: what `model_index.json` calls `force_zeros_for_empty_prompt`.
+        tokenizer_3: folder of the tokenizer of `text_encoder_3`.
     """
 
     place: Path
@@ -53,6 +54,7 @@ class ModelFiles:
     scheduler_config: dict[str, Any]
     tokenizer_2: Path | None = None
     zero_empty_prompt: bool = False
+    tokenizer_3: Path | None = None
 
 
 def read_json(path: Path) -> dict[str, Any]:

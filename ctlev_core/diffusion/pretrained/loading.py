@@ -1,5 +1,5 @@
-"""Load pre-trained weights: a local diffusers folder of Stable Diffusion v1, 2 or XL, a Stable Diffusion v1 file, or
-the bundled small base model alike.
+"""Load pre-trained weights: a local diffusers folder of Stable Diffusion v1, 2, XL or 3, a Stable Diffusion v1 file,
+or the bundled small base model alike.
 
 Nothing is downloaded, and no pickle is run: `docs/weights.md` says what is read and what is checked.
 """
@@ -23,6 +23,7 @@ from ctlev_core.diffusion.pretrained.adapters import check_base_model, is_adapte
 from ctlev_core.diffusion.pretrained.checks import complete_schedule
 from ctlev_core.diffusion.pretrained.components import ZERO_EMPTY_PROMPT, read_json
 from ctlev_core.diffusion.pretrained.model_building import build_model
+from ctlev_core.diffusion.pretrained.model_kinds import is_flow, is_transformer
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, read_base_model_files, read_parts
 from ctlev_core.processes import use_cores_for
 from data_contracts.errors import DataError
@@ -39,16 +40,18 @@ class PretrainedModel:
         tokenizer: text to token ids.
         text_encoder: token ids to prompt embeddings [N, L, D].
         vae: images in [-1, 1] to latents and back.
-        unet: predicts from noisy latents.
+        unet: predicts from noisy latents; of Stable Diffusion 3 the transformer.
         controlnet: steers the U-Net by a condition image; None where the folder has none.
         scheduler_config: the noise schedule the base model was trained with.
         image_size: (width, height) px of the images the U-Net was trained on.
         value_table: [256, 256], how values are drawn about those the networks expect; None = they are taken as they
             are.
         motion: layers that make consecutive frames from one another; None = each frame is made by itself.
-        tokenizer_2: of Stable Diffusion XL, as `tokenizer` for `text_encoder_2`; None = there is one text encoder.
+        tokenizer_2: of Stable Diffusion XL and 3, as `tokenizer` for `text_encoder_2`; None = there is one text encoder.
         text_encoder_2: token ids to prompt embeddings and a pooled one.
         zero_empty_prompt: the empty prompt, of guidance, is zeros; else its embedding.
+        tokenizer_3: of Stable Diffusion 3, as `tokenizer` for `text_encoder_3`.
+        text_encoder_3: T5; None = it was left out, or there is none.
     """
 
     tokenizer: Any
@@ -63,11 +66,22 @@ class PretrainedModel:
     tokenizer_2: Any | None = None
     text_encoder_2: Any | None = None
     zero_empty_prompt: bool = False
+    tokenizer_3: Any | None = None
+    text_encoder_3: Any | None = None
 
     @property
     def scaling_factor(self) -> float:
         """Latents are multiplied by it after encoding."""
         return float(self.vae.config.scaling_factor)
+
+    @property
+    def shift_factor(self) -> float:
+        """Is taken from latents before that."""
+        return float(self.vae.config.get("shift_factor") or 0.0)
+
+    def scale_latents(self, latents: torch.Tensor) -> torch.Tensor:
+        """Latents of the autoencoder as the networks take them."""
+        return (latents - self.shift_factor) * self.scaling_factor
 
     @property
     def reversed_condition(self) -> bool:
@@ -129,6 +143,8 @@ def load_base_model(
         tokenizer_2=tokenizer_2,
         text_encoder_2=second,
         zero_empty_prompt=files.zero_empty_prompt,
+        tokenizer_3=None if files.tokenizer_3 is None else _load_t5_tokenizer(files.tokenizer_3),
+        text_encoder_3=models.get("text_encoder_3"),
     )
 
 
@@ -171,6 +187,24 @@ def _load_tokenizer(folder: Path, max_length: int) -> Any:
     return tokenizer
 
 
+def _load_t5_tokenizer(folder: Path) -> Any:
+    from transformers import AutoTokenizer
+
+    try:
+        return AutoTokenizer.from_pretrained(str(folder), local_files_only=True)
+    except Exception as error:
+        raise DataError(f"{folder}: cannot be loaded as a T5 tokenizer: {error}") from error
+
+
+def training_scheduler(config: dict[str, Any]) -> Any:
+    """The scheduler of diffusers that says which noise a network was trained with."""
+    from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+    from diffusers.schedulers.scheduling_flow_match_euler_discrete import FlowMatchEulerDiscreteScheduler
+
+    kind: Any = FlowMatchEulerDiscreteScheduler if is_flow(config) else DDPMScheduler
+    return kind.from_config(config)
+
+
 def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtype | None = None) -> None:
     """Write an ordinary diffusers pipeline folder, with safetensors weights.
 
@@ -183,10 +217,8 @@ def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtyp
         dtype: of the written weights, their own when None. The autoencoder always stays as it is: half precision would
             break the exactness of the patch code.
     """
-    from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
-
     folder.mkdir(parents=True, exist_ok=True)
-    scheduler: Any = DDPMScheduler.from_config(base_model.scheduler_config)
+    scheduler = training_scheduler(base_model.scheduler_config)
     base_model.vae.save_pretrained(folder / "vae", safe_serialization=True)
     library = _library(base_model.vae)
     if library not in LIBRARIES:
@@ -195,7 +227,9 @@ def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtyp
         library = source.stem
     scheduler.save_pretrained(folder / "scheduler")
     base_model.tokenizer.save_pretrained(folder / "tokenizer")
+    with_transformer = is_transformer(base_model.unet)
     kind = "StableDiffusion" if base_model.text_encoder_2 is None else "StableDiffusionXL"
+    kind = "StableDiffusion3" if with_transformer else kind
     index: dict[str, Any] = {
         "_class_name": f"{kind}Pipeline" if base_model.controlnet is None else f"{kind}ControlNetPipeline",
         "scheduler": ["diffusers", type(scheduler).__name__],
@@ -208,12 +242,19 @@ def save_base_model(base_model: PretrainedModel, folder: Path, dtype: torch.dtyp
         base_model.tokenizer_2.save_pretrained(folder / "tokenizer_2")
         index |= {
             "tokenizer_2": ["transformers", "CLIPTokenizer"],
-            ZERO_EMPTY_PROMPT: base_model.zero_empty_prompt,
         }
-    for name in ("text_encoder", "text_encoder_2", "unet", "controlnet"):
-        model = getattr(base_model, name)
+    if with_transformer:
+        index |= {"tokenizer_3": [None, None], "text_encoder_3": [None, None]}
+    elif base_model.tokenizer_2 is not None:
+        index[ZERO_EMPTY_PROMPT] = base_model.zero_empty_prompt
+    if base_model.tokenizer_3 is not None:
+        base_model.tokenizer_3.save_pretrained(folder / "tokenizer_3")
+        index["tokenizer_3"] = ["transformers", type(base_model.tokenizer_3).__name__]
+    for attribute in ("text_encoder", "text_encoder_2", "text_encoder_3", "unet", "controlnet"):
+        model = getattr(base_model, attribute)
         if model is None:
             continue
+        name = "transformer" if attribute == "unet" and with_transformer else attribute
         index[name] = [_library(model), type(model).__name__]
         written = copy.deepcopy(model)
         for parameter in written.parameters():
@@ -232,6 +273,22 @@ def _library(model: Any) -> str:
     module = type(model).__module__
     top = module.split(".", 1)[0]
     return top if top in LIBRARIES else module
+
+
+@torch.no_grad()
+def control_input(base_model: PretrainedModel, images: torch.Tensor | None) -> torch.Tensor | None:
+    """What the ControlNet takes of condition images [B, 3, H, W] in [0, 1]: themselves, of a transformer latents.
+
+    Those are the means of the autoencoder's posteriors, where diffusers' pipeline draws from them: a condition has no
+    noise of its own. As there, ControlNets that are told no pooled prompt get them without `shift_factor`.
+    """
+    if images is None or base_model.controlnet is None or not is_transformer(base_model.controlnet):
+        return images
+    vae, config = base_model.vae, base_model.controlnet.config
+    latents = vae.encode(2 * images.to(vae.device, vae.dtype) - 1).latent_dist.mean.float()
+    if config.get("force_zeros_for_pooled_projection"):
+        return latents * base_model.scaling_factor
+    return base_model.scale_latents(latents)
 
 
 def encode_posterior(vae: Any, images: Any) -> tuple[torch.Tensor, torch.Tensor | None]:
@@ -256,7 +313,7 @@ def decode_latents(base_model: PretrainedModel, latents: torch.Tensor) -> torch.
         DataError: they are not finite in single precision either.
     """
     vae = base_model.vae
-    latents, dtype = latents.float() / base_model.scaling_factor, vae.dtype
+    latents, dtype = latents.float() / base_model.scaling_factor + base_model.shift_factor, vae.dtype
     images = vae.decode(latents.to(dtype)).sample.float()
     broken = [row for row, image in enumerate(images) if not bool(torch.isfinite(image).all())]
     if broken and dtype != torch.float32:

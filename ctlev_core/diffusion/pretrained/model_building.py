@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.pretrained.components import ModelPart
+from ctlev_core.diffusion.pretrained.model_kinds import TRANSFORMER
 from ctlev_core.safe_files.tensor_files import FLOATS, StoredTensor, read_items
 from data_contracts.errors import DataError
 
 _UNUSED = (".position_ids", "position_ids")
+_TIED = ("encoder.embed_tokens.weight",)
 
 
 def build_model(part: ModelPart, dtype: torch.dtype) -> Any:
@@ -46,21 +48,33 @@ def build_model(part: ModelPart, dtype: torch.dtype) -> Any:
         if expected[name].is_floating_point() and tensor.dtype not in FLOATS:
             raise DataError(f"{tensor.path}: weight {name} is of type {tensor.dtype}; expected {', '.join(FLOATS)}")
     model.load_state_dict({name: load_tensor(tensor, dtype) for name, tensor in stored.items()}, assign=True)
+    if part.name == "text_encoder_3":
+        model.tie_weights()
     return model.eval().requires_grad_(False)
 
 
 def _make_model(part: ModelPart) -> Any:
     from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
     from diffusers.models.controlnets.controlnet import ControlNetModel
+    from diffusers.models.controlnets.controlnet_sd3 import SD3ControlNetModel
+    from diffusers.models.transformers.transformer_sd3 import SD3Transformer2DModel
     from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 
     from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 
+    if part.name == "text_encoder_3":
+        from transformers import T5Config, T5EncoderModel
+
+        return T5EncoderModel(T5Config.from_dict(part.config))
     if part.name in ("text_encoder", "text_encoder_2"):
         from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
-        encoder = CLIPTextModel if part.name == "text_encoder" else CLIPTextModelWithProjection
+        encoder = CLIPTextModelWithProjection if _has_projection(part) else CLIPTextModel
         return encoder(CLIPTextConfig.from_dict(part.config))
+    if part.config.get("_class_name") == TRANSFORMER:
+        return SD3Transformer2DModel.from_config(part.config)
+    if part.config.get("_class_name") == "SD3ControlNetModel":
+        return SD3ControlNetModel.from_config(part.config)
     classes: dict[str, Any] = {
         "unet": UNet2DConditionModel,
         "controlnet": ControlNetModel,
@@ -69,10 +83,17 @@ def _make_model(part: ModelPart) -> Any:
     return classes[part.name].from_config(part.config)
 
 
+def _has_projection(part: ModelPart) -> bool:
+    return part.name == "text_encoder_2" or part.config.get("architectures") == ["CLIPTextModelWithProjection"]
+
+
 def _match_names(part: ModelPart, expected: Mapping[str, Tensor]) -> dict[str, StoredTensor]:
     """The stored tensors by the names of this version of the libraries; the same set as the network's."""
     stored = {name: tensor for name, tensor in part.tensors.items() if not name.endswith(_UNUSED)}
-    if part.name == "text_encoder":  # transformers gave up the prefix in 5.6
+    if part.name == "text_encoder_3" and "shared.weight" in stored:  # one weight, stored under one of its names
+        stored.setdefault("encoder.embed_tokens.weight", stored["shared.weight"])
+        stored = {name: tensor for name, tensor in stored.items() if name in expected or name not in _TIED}
+    if part.name == "text_encoder" and not _has_projection(part):  # transformers gave up the prefix in 5.6
         prefix = "text_model." if any(name.startswith("text_model.") for name in expected) else ""
         stored = {prefix + name.removeprefix("text_model."): tensor for name, tensor in stored.items()}
     missing, unknown = sorted(expected.keys() - stored.keys()), sorted(stored.keys() - expected.keys())

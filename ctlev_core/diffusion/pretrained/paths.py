@@ -13,6 +13,8 @@ from ctlev_core.diffusion.pretrained.components import (
     read_json,
     read_part,
 )
+from ctlev_core.diffusion.pretrained.flow_checks import check_flow_parts, check_transformer_class
+from ctlev_core.diffusion.pretrained.model_kinds import TRANSFORMER
 from ctlev_core.diffusion.pretrained.single_file import (
     ENDINGS,
     files_beside,
@@ -28,6 +30,7 @@ BUNDLED_BASE_MODEL = Path(__file__).resolve().parents[2] / "base_models" / "smal
 BUNDLED_OBJECT_MODEL = BUNDLED_BASE_MODEL.with_name("small_objects")
 """The same networks without ControlNet, taught the names of things: for the text route."""
 COMPONENTS = ("tokenizer", "text_encoder", "vae", "unet", "scheduler")
+TRANSFORMER_COMPONENTS = ("tokenizer", "text_encoder", "tokenizer_2", "text_encoder_2", "vae", "scheduler")
 
 
 def read_base_model_files(path: Path, *, controlnet: Path | None = None, with_controlnet: bool = True) -> ModelFiles:
@@ -54,7 +57,8 @@ def read_base_model_files(path: Path, *, controlnet: Path | None = None, with_co
     elif not with_controlnet:
         parts.pop("controlnet", None)
     files = dataclasses.replace(files, parts=parts)
-    check_parts(files)
+    is_transformer = files.parts["unet"].config.get("_class_name") == TRANSFORMER
+    (check_flow_parts if is_transformer else check_parts)(files)
     for part in files.parts.values():
         check_finite(part.tensors.items())
     return files
@@ -143,7 +147,31 @@ def read_controlnet(path: Path) -> ModelPart:
     return read_single_controlnet(path) if path.is_file() else read_part("controlnet", path)
 
 
+def _read_transformer_folder(folder: Path) -> ModelFiles:
+    """Stable Diffusion 3's; T5, the third text encoder, may be left out, as in diffusers."""
+    network = read_part("unet", folder / "transformer")
+    check_transformer_class(network)
+    missing = [name for name in TRANSFORMER_COMPONENTS if not (folder / name).is_dir()]
+    if missing:
+        raise DataError(f"{folder}: it has a transformer, as Stable Diffusion 3; missing: {', '.join(missing)}")
+    names, has_t5 = ["text_encoder", "text_encoder_2", "vae"], (folder / "text_encoder_3").is_dir()
+    if has_t5:
+        names.append("text_encoder_3")
+        if not (folder / "tokenizer_3").is_dir():
+            raise DataError(f"{folder}: it has text_encoder_3, a T5 encoder; its tokenizer_3 is missing")
+    return ModelFiles(
+        place=folder,
+        parts={"unet": network} | {name: read_part(name, folder / name) for name in names},
+        tokenizer=folder / "tokenizer",
+        scheduler_config=read_json(folder / "scheduler" / "scheduler_config.json"),
+        tokenizer_2=folder / "tokenizer_2",
+        tokenizer_3=folder / "tokenizer_3" if has_t5 else None,
+    )
+
+
 def _read_folder(folder: Path) -> ModelFiles:
+    if (folder / "transformer").is_dir():
+        return _read_transformer_folder(folder)
     missing = [name for name in COMPONENTS if not (folder / name).is_dir()]
     if missing:
         found = sorted(path.name for path in folder.iterdir() if path.is_dir())
@@ -155,8 +183,6 @@ def _read_folder(folder: Path) -> ModelFiles:
             f"{folder}: a diffusers folder has the subfolders {', '.join(COMPONENTS)}; "
             f"missing: {', '.join(missing)}; found: {', '.join(found) or 'none'}"
         )
-    if (folder / "text_encoder_3").is_dir():
-        raise DataError(f"{folder}: expected Stable Diffusion v1, 2 or XL, got Stable Diffusion 3 (text_encoder_3)")
     names, is_xl = ["text_encoder", "vae", "unet"], (folder / "text_encoder_2").is_dir()
     if is_xl:
         names.append("text_encoder_2")

@@ -20,6 +20,7 @@ import torch
 
 from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel
+from ctlev_core.diffusion.pretrained.model_kinds import is_transformer
 
 IMAGE_SIZE = 64
 WIDTHS = (64, 64, 96)
@@ -233,6 +234,12 @@ def break_zeros(controlnet: Any) -> None:
     Zero convolutions protect a trained U-Net. Here both are trained from the start, and zeros would only delay the
     moment when the condition is first used ("sudden convergence") by thousands of steps.
     """
+    if is_transformer(controlnet):
+        for layer in controlnet.controlnet_blocks:
+            torch.nn.init.normal_(layer.weight, std=0.3 / layer.in_features**0.5)
+        patches = controlnet.pos_embed_input.proj
+        torch.nn.init.normal_(patches.weight, std=1.0 / patches.weight[0].numel() ** 0.5)
+        return
     zero_convolutions = [*controlnet.controlnet_down_blocks, controlnet.controlnet_mid_block]
     for convolution in zero_convolutions:
         torch.nn.init.normal_(convolution.weight, std=0.3 / convolution.in_channels**0.5)

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from ctlev_core.diffusion.pretrained.model_kinds import is_transformer
 from data_contracts.errors import DataError
 
 
@@ -30,6 +31,8 @@ def attention_blocks(unet: Any, layers: str) -> list[nn.Module]:
     """
     from diffusers.models.attention import BasicTransformerBlock
 
+    if is_transformer(unet):
+        raise DataError("autoguidance_scale is made for U-Nets; this base model is a transformer: leave it at 1")
     part = unet.mid_block if layers == "middle" else unet
     found: list[nn.Module] = [module for module in part.modules() if isinstance(module, BasicTransformerBlock)]
     if not found:

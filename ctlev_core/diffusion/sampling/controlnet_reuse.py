@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ctlev_core.diffusion.pretrained.model_kinds import is_transformer
+
 
 class _CachedEmbedding(torch.nn.Module):
     """Stands in for a ControlNet's condition embedding, whose output does not depend on the time step.
@@ -30,9 +32,9 @@ def cached_condition_embedding(controlnet: Any | None, conditions: Tensor | None
     """Within the context the condition embedding is computed once; exact, and most of a tiny ControlNet's time.
 
     Red and blue are exchanged where the ControlNet's config asks for it: its own forward pass does so with what it is
-    handed, which is too late for what is computed here.
+    handed, which is too late for what is computed here. Transformers take latents, and have no such embedding.
     """
-    if controlnet is None or conditions is None:
+    if controlnet is None or conditions is None or is_transformer(controlnet):
         yield
         return
     original = controlnet.controlnet_cond_embedding
@@ -56,6 +58,7 @@ class EveryKthStep:
     def __init__(self, network: Any, k: int) -> None:
         self._network, self._k, self._calls, self._num_rows = network, k, 0, 0
         self._residuals: Any = None
+        self.config = network.config
 
     def __call__(self, noisy: Tensor, *arguments: Any, **named: Any) -> Any:
         """As the ControlNet's call: the residuals of the down blocks and of the middle one."""

@@ -53,7 +53,7 @@ def encode_frames(base_model: PretrainedModel, frames: np.ndarray, seeds: Sequen
     latents, deviations = encode_posterior(base_model.vae, frames)
     if deviations is not None:
         latents = latents + deviations * _noise(latents, seeds, ENCODING_STREAM)
-    return latents * base_model.scaling_factor
+    return base_model.scale_latents(latents)
 
 
 def noise_to(latents: Tensor, time_step: int, schedule: NoiseSchedule, seeds: Sequence[int]) -> Tensor:

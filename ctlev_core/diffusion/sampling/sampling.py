@@ -31,6 +31,7 @@ from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
     choose_device,
     conditions_to_tensor,
+    control_input,
     decode_latents,
     load_base_model,
 )
@@ -123,7 +124,7 @@ def guided_predictions(
 ) -> Iterator[Callable[[Tensor, Tensor], Tensor]]:
     """Within the context a function of (noisy latents [B, C, h, w], time step) to the prediction, with guidance.
 
-    It takes the latents in any precision and gives float32; the time step is one integer for all rows.
+    It takes the latents in any precision and gives float32; the time step is one number for all rows.
 
     Args:
         base_model: networks in any precision.
@@ -134,6 +135,7 @@ def guided_predictions(
     """
     device, dtype = base_model.unet.device, base_model.unet.dtype
     embeddings = embeddings.to(device, dtype)
+    conditions = control_input(base_model, conditions)
     conditions = None if conditions is None else conditions.to(device, dtype)
     # What guided steps take: every row without its prompt, then with it.
     both, twice = embeddings, conditions
@@ -177,7 +179,8 @@ def _denoiser(base_model: PretrainedModel, options: SamplingOptions) -> Denoiser
 
 def _is_guided(timestep: Tensor, num_timesteps: int, options: SamplingOptions) -> bool:
     low, high = options.guidance_interval
-    return options.passes_a_step > 1 and low <= float(timestep) / (num_timesteps - 1) <= high
+    share = min(float(timestep) / (num_timesteps - 1), 1.0)  # flow matching goes up to num_timesteps
+    return options.passes_a_step > 1 and low <= share <= high
 
 
 @torch.no_grad()

@@ -23,6 +23,8 @@ from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepSchedu
 from diffusers.schedulers.scheduling_utils import SchedulerOutput
 from torch import Tensor
 
+from ctlev_core.diffusion.flow_matching import refuse_flow, sampling_sigmas
+from ctlev_core.diffusion.pretrained.model_kinds import is_flow
 from ctlev_core.diffusion.sampling.options import OF_STUDENTS, SPACINGS, check_spacing
 from ctlev_core.diffusion.student_files import STUDENT_SCHEDULER, evaluations_of
 from data_contracts.errors import DataError
@@ -110,6 +112,9 @@ _SOLVERS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 
 
+_FLOW_SOLVERS = ("unipc", "dpmpp_2m", "dpmpp_3m", "dpmpp_sde", "ddim")
+
+
 def make_scheduler(
     name: str, config: dict[str, Any], num_inference_steps: int, timestep_spacing: str | None = None
 ) -> Any:
@@ -131,6 +136,8 @@ def make_scheduler(
     """
     timestep_spacing = timestep_spacing or SPACINGS.get(name, ("karras",))[0]
     check_spacing(name, timestep_spacing)
+    if is_flow(config):
+        return _flow_scheduler(name, config, num_inference_steps)
     _check_student(name, config, num_inference_steps)
     schedule = _noise_schedule(config)
     steps = schedule.get("num_train_timesteps", 1000)
@@ -158,6 +165,32 @@ def make_scheduler(
     if hasattr(scheduler, "set_begin_index"):
         # Else the start is looked up by its time step, wrongly where close sigmas round to the same one.
         scheduler.set_begin_index(0)
+    return scheduler
+
+
+def _flow_scheduler(name: str, config: dict[str, Any], num_inference_steps: int) -> Any:
+    """A solver for flow matching, at the steps of the base model's own pipeline whatever spacing is asked for."""
+    if name not in _FLOW_SOLVERS:
+        raise DataError(
+            f"scheduler {name!r} is not made for flow matching; take one of {', '.join(_FLOW_SOLVERS)} with this base model"
+        )
+    num_timesteps = config.get("num_train_timesteps", 1000)
+    if not 1 <= num_inference_steps <= num_timesteps:
+        raise ValueError(
+            f"the noise schedule has 1 to {num_timesteps} steps, got num_inference_steps {num_inference_steps}"
+        )
+    solver, settings = _SOLVERS[name]
+    if name == "unipc" and num_inference_steps < THIRD_ORDER_FROM:
+        settings = {**settings, "solver_order": 2}
+    scheduler = solver(
+        num_train_timesteps=num_timesteps, prediction_type="flow_prediction", use_flow_sigmas=True,
+        flow_shift=config.get("shift", 1.0), **settings,
+    )  # fmt: skip
+    scheduler.set_timesteps(num_inference_steps)
+    # The time steps are no whole numbers: solvers would round what the network is told.
+    scheduler.sigmas = sampling_sigmas(config, num_inference_steps)
+    scheduler.timesteps = num_timesteps * scheduler.sigmas[:-1]
+    scheduler.set_begin_index(0)
     return scheduler
 
 
@@ -227,6 +260,7 @@ def _drop_step_before_the_first(scheduler: Any, num_inference_steps: int) -> Non
 
 def _noise_schedule(config: dict[str, Any]) -> dict[str, Any]:
     """The part of a scheduler config that says which noise the network was trained with."""
+    refuse_flow(config, "a student, or this study of solvers,")
     schedule = {key: config[key] for key in _NOISE_SCHEDULE if key in config}
     prediction_type = schedule.get("prediction_type", "epsilon")
     if prediction_type not in PREDICTION_TYPES:

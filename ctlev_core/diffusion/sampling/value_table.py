@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, generator_for
+from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, generator_for, noise_schedule
+from ctlev_core.diffusion.flow_matching import FlowSchedule
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, decode_latents
 from data_contracts.errors import DataError
 
@@ -54,7 +55,7 @@ def fit_value_table(
     kept = np.arange(len(frames))[: max(MAX_PIXELS // per_frame, 1)]
     repeats = max(-(-MIN_PIXELS // (per_frame * len(kept))), 1)
     counts = np.zeros((256, 256))
-    schedule = NoiseSchedule(base_model.scheduler_config)
+    schedule = noise_schedule(base_model.scheduler_config)
     for repeat in range(repeats):
         for rows in _batches(kept):
             expected = _expected(
@@ -133,7 +134,7 @@ def _batches(rows: np.ndarray) -> Iterator[np.ndarray]:
 @torch.no_grad()
 def _expected(
     base_model: PretrainedModel,
-    schedule: NoiseSchedule,
+    schedule: NoiseSchedule | FlowSchedule,
     latents: Tensor,
     embeddings: Tensor,
     timestep: int,
@@ -145,7 +146,8 @@ def _expected(
     noise = torch.randn(latents.shape, generator=generator_for(*entropy))
     noisy, _ = schedule.noised(latents, noise, timesteps)
     denoiser = Denoiser(base_model.unet)
-    predicted = denoiser.predict(noisy.to(device), timesteps.to(device), embeddings.to(device), None).float()
+    told = schedule.told(timesteps.to(device))
+    predicted = denoiser.predict(noisy.to(device), told, embeddings.to(device), None).float()
     clean = schedule.clean_of(predicted, noisy.to(device), timesteps.to(device))
     values = (decode_latents(base_model, clean) + 1) * 127.5
     return values.clamp(0, 255).round().long().permute(0, 2, 3, 1).cpu().numpy()

@@ -17,9 +17,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
+from ctlev_core.diffusion.denoising import Batch, Denoiser, generator_for, noise_schedule, validation_losses
 from ctlev_core.diffusion.pretrained.fit import check_channel_order
-from ctlev_core.diffusion.pretrained.loading import PretrainedModel
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, control_input
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts, put_text_encoders_aside
 from ctlev_core.diffusion.pretraining.architecture import break_zeros
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
@@ -120,7 +120,7 @@ def fine_tune(
     validated = len(validation_rows) >= 2
     check_run(trainer, distributed, validated=validated)
     denoiser = Denoiser(base_model.unet, base_model.controlnet)
-    schedule = NoiseSchedule(base_model.scheduler_config)
+    schedule = noise_schedule(base_model.scheduler_config)
     cache = cache_latents(
         base_model,
         frames,
@@ -136,18 +136,21 @@ def fine_tune(
     num_pictures = round(options.batch_size * options.rehearsal_share)
     rehearsal = Rehearsal(options.rehearsal, base_model.image_size[0]) if num_pictures else None
 
+    def steered(batch: Batch) -> Batch:
+        return replace(batch, conditions=control_input(base_model, batch.conditions))
+
     def fetch(number: int) -> Batch:
         rows = training_rows[sample_rows(seed, number, options.batch_size - num_pictures, len(training_rows))]
         turns = draw_turns(len(rows), options.rot90_probability, seed, number) if options.rot90_probability else None
         generator = generator_for(seed, LATENT_STREAM, number)
-        batch = cache.batch(rows, generator, options.prompt_dropout, device, turns)
+        batch = steered(cache.batch(rows, generator, options.prompt_dropout, device, turns))
         if options.moves.moves_anything:
             moved = move_frames(frames[rows], options, seed, number)
             batch = replace(batch, latents=encode_images(base_model, moved, generator).to(device))
         return batch if rehearsal is None else _with_pictures(batch, base_model, rehearsal, options, seed, number)
 
     def validate() -> tuple[float, float]:
-        batch = cache.batch(validation_rows, generator_for(seed, DROPOUT_STREAM), 0.0, device)
+        batch = steered(cache.batch(validation_rows, generator_for(seed, DROPOUT_STREAM), 0.0, device))
         return validation_losses(denoiser, schedule, batch, seed=seed, batch_size=options.batch_size)
 
     shown = np.sort(validation_rows if len(validation_rows) else training_rows)[:SHOWN]
@@ -230,7 +233,7 @@ def _value_table(
     seed: int,
 ) -> np.ndarray:
     batch = cache.batch(rows, generator_for(seed, VALUE_STREAM), 0.0, torch.device("cpu"))
-    timestep = round(options.values_at * (len(NoiseSchedule(base_model.scheduler_config).alphas_cumprod) - 1))
+    timestep = round(options.values_at * (noise_schedule(base_model.scheduler_config).num_timesteps - 1))
     return fit_value_table(base_model, frames[rows], batch.latents, batch.embeddings, timestep=timestep, seed=seed)
 
 

@@ -19,8 +19,8 @@ from torch.distributed.tensor import DTensor, distribute_tensor
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel
 from ctlev_core.diffusion.training.options import FineTuningOptions
 
-BLOCKS = ("down_blocks", "mid_block", "up_blocks", "controlnet_cond_embedding")
-"""Parts of a U-Net and of a ControlNet whose weights are put together at a time; what is left is one part more."""
+BLOCKS = ("down_blocks", "mid_block", "up_blocks", "controlnet_cond_embedding", "transformer_blocks")
+"""Parts of a network whose weights are put together at a time; what is left is one part more."""
 
 
 def check_sharding(options: FineTuningOptions) -> None:

@@ -30,6 +30,7 @@ class LatentCache:
     Attributes:
         latents: of all frames and turns.
         scaling_factor: multiplies sampled latents.
+        shift_factor: is taken from them before.
         embeddings: [P, L, D] of the distinct prompts; the last is the empty prompt.
         prompt_rows: for each of N frames the indices into `embeddings` of the prompts it may be shown with.
         conditions: [N, H, W, 3] uint8, or None.
@@ -42,6 +43,7 @@ class LatentCache:
     prompt_rows: tuple[Tensor, ...]
     conditions: Images | None
     made_by: ConditionChoice | None = None
+    shift_factor: float = 0.0
 
     def batch(
         self,
@@ -75,7 +77,7 @@ class LatentCache:
             if turns is not None:
                 images = turn_conditions(images, turns, self.made_by)
             conditions = conditions_to_tensor(images).to(device)
-        latents = latents * self.scaling_factor
+        latents = (latents - self.shift_factor) * self.scaling_factor
         return Batch(latents.to(device), self.embeddings[prompts].to(device), conditions)
 
 
@@ -119,6 +121,7 @@ def cache_latents(
     return LatentCache(
         latents=latents,
         scaling_factor=base_model.scaling_factor,
+        shift_factor=base_model.shift_factor,
         embeddings=encode_prompts(base_model, [*prompts, ""]).float().cpu(),
         prompt_rows=_prompt_rows([position[prompt] for prompt in conditions.prompts], class_names),
         conditions=conditions.images,
@@ -133,7 +136,7 @@ def encode_images(base_model: PretrainedModel, images: np.ndarray, generator: to
     if deviations is not None:
         noise = torch.randn(latents.shape, generator=generator)
         latents = latents + deviations * noise.to(latents.device)
-    return latents * base_model.scaling_factor
+    return base_model.scale_latents(latents)
 
 
 def turn_conditions(images: np.ndarray, turns: np.ndarray, made_by: ConditionChoice | None) -> np.ndarray:

@@ -16,6 +16,7 @@ import torch
 
 from ctlev_core.determinism import deterministic
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, generator_for
+from ctlev_core.diffusion.flow_matching import FlowSchedule
 from ctlev_core.diffusion.training.acceleration import accelerated, autocast, check_precision
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.options import TrainingOptions
@@ -52,7 +53,7 @@ def check_run(trainer: Trainer, distributed: DistributedContext, *, validated: b
 def run_training(
     trainer: Trainer,
     denoiser: Denoiser,
-    schedule: NoiseSchedule,
+    schedule: NoiseSchedule | FlowSchedule,
     fetch: Callable[[int], Batch],
     *,
     seed: int,
@@ -126,7 +127,9 @@ def run_training(
     return trainer.finish()
 
 
-def _denoising(denoiser: Denoiser, schedule: NoiseSchedule, options: TrainingOptions) -> BatchLoss:
+def _denoising(
+    denoiser: Denoiser, schedule: NoiseSchedule | FlowSchedule, options: TrainingOptions
+) -> BatchLoss:
     emphasis = Emphasis(options.snr_gamma, options.max_loss_weight, options.timestep_power)
     return lambda batch, generator: denoising_loss(denoiser, schedule, batch, generator, emphasis)
 

@@ -12,12 +12,15 @@ from typing import Any
 
 import torch
 
-from ctlev_core.diffusion.pretrained.adapters import FOLDERS, PREFIXES, WEIGHTS_FILE, write_adapter
-from ctlev_core.diffusion.pretrained.loading import PretrainedModel
+from ctlev_core.diffusion.pretrained.adapters import FOLDERS, WEIGHTS_FILE, prefix_of, write_adapter
+from ctlev_core.diffusion.pretrained.loading import PretrainedModel, training_scheduler
+from ctlev_core.diffusion.pretrained.model_kinds import is_transformer
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.errors import DataError
 
 ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
+OF_PROMPTS = ["add_q_proj", "add_k_proj", "add_v_proj", "to_add_out"]
+"""Attention of a transformer from and to the prompt, beside that of the image."""
 LORA_STREAM = 17
 MIN_CHANNELS = 5
 """A layer to or from an image or latents is small itself."""
@@ -43,7 +46,8 @@ def add_lora(networks: dict[str, Any], options: FineTuningOptions, seed: int) ->
 
     parameters = []
     for number, network in enumerate(networks.values()):
-        layers = ATTENTION if options.lora_layers == "attention" else _layers(network)
+        attention = ATTENTION + OF_PROMPTS * is_transformer(network)
+        layers = attention if options.lora_layers == "attention" else _layers(network)
         network.requires_grad_(False)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed * 1000 + LORA_STREAM + number)
@@ -71,7 +75,6 @@ def _layers(network: Any) -> list[str]:
 
 def save_lora(base_model: PretrainedModel, options: FineTuningOptions, controlnet: Path | None, folder: Path) -> None:
     """Write what was learnt to a folder; see `ctlev_core.diffusion.pretrained.adapters`."""
-    from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
     from peft.utils import get_peft_model_state_dict
     from safetensors.torch import save_file
 
@@ -81,11 +84,11 @@ def save_lora(base_model: PretrainedModel, options: FineTuningOptions, controlne
         if not getattr(network, "peft_config", None):
             continue
         adapted.append(name)
-        weights = {PREFIXES[name] + key: value.cpu() for key, value in get_peft_model_state_dict(network).items()}
+        prefix = prefix_of(name, network)
+        weights = {prefix + key: value.cpu() for key, value in get_peft_model_state_dict(network).items()}
         path = folder / FOLDERS[name] / WEIGHTS_FILE
         path.parent.mkdir(parents=True, exist_ok=True)
         # Not by diffusers, which writes a set beside them, whose order is another in each process.
         save_file({key: weights[key].contiguous() for key in sorted(weights)}, path, metadata={"format": "pt"})
-    scheduler: Any = DDPMScheduler.from_config(base_model.scheduler_config)
-    scheduler.save_pretrained(folder / "scheduler")
+    training_scheduler(base_model.scheduler_config).save_pretrained(folder / "scheduler")
     write_adapter(folder, options.base_model, controlnet, adapted)
