@@ -91,7 +91,11 @@ class Denoiser:
             if self.controlnet.config.get("force_zeros_for_pooled_projection"):
                 arguments["pooled_projections"] = torch.zeros_like(arguments["pooled_projections"])
             made = self.controlnet(
-                noisy[:steered], controlnet_cond=conditions, timestep=timesteps[:steered], **arguments, return_dict=False
+                noisy[:steered],
+                controlnet_cond=conditions,
+                timestep=timesteps[:steered],
+                **arguments,
+                return_dict=False,
             )[0]
             residuals = [_padded(residual, len(noisy)) for residual in made]
         return self.unet(
@@ -135,8 +139,8 @@ class NoiseSchedule:
         """Time steps [count] int64 of a training."""
         return emphasis.draw(count, self.num_timesteps, generator)
 
-    def told(self, timesteps: Tensor) -> Tensor:
-        """What the network is told of time steps [B]: themselves."""
+    def times(self, timesteps: Tensor) -> Tensor:
+        """What the network gets as its time [B] at time steps [B]: themselves."""
         return timesteps
 
     def noised(self, latents: Tensor, noise: Tensor, timesteps: Tensor) -> tuple[Tensor, Tensor]:
@@ -208,7 +212,7 @@ def denoising_loss(
         noise = mix_noise(noise, shared.repeat_interleave(batch.num_frames, 0), batch.shared_noise)
     device = batch.latents.device
     noisy, target = schedule.noised(batch.latents, noise.to(device), timesteps.to(device))
-    predicted = denoiser.predict(noisy, schedule.told(timesteps.to(device)), batch.embeddings, batch.conditions)
+    predicted = denoiser.predict(noisy, schedule.times(timesteps.to(device)), batch.embeddings, batch.conditions)
     error = (predicted.float() - target.float()).square().mean(dim=(1, 2, 3))
     return (schedule.loss_weights(timesteps, emphasis).to(device) * error).mean()
 

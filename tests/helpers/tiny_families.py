@@ -93,7 +93,12 @@ def _write_sd3(folder: Path) -> Path:
 
 def _write_t5_tokenizer(folder: Path) -> None:
     words = sorted({word for line in CORPUS for word in line.split()})[:150]
-    tokens = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), *((f"\u2581{word}", -float(n)) for n, word in enumerate(words))]
+    tokens = [
+        ("<pad>", 0.0),
+        ("</s>", 0.0),
+        ("<unk>", 0.0),
+        *((f"\u2581{word}", -float(n)) for n, word in enumerate(words)),
+    ]
     tokenizer = Tokenizer(models.Unigram(tokens, unk_id=2))
     tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
     tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])

@@ -119,7 +119,10 @@ def _check_pooled(unet: ModelPart, texts: Sequence[ModelPart]) -> None:
         )
     if takes != "text_time":
         return
-    pooled, sizes = shape_of(texts[1], "text_projection.weight")[0], NUM_SIZES * entry_of(unet, "addition_time_embed_dim")
+    pooled, sizes = (
+        shape_of(texts[1], "text_projection.weight")[0],
+        NUM_SIZES * entry_of(unet, "addition_time_embed_dim"),
+    )
     wanted = channels_of(unet, "add_embedding.linear_1.weight", "projection_class_embeddings_input_dim", 1) - sizes
     if pooled != wanted:
         raise DataError(

@@ -40,7 +40,7 @@ class ModelFiles:
 
     Attributes:
         place: the folder or file that was asked for.
-        parts: `text_encoder`, `vae`, `unet`, and `text_encoder_2`, `text_encoder_3` and `controlnet` where there is one.
+        parts: `text_encoder`, `vae`, `unet`, and where they are there `text_encoder_2`, `text_encoder_3`, `controlnet`.
         tokenizer: folder of the tokenizer.
         scheduler_config: the noise schedule the base model was trained with.
         tokenizer_2: folder of the tokenizer of `text_encoder_2`.

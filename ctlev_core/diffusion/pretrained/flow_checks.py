@@ -113,10 +113,13 @@ def _check_schedule(files: ModelFiles) -> None:
 
 
 def _check_controlnet(controlnet: ModelPart, network: ModelPart) -> None:
-    if controlnet.config.get("joint_attention_dim") is None or controlnet.config.get("pos_embed_type", "sincos") is None:
+    if (
+        controlnet.config.get("joint_attention_dim") is None
+        or controlnet.config.get("pos_embed_type", "sincos") is None
+    ):
         raise DataError(
-            f"{controlnet.place}: this ControlNet sees neither prompt nor place, as those of Stable Diffusion 3.5 Large; "
-            "expected one as of Stable Diffusion 3"
+            f"{controlnet.place}: this ControlNet takes neither prompt nor positions, as those of Stable Diffusion 3.5 "
+            "Large; expected one as of Stable Diffusion 3"
         )
     if controlnet.config.get("extra_conditioning_channels"):
         raise DataError(f"{controlnet.place}: this ControlNet takes a mask beside its image, as for inpainting")

@@ -47,7 +47,7 @@ class PretrainedModel:
         value_table: [256, 256], how values are drawn about those the networks expect; None = they are taken as they
             are.
         motion: layers that make consecutive frames from one another; None = each frame is made by itself.
-        tokenizer_2: of Stable Diffusion XL and 3, as `tokenizer` for `text_encoder_2`; None = there is one text encoder.
+        tokenizer_2: of Stable Diffusion XL and 3, as `tokenizer` for `text_encoder_2`; None = there is no second one.
         text_encoder_2: token ids to prompt embeddings and a pooled one.
         zero_empty_prompt: the empty prompt, of guidance, is zeros; else its embedding.
         tokenizer_3: of Stable Diffusion 3, as `tokenizer` for `text_encoder_3`.

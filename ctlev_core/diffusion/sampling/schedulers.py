@@ -140,9 +140,7 @@ def make_scheduler(
         return _flow_scheduler(name, config, num_inference_steps)
     _check_student(name, config, num_inference_steps)
     schedule = _noise_schedule(config)
-    steps = schedule.get("num_train_timesteps", 1000)
-    if not 1 <= num_inference_steps <= steps:
-        raise ValueError(f"the noise schedule has 1 to {steps} steps, got num_inference_steps {num_inference_steps}")
+    steps = _check_steps(config, num_inference_steps)
     if timestep_spacing == "linspace" and num_inference_steps in (1, steps):
         # A single step must be the first, and all steps must be each once: rounding would get both wrong.
         timestep_spacing = "trailing"
@@ -168,17 +166,22 @@ def make_scheduler(
     return scheduler
 
 
+def _check_steps(config: dict[str, Any], num_inference_steps: int) -> int:
+    """The steps of the noise schedule, of which no more can be taken."""
+    steps = config.get("num_train_timesteps", 1000)
+    if not 1 <= num_inference_steps <= steps:
+        raise ValueError(f"the noise schedule has 1 to {steps} steps, got num_inference_steps {num_inference_steps}")
+    return steps
+
+
 def _flow_scheduler(name: str, config: dict[str, Any], num_inference_steps: int) -> Any:
-    """A solver for flow matching, at the steps of the base model's own pipeline whatever spacing is asked for."""
+    """A solver for flow matching, at steps of its own whatever spacing is asked for."""
     if name not in _FLOW_SOLVERS:
         raise DataError(
-            f"scheduler {name!r} is not made for flow matching; take one of {', '.join(_FLOW_SOLVERS)} with this base model"
+            f"scheduler {name!r} is not made for flow matching; with this base model take one of "
+            f"{', '.join(_FLOW_SOLVERS)}"
         )
-    num_timesteps = config.get("num_train_timesteps", 1000)
-    if not 1 <= num_inference_steps <= num_timesteps:
-        raise ValueError(
-            f"the noise schedule has 1 to {num_timesteps} steps, got num_inference_steps {num_inference_steps}"
-        )
+    num_timesteps = _check_steps(config, num_inference_steps)
     solver, settings = _SOLVERS[name]
     if name == "unipc" and num_inference_steps < THIRD_ORDER_FROM:
         settings = {**settings, "solver_order": 2}
@@ -187,8 +190,8 @@ def _flow_scheduler(name: str, config: dict[str, Any], num_inference_steps: int)
         flow_shift=config.get("shift", 1.0), **settings,
     )  # fmt: skip
     scheduler.set_timesteps(num_inference_steps)
-    # The time steps are no whole numbers: solvers would round what the network is told.
-    scheduler.sigmas = sampling_sigmas(config, num_inference_steps)
+    # Times are no whole numbers, to which solvers would round them.
+    scheduler.sigmas = sampling_sigmas(num_inference_steps)
     scheduler.timesteps = num_timesteps * scheduler.sigmas[:-1]
     scheduler.set_begin_index(0)
     return scheduler

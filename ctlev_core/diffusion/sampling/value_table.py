@@ -146,8 +146,8 @@ def _expected(
     noise = torch.randn(latents.shape, generator=generator_for(*entropy))
     noisy, _ = schedule.noised(latents, noise, timesteps)
     denoiser = Denoiser(base_model.unet)
-    told = schedule.told(timesteps.to(device))
-    predicted = denoiser.predict(noisy.to(device), told, embeddings.to(device), None).float()
+    times = schedule.times(timesteps.to(device))
+    predicted = denoiser.predict(noisy.to(device), times, embeddings.to(device), None).float()
     clean = schedule.clean_of(predicted, noisy.to(device), timesteps.to(device))
     values = (decode_latents(base_model, clean) + 1) * 127.5
     return values.clamp(0, 255).round().long().permute(0, 2, 3, 1).cpu().numpy()

@@ -127,9 +127,7 @@ def run_training(
     return trainer.finish()
 
 
-def _denoising(
-    denoiser: Denoiser, schedule: NoiseSchedule | FlowSchedule, options: TrainingOptions
-) -> BatchLoss:
+def _denoising(denoiser: Denoiser, schedule: NoiseSchedule | FlowSchedule, options: TrainingOptions) -> BatchLoss:
     emphasis = Emphasis(options.snr_gamma, options.max_loss_weight, options.timestep_power)
     return lambda batch, generator: denoising_loss(denoiser, schedule, batch, generator, emphasis)
 
