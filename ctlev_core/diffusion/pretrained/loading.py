@@ -77,7 +77,7 @@ class PretrainedModel:
     @property
     def shift_factor(self) -> float:
         """Is taken from latents before that."""
-        return float(self.vae.config.get("shift_factor") or 0.0)
+        return float(getattr(self.vae.config, "shift_factor", None) or 0.0)
 
     def scale_latents(self, latents: torch.Tensor) -> torch.Tensor:
         """Latents of the autoencoder as the networks take them."""

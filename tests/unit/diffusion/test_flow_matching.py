@@ -48,18 +48,18 @@ def solve(name, steps, clean_of, count=1, seed=0):
 
 
 @pytest.mark.parametrize("shift", [1.0, 3.0])
-def test_noise_and_what_the_network_is_told_are_those_of_diffusers(shift):
+def test_noise_and_times_are_those_of_diffusers(shift):
     config = CONFIG | {"shift": shift}
     reference, schedule = FlowMatchEulerDiscreteScheduler.from_config(config), FlowSchedule(config)
     generator = torch.Generator().manual_seed(0)
     latents, noise = (torch.randn((1000, 2, 3, 3), generator=generator) for _ in range(2))
     noisy, target = schedule.noised(latents, noise, torch.arange(1000))
-    told = schedule.times(torch.arange(1000))
-    torch.testing.assert_close(told, reference.timesteps.flip(0))
+    times = schedule.times(torch.arange(1000))
+    torch.testing.assert_close(times, reference.timesteps.flip(0))
     expected = reference.scale_noise(latents, reference.timesteps.flip(0), noise)
     torch.testing.assert_close(noisy, expected, atol=1e-6, rtol=1e-5)
     torch.testing.assert_close(schedule.clean_of(target, noisy, torch.arange(1000)), latents, atol=1e-5, rtol=1e-5)
-    assert told[0] > 0 and told[-1] == 1000
+    assert times[0] > 0 and times[-1] == 1000
 
 
 def test_time_steps_are_logit_normal_as_in_the_paper():
