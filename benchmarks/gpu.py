@@ -34,13 +34,22 @@ import training
 from interleaved import Comparison, describe_machine, matmul_flops, print_comparisons, print_targets
 from torch.utils.flop_counter import FlopCounterMode
 
+from ctlev_core.diffusion.denoising import Batch, Denoiser, denoising_loss, noise_schedule
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, choose_device
+from ctlev_core.diffusion.pretrained.model_kinds import FLOW_SCHEDULER
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
+from ctlev_core.diffusion.pretrained.prompts import T5_TOKENS
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import compile_for_sampling
 from ctlev_core.stand_ins.networks import Size, build_network, stable_diffusion_configs
 
 MATMUL_SIDE = {"cuda": 8192, "cpu": 512}
+STABLE_DIFFUSION_3 = {
+    "patch_size": 2, "in_channels": 16, "out_channels": 16, "num_layers": 24, "attention_head_dim": 64,
+    "num_attention_heads": 24, "joint_attention_dim": 4096, "caption_projection_dim": 1536,
+    "pooled_projection_dim": 2048, "pos_embed_max_size": 192,
+}  # fmt: skip
+"""The config of Stable Diffusion 3 Medium's transformer."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -195,6 +204,65 @@ def measure_training(
     found.append(training.compare(base_model, same, options, route, chosen.rounds, chosen.steps, name))
 
 
+def measure_transformer(chosen: Any, device: torch.device, limit: float, _found: list[Comparison]) -> None:
+    """Stable Diffusion 3 Medium, random weights: gradients of a training step, and one evaluation of sampling."""
+    from diffusers.models.transformers.transformer_sd3 import SD3Transformer2DModel
+
+    side, precision = chosen.image_size // 8, getattr(torch, chosen.precision)
+    small = {"num_layers": 2, "num_attention_heads": 2, "caption_projection_dim": 128} if chosen.size == "tiny" else {}
+    torch.manual_seed(0)
+    with torch.device(device):
+        network = SD3Transformer2DModel.from_config({**STABLE_DIFFUSION_3, **small, "sample_size": side})
+    schedule = noise_schedule({"_class_name": FLOW_SCHEDULER, "num_train_timesteps": 1000, "shift": 3.0})
+
+    def batch(count: int, dtype: torch.dtype) -> Batch:
+        rows = 77 + T5_TOKENS + 1
+        embeddings = torch.randn((count, rows, network.config.joint_attention_dim), device=device, dtype=dtype)
+        return Batch(
+            torch.randn((count, network.config.in_channels, side, side), device=device, dtype=dtype), embeddings
+        )
+
+    def step(given: Batch) -> None:
+        network.zero_grad(set_to_none=True)
+        with torch.autocast(device.type, precision, enabled=precision != torch.float32):
+            loss = denoising_loss(Denoiser(network), schedule, given, torch.Generator().manual_seed(0))
+        loss.backward()
+
+    def evaluate(given: Batch) -> None:
+        times = torch.full((len(given.latents),), 500.0, device=device)
+        with torch.no_grad():
+            Denoiser(network).predict(given.latents, times, given.embeddings, None)
+
+    network.train()
+    for checkpointing in (False, True):
+        (network.enable_gradient_checkpointing if checkpointing else network.disable_gradient_checkpointing)()
+        name = "gradients, checkpointing" if checkpointing else "gradients"
+        _report(name, partial(step, batch(chosen.batch_size, torch.float32)), chosen.batch_size, device, limit)
+    network.zero_grad(set_to_none=True)
+    network.to(precision).eval()
+    count = chosen.sampling_batch_size
+    _report("one evaluation", partial(evaluate, batch(count, precision)), count, device, limit)
+
+
+def _report(name: str, work: Callable[[], None], count: int, device: torch.device, limit: float) -> None:
+    """Time of the third run, of the operations that torch counts, and peak memory."""
+    with FlopCounterMode(display=False) as counter:
+        work()
+    work()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+    start = time.perf_counter()
+    work()
+    peak = ""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        peak = f", {torch.cuda.max_memory_allocated(device) / 1e9:.1f} GB"
+    seconds = time.perf_counter() - start
+    rate = counter.get_total_flops() / seconds
+    print(f"  {name}, batch of {count}: {1e3 * seconds:.1f} ms, {rate / limit:.0%} of the matrix product{peak}")
+
+
 PARTS: dict[str, Callable[[Any, torch.device, float, list[Comparison]], None]] = {
     "sampling": partial(measure_sampling, False),
     "sampling_compiled": partial(measure_sampling, True),
@@ -202,6 +270,7 @@ PARTS: dict[str, Callable[[Any, torch.device, float, list[Comparison]], None]] =
     "controlnet_compiled": partial(measure_training, "controlnet", ("compile_networks=true",)),
     "text": partial(measure_training, "text", ()),
     "text_compiled": partial(measure_training, "text", ("compile_networks=true",)),
+    "transformer": measure_transformer,
 }
 
 if __name__ == "__main__":

@@ -1,17 +1,14 @@
-"""Hours and storage that a generator of Stable Diffusion's size would take, by calculation.
-
-Operations per image as torch's FlopCounterMode counts them for Stable Diffusion v1.4 and ControlNet v1.0, latents
-cached while training.
-"""
+"""Hours and storage that a generator of Stable Diffusion's size would take, by calculation; latents are cached."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ctlev_core import plugins
 from data_contracts.experiment import Experiment
+from flows.network_operations import Networks, learning, read_networks, stable_diffusion_v1
 
 TRAINING_RATE = {"bfloat16": 168e12, "float16": 168e12, "float32": 50e12}
 SAMPLING_RATE = {"bfloat16": 330e12, "float16": 330e12, "float32": 50e12}
@@ -25,12 +22,6 @@ PIXELS = 3
 COMPRESSION = 5
 """How many times smaller samples are stored. Of `benchmarks/arrays.py`, recorded frames of 512 px are 24 to 190 times
 smaller; those sampled in the preset `smoke`, 64 px, 15. Sampled ones of 512 px were not measured: this is cautious."""
-_TERA = 1e12
-# (at 512 px, at 256 px): TFLOP an image.
-_OPERATIONS = {
-    "unet": (0.803, 0.180), "controlnet": (0.283, 0.063), "encoding": (1.117, 0.273), "decoding": (2.515, 0.622),
-    "tune unet": (2.41, 0.537), "tune controlnet": (2.27, 0.493),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -73,8 +64,9 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
     controlled = experiment.generator.name == "controlnet"
     per_step = options["batch_size"] * options["gradient_accumulation"]
     images = options["num_steps"] * per_step * experiment.num_generators
-    forward = operations("unet", width, height) + controlled * operations("controlnet", width, height)
-    backward = training_operations(options["tune"], width, height)
+    networks = _networks(given, controlled)
+    forward = networks.operations("denoising", width, height)
+    backward = networks.operations(learning(options["tune"]), width, height)
     # As if guidance were at every step: where steps lie in its interval depends on the checkpoint's schedule.
     guided = sum(sampled.get(name, 1.0) > 1 for name in ("guidance_scale", "autoguidance_scale"))
     evaluations = sampled["num_inference_steps"] * (1 + guided)
@@ -85,7 +77,7 @@ def estimate_costs(experiment: Experiment) -> Costs | None:
         num_samples=samples,
         num_steps=sampled["num_inference_steps"],
         sampling_s=samples
-        * (evaluations * forward + operations("decoding", width, height))
+        * (evaluations * forward + networks.operations("decoding", width, height))
         / SAMPLING_RATE[sampled["precision"]],
         frames_bytes=samples * width * height * PIXELS // COMPRESSION,
     )
@@ -96,15 +88,11 @@ def _with_defaults(generator: str, model: str, given: dict[str, Any]) -> dict[st
     return {name: given.get(name, field.default) for name, field in fields.items()}
 
 
-def training_operations(tune: str, width: int, height: int) -> float:
-    """Operations of a training step for an image, where the networks that `tune` names learn."""
-    if tune == "both":
-        return 3 * (operations("unet", width, height) + operations("controlnet", width, height))
-    return operations(f"tune {tune}", width, height)
-
-
-def operations(what: str, width: int, height: int) -> float:
-    """Operations an image of a part of `_OPERATIONS`: a power of its area through the two sizes that were counted."""
-    large, small = _OPERATIONS[what]
-    exponent = math.log(large / small) / math.log(4)
-    return _TERA * large * (width * height / 512**2) ** exponent
+def _networks(given: dict[str, Any], with_controlnet: bool) -> Networks:
+    """Those of the base model asked for, or of Stable Diffusion v1 where its files are not there."""
+    controlnet = given.get("controlnet") if with_controlnet else None
+    place = None if controlnet is None else Path(controlnet)
+    found = read_networks(Path(given["base_model"]), place, with_controlnet)
+    if found is None or (with_controlnet and "controlnet" not in found.weights):
+        return stable_diffusion_v1(with_controlnet)
+    return found

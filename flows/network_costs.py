@@ -1,8 +1,8 @@
 """Time, memory and disk of the stages that run networks of Stable Diffusion's size, by calculation.
 
-Operations are those of `flows.costs`; how fast they are done is measured here, by a product of two matrices in the
-precision of the stage. Memory is that of the process: the weights, gradients and moments, and the activations of a
-batch; where a GPU holds them, what passes through on the way to it.
+Operations are those of `flows.network_operations`; how fast they are done is measured here, by a product of two
+matrices in the precision of the stage. Memory is that of the process: the weights, gradients and moments, and the
+activations of a batch; where a GPU holds them, what passes through on the way to it.
 """
 
 from __future__ import annotations
@@ -13,32 +13,29 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from ctlev_core import plugins
-from ctlev_core.diffusion.pretrained.components import ModelPart
-from ctlev_core.diffusion.pretrained.paths import find_controlnet, read_controlnet, read_parts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.latent_files import ENCODE_BATCH, ENCODE_PIXELS
 from ctlev_core.diffusion.training.options import FineTuningOptions, LatentOptions, StudentOptions, TrainingOptions
 from ctlev_core.processes import few_threads, use_cores_for
 from data_contracts.config import Choice
-from data_contracts.errors import DataError
-from flows.costs import operations, training_operations
+from flows.network_operations import Networks, learning, read_networks
 
 LARGE = 400e6
-"""Weights of a U-Net from which on the operations counted for Stable Diffusion's are taken."""
+"""Weights of a U-Net or transformer from which on stages are calculated."""
 ITEM_BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 EFFICIENCY = {"encoding": 0.85, "sampling": 0.7, "training": 0.45}
 GPU_EFFICIENCY = {"encoding": 0.85, "sampling": 0.43, "training": 0.22}
 """Of the rate of a matrix product, what whole networks reach: on an AMD EPYC in float32, bfloat16 and bfloat16, on an
 H200 in bfloat16 (`benchmarks/RESULTS.md`), where encoding was not measured."""
 DISK_BYTES_A_S = 500e6
-LATENT_CHANNELS, LATENT_SCALE = 4, 8
+LATENT_SCALE = 8
 PROCESS_BYTES = 0.7e9
 """Of Python with torch, diffusers and transformers."""
-# Bytes of activations for an image of 512 px; as many times more as it has pixels.
+# Bytes of activations for an image of 512 px; as many times more as it has pixels. Counted for Stable Diffusion v1; the
+# transformer of 3 takes 2.75, 0.15 and 0.06 GB in place of the second line (H200, `benchmarks/RESULTS.md`).
 _ENCODING, _DECODING = 0.7e9, 1.2e9
 _TRAINING, _CHECKPOINTED, _FORWARD = 3.0e9, 0.9e9, 0.4e9
 _SQUARE = 512**2
@@ -89,45 +86,45 @@ def network_cost(
     options = _options(given.get("generator") if stage == "finetune" else trained.get("generator"))
     if not isinstance(options, FineTuningOptions) or options.base_model is None:
         return None
-    weights = _count_weights(options.base_model, getattr(options, "controlnet", None), hasattr(options, "controlnet"))
-    if weights is None or weights["unet"] < LARGE:
+    networks = read_networks(options.base_model, getattr(options, "controlnet", None), hasattr(options, "controlnet"))
+    if networks is None or networks.weights["unet"] < LARGE:
         return None
     if stage == "finetune":
-        return _fine_tuning(options, weights, size)
+        return _fine_tuning(options, networks, size)
     sampling = _options(given.get("sampling"))
     if stage == "distill" and isinstance(sampling, SamplingOptions):
-        return _distilling(given["options"], sampling, options, weights, size)
+        return _distilling(given["options"], sampling, options, networks, size)
     if stage == "sample" and isinstance(sampling, SamplingOptions):
-        return _sampling(sampling, weights, rows, size)
+        return _sampling(sampling, networks, rows, size)
     return None
 
 
 def _encoding(options: LatentOptions, rows: float, size: tuple[int, int]) -> NetworkCost | None:
-    weights = _count_weights(options.base_model, None, False)
-    if weights is None or weights["unet"] < LARGE:
+    networks = read_networks(options.base_model, None, False)
+    if networks is None or networks.weights["unet"] < LARGE:
         return None
-    pixels = size[0] * size[1]
+    pixels, autoencoder = size[0] * size[1], 4 * networks.weights["vae"]
     batch = min(rows, ENCODE_BATCH, max(1, ENCODE_PIXELS // pixels))
-    latents = 2 * LATENT_CHANNELS * pixels / LATENT_SCALE**2 * 4
+    latents = 2 * networks.latent_channels * pixels / LATENT_SCALE**2 * 4
     return NetworkCost(
-        {"float32": rows * options.num_turns * operations("encoding", *size)},
+        {"float32": rows * options.num_turns * networks.operations("encoding", *size)},
         _efficiency("encoding", num_gpus(options.device)),
         1,
-        4 * weights["vae"],
-        _memory(4 * weights["vae"], batch * _ENCODING * pixels / _SQUARE, num_gpus(options.device)),
+        autoencoder,
+        _memory(autoencoder, batch * _ENCODING * pixels / _SQUARE, num_gpus(options.device)),
         rows * options.num_turns * latents,
     )
 
 
-def _fine_tuning(options: FineTuningOptions, weights: Mapping[str, int], size: tuple[int, int]) -> NetworkCost:
-    tune = getattr(options, "tune", "unet")
+def _fine_tuning(options: FineTuningOptions, networks: Networks, size: tuple[int, int]) -> NetworkCost:
+    tune, weights = getattr(options, "tune", "unet"), networks.weights
     images = options.num_steps * options.batch_size * options.gradient_accumulation
-    networks = weights["unet"] + weights.get("controlnet", 0)
-    trained = {"unet": weights["unet"], "controlnet": weights.get("controlnet", 0)}.get(tune, networks)
-    each = training_operations(tune, *size) * (4 / 3 if options.gradient_checkpointing else 1)
+    both = weights["unet"] + weights.get("controlnet", 0)
+    trained = {"unet": weights["unet"], "controlnet": weights.get("controlnet", 0)}.get(tune, both)
+    each = networks.operations(learning(tune), *size) * (4 / 3 if options.gradient_checkpointing else 1)
     moments, averages = 8 * trained, 4 * trained * bool(options.ema_decay)
     activations = _CHECKPOINTED if options.gradient_checkpointing else _TRAINING
-    copies = 2 * networks if options.precision != "float32" else 0
+    copies = 2 * both if options.precision != "float32" else 0
     everything = sum(weights.values())
     backward = copies + options.batch_size * activations * size[0] * size[1] / _SQUARE
     processes, gpus = options.num_processes or 1, num_gpus(options.device)
@@ -147,15 +144,15 @@ def _distilling(
     student: StudentOptions,
     sampling: SamplingOptions,
     options: FineTuningOptions,
-    weights: Mapping[str, int],
+    networks: Networks,
     size: tuple[int, int],
 ) -> NetworkCost:
     """Training of a copy, and the teacher's forward passes for the states that it learns from."""
-    with_controlnet = "controlnet" in weights
-    tune = student.tune if with_controlnet else "unet"
+    weights = networks.weights
+    tune = student.tune if "controlnet" in weights else "unet"
     learning = {name: getattr(student, name) for name in TrainingOptions.model_fields} | {"device": student.device}
-    cost = _fine_tuning(options.model_copy(update={**learning, "tune": tune, "num_processes": None}), weights, size)
-    forward = operations("unet", *size) + with_controlnet * operations("controlnet", *size)
+    cost = _fine_tuning(options.model_copy(update={**learning, "tune": tune, "num_processes": None}), networks, size)
+    forward = networks.operations("denoising", *size)
     each = math.ceil(student.teacher_evaluations / student.num_evaluations) * sampling.passes_a_step
     images = student.num_steps * student.batch_size * student.gradient_accumulation
     teacher = 4 * (weights["unet"] + weights.get("controlnet", 0))
@@ -167,13 +164,13 @@ def _distilling(
     )
 
 
-def _sampling(options: SamplingOptions, weights: Mapping[str, int], rows: float, size: tuple[int, int]) -> NetworkCost:
-    forward = operations("unet", *size) + ("controlnet" in weights) * operations("controlnet", *size)
+def _sampling(options: SamplingOptions, networks: Networks, rows: float, size: tuple[int, int]) -> NetworkCost:
+    forward, weights = networks.operations("denoising", *size), networks.weights
     evaluations = options.num_inference_steps * options.passes_a_step
     pixels, item, everything = size[0] * size[1], ITEM_BYTES[options.precision], sum(weights.values())
     batch, gpus = min(rows, options.batch_size), num_gpus(options.device)
     return NetworkCost(
-        {options.precision: rows * (evaluations * forward + operations("decoding", *size))},
+        {options.precision: rows * (evaluations * forward + networks.operations("decoding", *size))},
         _efficiency("sampling", gpus),
         max(gpus if options.device == "all" else 1, 1),
         4 * everything,
@@ -200,24 +197,6 @@ def num_gpus(device: str) -> int:
 
 def _options(choice: Any) -> Any:
     return plugins.load_options(choice).options if isinstance(choice, Choice) else None
-
-
-@functools.cache
-def _count_weights(base_model: Path, controlnet: Path | None, with_controlnet: bool) -> dict[str, int] | None:
-    try:
-        parts = dict(read_parts(base_model).parts)
-        place = find_controlnet(base_model, controlnet) if with_controlnet else None
-        if place is not None:
-            parts["controlnet"] = read_controlnet(place)
-        elif not with_controlnet:
-            parts.pop("controlnet", None)
-    except (DataError, OSError):
-        return None
-    return {name: _weights_of(part) for name, part in parts.items()}
-
-
-def _weights_of(part: ModelPart) -> int:
-    return sum(math.prod(tensor.shape) for tensor in part.tensors.values())
 
 
 @functools.cache

@@ -34,7 +34,7 @@ def build_model(part: ModelPart, dtype: torch.dtype) -> Any:
 
     try:
         with init_empty_weights():  # no memory and no time for random weights that are replaced at once
-            model = _make_model(part)
+            model = make_model(part)
     except Exception as error:  # a wrong config can raise nearly any error
         raise DataError(f"{part.place}: its config does not make a {part.name}: {error}") from error
     expected = model.state_dict()
@@ -53,7 +53,8 @@ def build_model(part: ModelPart, dtype: torch.dtype) -> Any:
     return model.eval().requires_grad_(False)
 
 
-def _make_model(part: ModelPart) -> Any:
+def make_model(part: ModelPart) -> Any:
+    """The network that a part's config describes, with random weights."""
     from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
     from diffusers.models.controlnets.controlnet import ControlNetModel
     from diffusers.models.controlnets.controlnet_sd3 import SD3ControlNetModel

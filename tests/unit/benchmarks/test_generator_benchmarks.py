@@ -196,7 +196,7 @@ TOY += ["--sampling-batch-size", "1"]
 @pytest.mark.slow
 def test_gpu_benchmark_in_small(benchmarks, capsys):
     """Every function of it; compiling takes minutes and is switched off, the lines around it run."""
-    parts = ["sampling", "sampling_compiled", "controlnet_compiled", "text"]
+    parts = ["sampling", "sampling_compiled", "controlnet_compiled", "text", "transformer"]
     with torch._dynamo.config.patch(disable=True):  # monkeypatch would take the option away for good
         benchmarks.gpu.main([*TOY, "--ddpm-steps", "4", "--inference-steps", "2", "--parts", *parts])
     printed = capsys.readouterr().out

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
+from tiny_families import write_family
 
 from ctlev_core.diffusion.training.options import LatentOptions, StudentOptions
 from ctlev_core.stand_ins.making import make_stand_in
 from data_contracts.config import DatasetChoice, GeneratorChoice, SamplingChoice
 from flows import network_costs
 from flows.amounts_of_work import Amounts, Rows
-from flows.costs import operations
 from flows.network_costs import network_cost
+from flows.network_operations import Networks, read_networks, stable_diffusion_v1
 from flows.stage_costs import Measured, StageCost, kind_of, predict_stages
 from tasks.stage import PlannedStage
 
@@ -23,11 +26,62 @@ ALL = sum(WEIGHTS.values())
 def base_model(monkeypatch, tmp_path):
     """A place whose files say that they hold Stable Diffusion."""
 
-    def count(place, controlnet, with_controlnet):
-        return WEIGHTS | ({"controlnet": 361_000_000} if with_controlnet else {})
+    def read(place, controlnet, with_controlnet):
+        weights = WEIGHTS | ({"controlnet": 361_000_000} if with_controlnet else {})
+        return Networks(stable_diffusion_v1(with_controlnet).configs, weights)
 
-    monkeypatch.setattr(network_costs, "_count_weights", count)
+    monkeypatch.setattr(network_costs, "read_networks", read)
     return tmp_path
+
+
+def operations(work, with_controlnet=False):
+    return stable_diffusion_v1(with_controlnet).operations(work, *SIZE)
+
+
+def test_counts_of_stable_diffusion_v1_are_those_in_the_literature():
+    """TFLOP an image at 512 and 256 px, counted once by torch on networks with weights."""
+    published = {"denoising": (0.803, 0.180), "encoding": (1.117, 0.273), "decoding": (2.515, 0.622)}
+    for work, expected in published.items():
+        found = [stable_diffusion_v1(False).operations(work, side, side) / 1e12 for side in (512, 256)]
+        assert found == pytest.approx(expected, rel=2e-3)
+    assert operations("tune unet") / 1e12 == pytest.approx(2.41, rel=2e-3)
+    assert operations("denoising", True) / 1e12 == pytest.approx(0.803 + 0.283, rel=2e-3)
+    assert operations("tune controlnet", True) / 1e12 == pytest.approx(2.27, rel=3e-3)
+
+
+def test_counts_of_a_transformer_are_its_closed_form():
+    """Of 2 operations a weight and token, and attention; text and image have weights of their own."""
+    width, depth, text = 64, 3, 77 + 256
+    config = {
+        "_class_name": "SD3Transformer2DModel", "sample_size": 16, "patch_size": 2, "in_channels": 16,
+        "num_layers": depth, "attention_head_dim": 16, "num_attention_heads": 4, "joint_attention_dim": 96,
+        "caption_projection_dim": width, "pooled_projection_dim": 48, "out_channels": 16, "pos_embed_max_size": 16,
+    }  # fmt: skip
+    vae = {"latent_channels": 16, "block_out_channels": [4, 4, 4, 4]}
+    networks = Networks((("unet", json.dumps(config)), ("vae", json.dumps(vae))), {})
+    for side in (64, 128):
+        tokens = (side // 16) ** 2
+        linear = 12 * width**2 * 2 * (tokens + text) * depth
+        last = 2 * 9 * width**2 * text  # the last block makes no text
+        modulation = 2 * 12 * width**2 * depth - 2 * 4 * width**2 + 2 * 2 * width**2
+        attention = 4 * (tokens + text) ** 2 * width * depth
+        embedding = 2 * (text * 96 * width + 2 * tokens * 4 * 16 * width + (256 + width + 48 + width) * width)
+        expected = linear - last + modulation + attention + embedding
+        found = networks.operations("denoising", side, side)
+        assert found == pytest.approx(expected, rel=1e-3)
+        assert networks.operations("tune unet", side, side) == pytest.approx(3 * found, rel=0.02)
+    assert networks.latent_channels == 16
+
+
+def test_larger_families_are_read_from_their_folders(tmp_path):
+    networks = read_networks(write_family("sd3", tmp_path / "sd3"), None, True)
+    assert networks is not None
+    assert {"text_encoder_3", "controlnet", "unet"} <= networks.weights.keys()
+    alone = read_networks(tmp_path / "sd3", None, False)
+    assert alone is not None and alone.operations("denoising", 32, 32) < networks.operations("denoising", 32, 32)
+    xl = read_networks(write_family("xl", tmp_path / "xl"), None, True)
+    assert xl is not None and xl.operations("tune both", 32, 32) > 2 * xl.operations("denoising", 32, 32)
+    assert read_networks(tmp_path / "nowhere", None, False) is None
 
 
 def generator(name, base_model, **options):
@@ -46,7 +100,7 @@ def test_fine_tuning_a_unet_keeps_its_gradients_and_moments(base_model):
     assert averaged.memory_bytes - plain.memory_bytes == 4 * WEIGHTS["unet"]
     assert plain.memory_bytes > 16 * WEIGHTS["unet"] + 4 * (WEIGHTS["vae"] + WEIGHTS["text_encoder"])
     assert plain.disk_bytes == 4 * ALL
-    assert plain.operations == {"float32": 6 * operations("tune unet", *SIZE)}
+    assert plain.operations == {"float32": 6 * operations("tune unet")}
 
 
 def test_fine_tuning_a_controlnet_takes_less_memory_and_more_disk(base_model):
@@ -71,7 +125,7 @@ def test_sampling_is_steps_and_a_decoding_for_each_row(base_model):
     )
     cost = network_cost("sample", {"sampling": sampling}, trained, 7, SIZE)
     assert cost is not None
-    assert cost.operations == {"bfloat16": 7 * (20 * operations("unet", *SIZE) + operations("decoding", *SIZE))}
+    assert cost.operations == {"bfloat16": 7 * (20 * operations("denoising") + operations("decoding"))}
     assert cost.memory_bytes > 2 * ALL
 
 
@@ -89,7 +143,7 @@ def test_distillation_is_a_training_and_passes_of_the_teacher(base_model):
         for sampling in ({}, {"guidance_scale": 2.0})
     )
     assert plain is not None and guided is not None
-    training, forward = operations("tune unet", *SIZE), operations("unet", *SIZE)
+    training, forward = operations("tune unet"), operations("denoising")
     assert plain.operations == {"float32": pytest.approx(10 * 4 * (training + 3 * forward))}
     assert guided.operations == {"float32": pytest.approx(10 * 4 * (training + 6 * forward))}
     # Weights of teacher and student, gradients and two moments.
@@ -112,13 +166,14 @@ def test_small_networks_and_other_stages_are_not_calculated(tmp_path, base_model
 
 def test_weights_are_counted_in_the_files(tmp_path):
     place = make_stand_in("stable_diffusion", "tiny", tmp_path)
-    network_costs._count_weights.cache_clear()
-    counted = network_costs._count_weights(place, None, False)
-    assert counted is not None and set(counted) == {"unet", "vae", "text_encoder"}
+    networks = read_networks(place, None, False)
+    assert networks is not None
+    counted = networks.weights
+    assert set(counted) == {"unet", "vae", "text_encoder"}
     stored = sum(path.stat().st_size for path in place.rglob("*.safetensors"))
     assert 2 * sum(counted.values()) == pytest.approx(stored, rel=0.05)  # float16
     assert network_cost("encode_latents", {"latents": LatentOptions(base_model=place)}, {}, 5, SIZE) is None
-    assert network_costs._count_weights(tmp_path / "none", None, False) is None
+    assert read_networks(tmp_path / "none", None, False) is None
 
 
 def test_a_product_of_matrices_tells_how_fast_a_machine_is():

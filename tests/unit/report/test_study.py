@@ -429,10 +429,10 @@ def test_costs_are_those_of_the_operations():
     # 512 frames a step; TFLOP of Stable Diffusion v1.4 at 512 px: U-Net 0.803, ControlNet 0.283, decoder 2.515.
     text, pose = costs["recognition"], costs["pose_dhp19"]
     assert (text.images_trained, pose.images_trained) == (15625 * 512, 11719 * 512)
-    assert text.training_s == pytest.approx(15625 * 512 * 2.41 / 168)
-    assert pose.training_s == pytest.approx(11719 * 512 * 2.27 / 168)
-    assert text.sampling_s == pytest.approx(650_000 * (1000 * 0.803 + 2.515) / 330)
-    assert pose.sampling_s == pytest.approx(5000 * (1000 * (0.803 + 0.283) + 2.515) / 330)
+    assert text.training_s == pytest.approx(15625 * 512 * 2.41 / 168, rel=3e-3)
+    assert pose.training_s == pytest.approx(11719 * 512 * 2.27 / 168, rel=3e-3)
+    assert text.sampling_s == pytest.approx(650_000 * (1000 * 0.803 + 2.515) / 330, rel=3e-3)
+    assert pose.sampling_s == pytest.approx(5000 * (1000 * (0.803 + 0.283) + 2.515) / 330, rel=3e-3)
     assert pose.frames_bytes == 5000 * 512 * 512 * 3 // 5
     assert estimate_costs(load_experiment("pose", [])) is None
 
@@ -449,12 +449,12 @@ def test_costs_of_smaller_images_and_guidance_are_between_the_counted_ones():
         return estimate_costs(experiment)
 
     large, small = (seconds(f"encoding.options.image_size=[{side}, {side}]") for side in (512, 256))
-    assert small.training_s / large.training_s == pytest.approx(0.537 / 2.41)
+    assert small.training_s / large.training_s == pytest.approx(0.537 / 2.41, rel=3e-3)
     between = seconds("encoding.options.image_size=[384, 384]")
     assert small.training_s < between.training_s < large.training_s
     guided = seconds("encoding.options.image_size=[512, 512]", "sampling={guidance_scale: 7.5}")
     # In float32, the default of sampling, tensor cores stand idle.
-    assert guided.sampling_s - large.sampling_s == pytest.approx(800 * 20 * 0.803 / 50)
+    assert guided.sampling_s - large.sampling_s == pytest.approx(800 * 20 * 0.803 / 50, rel=3e-3)
     half = seconds("encoding.options.image_size=[512, 512]", "sampling={precision: bfloat16}")
     assert large.sampling_s / half.sampling_s == pytest.approx(330 / 50)
 
