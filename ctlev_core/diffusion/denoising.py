@@ -143,6 +143,11 @@ class NoiseSchedule:
         """What the network gets as its time [B] at time steps [B]: themselves."""
         return timesteps
 
+    def mixture(self, timestep: int) -> tuple[float, float]:
+        """Shares of latents and of noise in noisy latents: sqrt(a) and sqrt(1 - a)."""
+        alpha_bar = float(self.alphas_cumprod[timestep])
+        return alpha_bar**0.5, (1 - alpha_bar) ** 0.5
+
     def noised(self, latents: Tensor, noise: Tensor, timesteps: Tensor) -> tuple[Tensor, Tensor]:
         """Noisy latents, and the target: the noise, the latents, or v = sqrt(a) noise - sqrt(1 - a) latents."""
         noisy = self._scheduler.add_noise(latents, noise, timesteps)

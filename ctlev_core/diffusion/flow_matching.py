@@ -50,6 +50,11 @@ class FlowSchedule:
         """What the network gets as its time [B] at time steps [B]: T sigma, float32."""
         return self.num_timesteps * self.sigmas.to(timesteps.device)[timesteps]
 
+    def mixture(self, timestep: int) -> tuple[float, float]:
+        """Shares of latents and of noise in noisy latents: 1 - sigma and sigma."""
+        sigma = float(self.sigmas[timestep])
+        return 1 - sigma, sigma
+
     def noised(self, latents: Tensor, noise: Tensor, timesteps: Tensor) -> tuple[Tensor, Tensor]:
         """Noisy latents [B, C, h, w], and the target noise - latents."""
         sigma = self._of(timesteps)

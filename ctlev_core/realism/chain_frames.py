@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctlev_core.diffusion.denoising import NoiseSchedule
+from ctlev_core.diffusion.denoising import noise_schedule
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, conditions_to_tensor
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling.options import SamplingOptions
@@ -94,7 +94,7 @@ def _check(link: Link, frames: np.ndarray, conditions: Conditions, parts: Parts,
             f"frames must be [N, {height}, {width}, 3] uint8, as the checkpoint's images are, got {frames.shape} "
             f"{frames.dtype}"
         )
-    check_time_step(link.amount, NoiseSchedule(parts.base_model.scheduler_config))
+    check_time_step(link.amount, noise_schedule(parts.base_model.scheduler_config))
 
 
 def _process(
@@ -130,7 +130,7 @@ def _there_and_back(
     empty: Tensor,
     images: Tensor | None,
 ) -> Tensor:
-    schedule = NoiseSchedule(parts.base_model.scheduler_config)
+    schedule = noise_schedule(parts.base_model.scheduler_config)
     noisy = noise_to(latents, link.amount, schedule, seeds)
     with guided_predictions(parts.base_model, embeddings, empty, images, parts.options) as predict:
         return denoise(noisy, denoising_times(link.amount, link.max_evaluations), schedule, predict)

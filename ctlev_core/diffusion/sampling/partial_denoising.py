@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import NoiseSchedule, generator_for
+from ctlev_core.diffusion.flow_matching import FlowSchedule
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, encode_posterior
 from data_contracts.errors import DataError
 
@@ -56,8 +57,8 @@ def encode_frames(base_model: PretrainedModel, frames: np.ndarray, seeds: Sequen
     return base_model.scale_latents(latents)
 
 
-def noise_to(latents: Tensor, time_step: int, schedule: NoiseSchedule, seeds: Sequence[int]) -> Tensor:
-    """Latents with the noise of a time step: sqrt(a) latents + sqrt(1 - a) noise, the same noise for every time step.
+def noise_to(latents: Tensor, time_step: int, schedule: NoiseSchedule | FlowSchedule, seeds: Sequence[int]) -> Tensor:
+    """Latents with the noise of a time step of the schedule, the same noise for every time step.
 
     Args:
         latents: [B, C, h, w] clean, scaled.
@@ -75,7 +76,7 @@ def noise_to(latents: Tensor, time_step: int, schedule: NoiseSchedule, seeds: Se
 
 
 @torch.no_grad()
-def denoise(noisy: Tensor, times: Sequence[int], schedule: NoiseSchedule, predict: Predict) -> Tensor:
+def denoise(noisy: Tensor, times: Sequence[int], schedule: NoiseSchedule | FlowSchedule, predict: Predict) -> Tensor:
     """Clean latents [B, C, h, w] float32.
 
     Args:
@@ -89,19 +90,19 @@ def denoise(noisy: Tensor, times: Sequence[int], schedule: NoiseSchedule, predic
     state = noisy.float()
     for number, time in enumerate(times):
         timesteps = torch.full((len(state),), time, device=state.device)
-        clean = schedule.clean_of(predict(state, torch.tensor(time)), state, timesteps)
+        clean = schedule.clean_of(predict(state, schedule.times(torch.tensor(time))), state, timesteps)
         if number + 1 == len(times):
             state = clean
             break
-        here, there = (float(schedule.alphas_cumprod[step]) for step in (time, times[number + 1]))
-        noise = (state - here**0.5 * clean) / (1 - here) ** 0.5
-        state = there**0.5 * clean + (1 - there) ** 0.5 * noise
+        (signal, spread), (less, more) = (schedule.mixture(step) for step in (times[number + 1], time))
+        noise = (state - less * clean) / more
+        state = signal * clean + spread * noise
     if not bool(torch.isfinite(state).all()):
         raise FloatingPointError(f"latents denoised from time step {times[0]} are not finite; try float32")
     return state
 
 
-def check_time_step(time_step: int, schedule: NoiseSchedule) -> None:
+def check_time_step(time_step: int, schedule: NoiseSchedule | FlowSchedule) -> None:
     """Raise `DataError` unless the schedule has the time step."""
     if not 0 <= time_step < schedule.num_timesteps:
         raise DataError(f"expected a time step of 0 to {schedule.num_timesteps - 1}, got {time_step}")

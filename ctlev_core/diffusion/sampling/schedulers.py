@@ -263,7 +263,7 @@ def _drop_step_before_the_first(scheduler: Any, num_inference_steps: int) -> Non
 
 def _noise_schedule(config: dict[str, Any]) -> dict[str, Any]:
     """The part of a scheduler config that says which noise the network was trained with."""
-    refuse_flow(config, "a student, or this study of solvers,")
+    refuse_flow(config, "this solver")
     schedule = {key: config[key] for key in _NOISE_SCHEDULE if key in config}
     prediction_type = schedule.get("prediction_type", "epsilon")
     if prediction_type not in PREDICTION_TYPES:

@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for
+from ctlev_core.diffusion.flow_matching import refuse_flow
 from ctlev_core.diffusion.pretrained.loading import (
     PretrainedModel,
     choose_device,
@@ -219,6 +220,7 @@ def distil(
     teacher, student = (
         load_base_model(checkpoint, with_controlnet=with_controlnet, device=device) for _ in ("teacher", "student")
     )
+    refuse_flow(teacher.scheduler_config, "a student")
     _check_conditions(conditions, teacher, options)
     table, row_of = _embeddings(teacher, conditions)
     steps = TrajectorySteps.make(teacher.scheduler_config, options.num_evaluations, options.teacher_evaluations)

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, NoiseSchedule, generator_for, validation_losses
+from ctlev_core.diffusion.flow_matching import refuse_flow
 from ctlev_core.diffusion.motion_files import MotionSettings
 from ctlev_core.diffusion.motion_layers import MotionLayers, new_adapter, save_motion_layers
 from ctlev_core.diffusion.pretrained.loading import choose_device, load_base_model
@@ -67,6 +68,7 @@ def train_motion_layers(
     base_model = load_base_model(
         checkpoint, with_controlnet=conditions.images is not None, device=choose_device(options.device)
     )
+    refuse_flow(base_model.scheduler_config, "a set of motion layers (`motion_layers`)")
     check_training_data(frames, conditions, base_model.image_size)
     state = int(np.random.SeedSequence([seed, WEIGHT_STREAM]).generate_state(1)[0])
     adapter = new_adapter(base_model.unet, state).train()

@@ -17,6 +17,7 @@ from ctlev_core.diffusion.pretrained.loading import control_input, load_base_mod
 from ctlev_core.diffusion.pretrained.paths import check_base_model_folder
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts, prompt_arguments
 from ctlev_core.diffusion.sampling.options import SamplingOptions
+from ctlev_core.diffusion.sampling.partial_denoising import denoise, denoising_times, noise_to
 from ctlev_core.diffusion.sampling.sampling import guided_predictions, sample_latents
 from ctlev_core.diffusion.sampling.schedulers import make_scheduler
 from ctlev_core.diffusion.sampling.value_table import fit_value_table
@@ -246,6 +247,32 @@ def test_a_table_of_values_is_made_with_flow_matching_too(sd3):
     assert found.shape == (256, 256) and np.allclose(found.sum(axis=1), 1, atol=1e-4)
 
 
+def test_latents_that_are_noised_and_denoised_come_back():
+    """With the exact denoiser of one image, and of a normal distribution in many small steps."""
+    schedule = noise_schedule(CONFIG)
+    latents = torch.randn((3, 1, 8, 8), generator=torch.Generator().manual_seed(0)) * 0.3 + 0.5
+    times = denoising_times(600, 600)
+    noisy = noise_to(latents, 600, schedule, [1, 2, 3])
+
+    def only_one(state, time):
+        return (state - 3.0) / (time / 1000)
+
+    torch.testing.assert_close(denoise(noisy, times, schedule, only_one), torch.full_like(noisy, 3.0))
+    signal, spread = schedule.mixture(600)
+    assert signal == pytest.approx(1 - spread)
+
+    def normal(state, time):
+        sigma = time / 1000
+        variance = (1 - sigma) ** 2 * 0.09 + sigma**2
+        clean = 0.5 + (1 - sigma) * 0.09 / variance * (state - (1 - sigma) * 0.5)
+        return (state - clean) / sigma
+
+    # The flow keeps how many standard deviations from the mean a value is.
+    scale = (signal**2 * 0.09 + spread**2) ** 0.5
+    expected = 0.5 + 0.3 * (noisy - signal * 0.5) / scale
+    torch.testing.assert_close(denoise(noisy, times, schedule, normal), expected, atol=1e-2, rtol=0)  # of first order
+
+
 def test_what_is_made_for_u_nets_alone_is_refused_by_name(sd3, tmp_path):
     with pytest.raises(DataError, match="made for Stable Diffusion v1, 2 and XL; this base model is a transformer"):
         NoiseSchedule(CONFIG)
@@ -255,7 +282,7 @@ def test_what_is_made_for_u_nets_alone_is_refused_by_name(sd3, tmp_path):
         sample_latents(
             base_model, table[:1], table[1:], None, [0], SamplingOptions(autoguidance_scale=2.0, num_inference_steps=2)
         )
-    with pytest.raises(DataError, match="transformer with flow matching"):
+    with pytest.raises(DataError, match="a student is made for Stable Diffusion v1"):
         distil(
             sd3, Conditions(("a cup",)), StudentOptions(num_steps=1), guidance=SamplingOptions(), seed=0,
             work=tmp_path / "work", out=tmp_path / "out",
