@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ctlev_core import plugins
+from ctlev_core.cpu_precision import computed_in
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.training.latent_files import ENCODE_BATCH, ENCODE_PIXELS
 from ctlev_core.diffusion.training.options import FineTuningOptions, LatentOptions, StudentOptions, TrainingOptions
@@ -63,7 +64,8 @@ class NetworkCost:
 
     def seconds(self) -> float:
         """Alone on this machine's GPU, or else its cores."""
-        work = sum(count / operations_a_second(name) for name, count in self.operations.items())
+        device = "cuda" if num_gpus("auto") else "cpu"
+        work = sum(count / operations_a_second(computed_in(name, device)) for name, count in self.operations.items())
         return work / (self.efficiency * self.devices) + self.io_bytes / DISK_BYTES_A_S
 
 

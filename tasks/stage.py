@@ -43,6 +43,7 @@ import pyarrow as pa
 from pydantic import BaseModel
 
 from ctlev_core import plugins
+from ctlev_core.cpu_precision import computed_in
 from ctlev_core.plugin_contracts import PluginWithFiles
 from ctlev_core.processes import asked_threads, begin_memory_peak, few_threads, memory_peak_mib
 from ctlev_core.progress import Progress, current_report, reporting_to
@@ -519,6 +520,7 @@ def _versions() -> dict[str, str]:
     packages = ("ctlev", "torch", "numpy", "diffusers", "transformers", "numba", "pyarrow", "prefect")
     found = {"python": platform.python_version(), "platform": platform.platform()}
     found |= {"cores": str(os.cpu_count()), "threads": str(asked_threads())}
+    found["bfloat16"] = computed_in("bfloat16", "cpu")
     for package in packages:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package)

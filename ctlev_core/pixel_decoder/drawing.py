@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core.cpu_precision import computed_in
 from ctlev_core.pixel_decoder.network import MAX_NOISE, MIN_NOISE, PixelNetwork
 from ctlev_core.pixel_decoder.value_classes import ValueClasses
 from data_contracts.image_rows import Images
@@ -107,7 +108,8 @@ def draw_values(
         raise ValueError(f"expected one seed and condition a frame, got {len(frames)}, {len(seeds)} and {asked}")
     if lengths is not None and (sum(lengths) != len(frames) or any(length < 1 for length in lengths)):
         raise ValueError(f"lengths must be 1 or more and add up to {len(frames)}, got {list(lengths)}")
-    levels, dtype = noise_levels(num_passes, classes), getattr(torch, precision)
+    place = next(network.parameters()).device.type
+    levels, dtype = noise_levels(num_passes, classes), getattr(torch, computed_in(precision, place))
     counts = np.ones(len(frames), np.int64) if lengths is None else np.array(lengths, np.int64)
     firsts = np.cumsum(counts) - counts
     for start in range(0, len(counts), BATCH):

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core.cpu_precision import computed_in
 from ctlev_core.diffusion.pretrained.loading import choose_device
 from ctlev_core.diffusion.training.loop import sample_rows
 from ctlev_core.diffusion.training.options import TrainingOptions
@@ -257,7 +258,7 @@ class _Step:
         noise = torch.from_numpy(rng.standard_normal(crops.values.shape, np.float32)).to(self.device)
         level = torch.from_numpy((levels * self.classes.active_step).astype(np.float32)).to(self.device)
         noisy = self.network.embeddings[classes] + level[:, None, None, None] * noise
-        enabled = self.options.precision != "float32"
+        enabled = computed_in(self.options.precision, self.device.type) != "float32"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=enabled):
             logits = self.network(
                 noisy,

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from ctlev_core.cpu_precision import computed_in
 from ctlev_core.supervised.options import SupervisedOptions
 from data_contracts.array_rows import ArrayRows, Images
 from data_contracts.errors import DataError
@@ -56,7 +57,8 @@ def file_digests(files: Sequence[Path]) -> dict[str, str]:
 
 def mixed_precision(options: SupervisedOptions, device: torch.device) -> torch.autocast:
     """The context of a network's forward pass in training; losses belong outside it, in float32."""
-    return torch.autocast(device.type, torch.bfloat16, enabled=options.precision == "bfloat16")
+    enabled = computed_in(options.precision, device.type) == "bfloat16"
+    return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
 
 
 def build_seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:

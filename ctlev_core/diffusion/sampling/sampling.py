@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core.cpu_precision import computed_in
 from ctlev_core.diffusion.compilation import SAMPLING_PASSES, compiler_works, pays
 from ctlev_core.diffusion.denoising import Denoiser, generator_for, mix_noise
 from ctlev_core.diffusion.motion_layers import load_motion_layers
@@ -419,7 +420,8 @@ def load_for_sampling(
     """The networks in the precision asked for. The patch code stays in float32, where it is exact and takes no time."""
     from ctlev_core.diffusion.patch_autoencoder import PatchAutoencoder
 
-    place, dtype = choose_device(device), getattr(torch, options.precision)
+    place = choose_device(device)
+    dtype = getattr(torch, computed_in(options.precision, place.type))
     base_model = load_base_model(checkpoint, with_controlnet=with_controlnet, dtype=dtype, device=place)
     base_model = dataclasses.replace(base_model, motion=load_motion_layers(checkpoint, base_model.unet))
     if options.values != "expected":

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 import torch
 
+from ctlev_core.cpu_precision import computed_in
 from ctlev_core.diffusion.compilation import TRAINING_PASSES, compiler_works, pays
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.training.options import TrainingOptions
@@ -19,9 +20,10 @@ def check_precision(options: TrainingOptions, device: torch.device) -> None:
 
 
 def autocast(options: TrainingOptions, device: torch.device) -> AbstractContextManager:
-    """The context of a forward pass: matrix products and convolutions in the precision asked for."""
-    dtype = torch.float16 if options.precision == "float16" else torch.bfloat16
-    return torch.autocast(device.type, dtype, enabled=options.precision != "float32")
+    """The context of a forward pass: matrix products and convolutions in the precision asked for (`computed_in`)."""
+    precision = computed_in(options.precision, device.type)
+    dtype = torch.float16 if precision == "float16" else torch.bfloat16
+    return torch.autocast(device.type, dtype, enabled=precision != "float32")
 
 
 @contextmanager
@@ -37,7 +39,7 @@ def accelerated(denoiser: Denoiser, options: TrainingOptions, device: torch.devi
     passes = options.num_steps * options.gradient_accumulation
     compiled = pays(options.compile_networks, device, passes, TRAINING_PASSES) and compiler_works(device)
     attention = [network.attn_processors for network in networks]
-    if options.precision == "bfloat16" and device.type == "cpu":
+    if device.type == "cpu" and computed_in(options.precision, device.type) == "bfloat16":
         from ctlev_core.diffusion.training.float32_attention import use_float32_attention
 
         for network in networks:

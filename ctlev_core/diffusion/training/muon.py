@@ -16,6 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ctlev_core.cpu_precision import computed_in
+
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 ITERATIONS = 5
 MOMENTUM = 0.95
@@ -37,12 +39,14 @@ def orthogonalised(matrices: Tensor) -> Tensor:
     Args:
         matrices: [B, M, N]; their scales are of no account.
     Returns:
-        [B, M, N]; by Newton-Schulz iterations in bfloat16. Directions below a thousandth of the norm stay smaller.
+        [B, M, N]; by Newton-Schulz iterations in bfloat16, or `computed_in`. Directions below a thousandth of the norm
+        stay smaller.
     """
     a, b, c = COEFFICIENTS
     tall = matrices.shape[1] > matrices.shape[2]
     # Sums within a product are in float32: fused, a step's additions cost nothing and are rounded once.
-    x = (matrices.mT if tall else matrices).bfloat16().contiguous()
+    dtype = getattr(torch, computed_in("bfloat16", matrices.device.type))
+    x = (matrices.mT if tall else matrices).to(dtype).contiguous()
     x = x / (torch.stack([matrix.norm() for matrix in x])[:, None, None] + 1e-7)
     for _ in range(ITERATIONS):
         gram = x @ x.mT
