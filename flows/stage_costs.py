@@ -2,9 +2,9 @@
 
 Known are the records of the home (`run.json`: time, peak memory) and, where it has none of the kind, what
 `network_costs` calculates for networks of Stable Diffusion's size, or else those of `stage_costs.json`, measured on two
-cores. Stages are of a kind where they are the same function with the same plug-ins, for images of the same size. Their
-time and disk are taken as linear in an amount of work that options tell: steps times batch of a training, frames times
-steps of a sampling, rows elsewhere.
+cores. The latter are scaled by how much longer stages that ran here took than there. Stages are of a kind where they
+are the same function with the same plug-ins, for images of the same size. Their time and disk are taken as linear in an
+amount of work that options tell: steps times batch of a training, frames times steps of a sampling, rows elsewhere.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import json
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ from tasks.stage import PlannedStage
 REFERENCE = Path(__file__).with_name("stage_costs.json")
 MAX_RECORDS = 400
 """Of a stage, the newest; to read more says nothing new."""
+NOTICEABLE_S = 1.0
+"""Of shorter stages the time says little about a machine."""
 USUAL_SIZE = (64, 64)
 """px of the images of the bundled base models."""
 
@@ -95,7 +97,7 @@ def predict_stages(
     """
     measured, reference = _by_kind(known), _by_kind(_reference())
     plan = {row.key: row for row in (rows if of is None else of)}
-    amounts = Amounts(plan, made)
+    amounts, slower = Amounts(plan, made), _times_slower(known, reference)
     found: dict[str, StageCost | None] = {}
     for key, row in {row.key: row for row in rows}.items():
         size = amounts.image_size(key)
@@ -107,11 +109,26 @@ def predict_stages(
             memory = calculated.memory_bytes / 2**20
             found[key] = StageCost(calculated.seconds(), memory, int(calculated.disk_bytes))
             continue
-        others = [reference.get(kind)]
-        others += [table.get(name) for name in (_without_plugins(kind), row.stage) for table in (measured, reference)]
-        similar = similar or next(filter(None, others), None)
-        found[key] = None if similar is None else _at(similar, amounts.work(key))
+        places = [(measured, kind), (reference, kind)]
+        places += [(table, name) for name in (_without_plugins(kind), row.stage) for table in (measured, reference)]
+        table, name = next((place for place in places if place[0].get(place[1])), (None, ""))
+        found[key] = None
+        if table is not None:
+            cost = _at(table[name], amounts.work(key))
+            found[key] = replace(cost, seconds=cost.seconds * (slower if table is reference else 1.0))
     return found
+
+
+def _times_slower(known: Sequence[Measured], reference: Mapping[str, Sequence[Measured]]) -> float:
+    """How many times as long as on the machine of `stage_costs.json` stages took here: the median of their kinds."""
+    ratios: dict[str, list[float]] = {}
+    for one in known:
+        if one.kind not in reference or one.cost.seconds < NOTICEABLE_S:
+            continue
+        there = _at(reference[one.kind], one.work).seconds
+        if there >= NOTICEABLE_S:
+            ratios.setdefault(one.kind, []).append(one.cost.seconds / there)
+    return statistics.median(map(statistics.median, ratios.values())) if ratios else 1.0
 
 
 def kind_of(stage: str, arguments: Mapping[str, Any], size: tuple[int, int] | None = None) -> str:
