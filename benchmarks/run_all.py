@@ -51,6 +51,8 @@ ALL = (
     Benchmark("arrays"),
     Benchmark("operations"),
     Benchmark("many_recordings", ("20000",)),
+    Benchmark("formats"),
+    Benchmark("sweeps"),
     Benchmark("gpu", needs_gpu=True),
 )
 
