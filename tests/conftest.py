@@ -59,6 +59,12 @@ def real_recordings() -> Path:
 
 
 @pytest.fixture
+def native_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+    """bfloat16 as on processors that have instructions for it, whatever this one has."""
+    monkeypatch.setattr("ctlev_core.cpu_precision.has_bfloat16", lambda: True)
+
+
+@pytest.fixture
 def one_thread() -> Iterator[None]:
     """One thread for torch, here and in processes started from here: where sums over threads are rounded otherwise."""
     import torch

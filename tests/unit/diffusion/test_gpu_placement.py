@@ -99,6 +99,7 @@ def fine_tuned(folder, base_model, device, changed, kill=None):
     return history, load_file(folder / "out" / network / "diffusion_pytorch_model.safetensors")
 
 
+@pytest.mark.usefixtures("native_bfloat16")
 @pytest.mark.parametrize("name", TRAINED)
 def test_fine_tuning(tmp_path, base_model_folder, name):
     with simulated_gpu() as gpu:
@@ -143,6 +144,7 @@ SAMPLED += [
 ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("native_bfloat16")
 @pytest.mark.parametrize("changed", SAMPLED, ids=lambda changed: "-".join(map(str, changed.values())))
 def test_sampling(tmp_path, base_model_folder, changed):
     def sample(device):

@@ -206,6 +206,7 @@ def test_extreme_images_through_the_bundled_code_and_back(bundled_config, dtype,
     assert error.mean() <= worst_mean
 
 
+@pytest.mark.usefixtures("native_bfloat16")
 @pytest.mark.parametrize("precision", ["float16", "bfloat16"])
 def test_low_precision_is_that_of_the_networks_alone(tmp_path, precision):
     save_base_model(make_base_model(), tmp_path / "base_model")

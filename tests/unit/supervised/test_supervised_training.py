@@ -220,6 +220,7 @@ def test_whole_groups_are_held_back(tmp_path):
     assert result.record["held_back_rows"] == 6
 
 
+@pytest.mark.usefixtures("native_bfloat16")
 def test_half_precision_trains_with_weights_and_losses_in_float32(tmp_path):
     options = SupervisedOptions(**FAST, num_steps=100, precision="bfloat16")
     device = torch.device("cpu")
