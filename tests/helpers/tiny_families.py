@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import torch
 from diffusers.models.controlnets.controlnet import ControlNetModel
 from diffusers.models.controlnets.controlnet_sd3 import SD3ControlNetModel
@@ -23,7 +26,9 @@ from transformers import (
 )
 
 from ctlev_core.diffusion.pretrained.model_kinds import FLOW_SCHEDULER
+from ctlev_core.diffusion.pretrained.paths import check_base_model_folder
 from ctlev_core.diffusion.pretraining.architecture import train_tokenizer
+from data_contracts.errors import DataError
 
 FAMILIES = ("v1", "v2", "xl", "sd3")
 POOLED, SIZES, T5_WIDTH = 26, 4, 32
@@ -47,6 +52,25 @@ def write_family(family: str, folder: Path) -> Path:
         index = {"_class_name": "StableDiffusionXLPipeline", "force_zeros_for_empty_prompt": True}
         (folder / "model_index.json").write_text(json.dumps(index))
     return folder
+
+
+def check_refusal(folder: Path, place: Path, message: str, change: Callable[[Path], object]) -> None:
+    """A copy of the folder at `place`, changed, is refused with the message."""
+    copy = shutil.copytree(folder, place)
+    change(copy)
+    with pytest.raises(DataError, match=message):
+        check_base_model_folder(copy, needs_controlnet=True)
+    shutil.rmtree(copy)
+
+
+def with_entries(name: str, file: str = "config.json", **entries: object) -> Callable[[Path], object]:
+    """A change of a folder: entries of a part's config."""
+
+    def change(folder: Path) -> None:
+        path = folder / name / file
+        path.write_text(json.dumps({**json.loads(path.read_text()), **entries}))
+
+    return change
 
 
 def _write_sd3(folder: Path) -> Path:

@@ -146,9 +146,7 @@ def make_scheduler(
         timestep_spacing = "trailing"
     if name == OF_STUDENTS:
         return _student_scheduler(schedule, num_inference_steps)
-    solver, settings = _SOLVERS[name]
-    if name == "unipc" and num_inference_steps < THIRD_ORDER_FROM:
-        settings = {**settings, "solver_order": 2}
+    solver, settings = _solver(name, num_inference_steps)
     if name in ("deis", "sa_solver") and schedule.pop("rescale_betas_zero_snr", False):
         schedule["trained_betas"] = _betas_without_signal(config)
     scheduler = solver(**schedule, **settings, **_SPACING_SETTINGS[timestep_spacing])
@@ -164,6 +162,14 @@ def make_scheduler(
         # Else the start is looked up by its time step, wrongly where close sigmas round to the same one.
         scheduler.set_begin_index(0)
     return scheduler
+
+
+def _solver(name: str, num_inference_steps: int) -> tuple[Any, dict[str, Any]]:
+    """The class of a solver and its settings, of a lower order where steps are few."""
+    solver, settings = _SOLVERS[name]
+    if name == "unipc" and num_inference_steps < THIRD_ORDER_FROM:
+        settings = {**settings, "solver_order": 2}
+    return solver, settings
 
 
 def _check_steps(config: dict[str, Any], num_inference_steps: int) -> int:
@@ -182,9 +188,7 @@ def _flow_scheduler(name: str, config: dict[str, Any], num_inference_steps: int)
             f"{', '.join(_FLOW_SOLVERS)}"
         )
     num_timesteps = _check_steps(config, num_inference_steps)
-    solver, settings = _SOLVERS[name]
-    if name == "unipc" and num_inference_steps < THIRD_ORDER_FROM:
-        settings = {**settings, "solver_order": 2}
+    solver, settings = _solver(name, num_inference_steps)
     scheduler = solver(
         num_train_timesteps=num_timesteps, prediction_type="flow_prediction", use_flow_sigmas=True,
         flow_shift=config.get("shift", 1.0), **settings,

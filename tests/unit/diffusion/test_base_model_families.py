@@ -1,19 +1,18 @@
 """Every family of base models: loaded, sampled as diffusers' pipeline does, trained, resumed, saved, and reloaded."""
 
 import dataclasses
-import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from diffusers import DiffusionPipeline
-from tiny_families import FAMILIES, POOLED, write_family
+from tiny_families import FAMILIES, POOLED, check_refusal, with_entries, write_family
 from tiny_stable_diffusion import SIDE
 
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import conditions_to_tensor, load_base_model, save_base_model
-from ctlev_core.diffusion.pretrained.paths import check_base_model_folder
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts, prompt_arguments
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_latents
@@ -22,7 +21,6 @@ from ctlev_core.diffusion.training import loop
 from ctlev_core.diffusion.training.finetuning import fine_tune
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.generators import controlnet, stable_diffusion
-from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
 
 OPTIONS = FineTuningOptions(
@@ -155,19 +153,7 @@ def test_every_part_of_an_xl_prompt_counts(xl):
 
 
 def test_what_does_not_fit_an_xl_model_is_named(xl, tmp_path):
-    def refused(message, change):
-        folder = shutil.copytree(xl, tmp_path / "broken")
-        change(folder)
-        with pytest.raises(DataError, match=message):
-            check_base_model_folder(folder, needs_controlnet=True)
-        shutil.rmtree(folder)
-
-    def config(name, **entries):
-        def change(folder):
-            path = folder / name / "config.json"
-            path.write_text(json.dumps({**json.loads(path.read_text()), **entries}))
-
-        return change
+    refused, config = partial(check_refusal, xl, tmp_path / "broken"), with_entries
 
     refused("its tokenizer_2 is missing", lambda folder: shutil.rmtree(folder / "tokenizer_2"))
     refused(

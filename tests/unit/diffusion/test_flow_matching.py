@@ -2,19 +2,19 @@
 
 import json
 import shutil
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from diffusers.schedulers.scheduling_flow_match_euler_discrete import FlowMatchEulerDiscreteScheduler
-from tiny_families import POOLED, T5_WIDTH, write_family
+from tiny_families import POOLED, T5_WIDTH, check_refusal, with_entries, write_family
 from tiny_stable_diffusion import SIDE
 
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, noise_schedule
 from ctlev_core.diffusion.flow_matching import FlowSchedule, shifted
 from ctlev_core.diffusion.pretrained.loading import control_input, load_base_model, save_base_model
-from ctlev_core.diffusion.pretrained.paths import check_base_model_folder
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts, prompt_arguments
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.partial_denoising import denoise, denoising_times, noise_to
@@ -290,19 +290,7 @@ def test_what_is_made_for_u_nets_alone_is_refused_by_name(sd3, tmp_path):
 
 
 def test_what_does_not_fit_is_named(sd3, tmp_path):
-    def refused(message, change):
-        folder = shutil.copytree(sd3, tmp_path / "broken")
-        change(folder)
-        with pytest.raises(DataError, match=message):
-            check_base_model_folder(folder, needs_controlnet=True)
-        shutil.rmtree(folder)
-
-    def config(name, file="config.json", **entries):
-        def change(folder):
-            path = folder / name / file
-            path.write_text(json.dumps({**json.loads(path.read_text()), **entries}))
-
-        return change
+    refused, config = partial(check_refusal, sd3, tmp_path / "broken"), with_entries
 
     def schedule(**entries):
         return config("scheduler", "scheduler_config.json", **entries)
