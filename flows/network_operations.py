@@ -91,15 +91,13 @@ def _count(configs: tuple[tuple[str, str], ...], work: Work, width: int, height:
     import torch
     from torch.utils.flop_counter import FlopCounterMode
 
-    from ctlev_core.diffusion.pretrained.model_building import make_model
-
     parts = {name: json.loads(config) for name, config in configs}
     with torch.device("meta"):
         vae = parts["vae"]
         scale = 2 ** (len(vae["block_out_channels"]) - 1)
         latents = torch.empty(1, vae["latent_channels"], height // scale, width // scale)
         wanted = ["vae"] if work in ("encoding", "decoding") else [name for name in parts if name != "vae"]
-        models = {name: make_model(ModelPart(name, Path(name), parts[name], {})) for name in wanted}
+        models = {name: _without_weights(name, config) for name, config in configs if name in wanted}
         for name, model in models.items():
             model.requires_grad_(work in ("tune both", f"tune {name}"))
         with FlopCounterMode(display=False) as counter:
@@ -110,6 +108,13 @@ def _count(configs: tuple[tuple[str, str], ...], work: Work, width: int, height:
             else:
                 _denoise(models, latents, width, height, learning=work != "denoising")
     return float(counter.get_total_flops())
+
+
+@functools.cache
+def _without_weights(name: str, config: str) -> Any:
+    from ctlev_core.diffusion.pretrained.model_building import make_model
+
+    return make_model(ModelPart(name, Path(name), json.loads(config), {}))
 
 
 def _denoise(models: Mapping[str, Any], latents: Tensor, width: int, height: int, *, learning: bool) -> None:

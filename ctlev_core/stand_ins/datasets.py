@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+from pyarrow import csv
 
 from ctlev_core.body.layer import BUNDLED_BODY
 from ctlev_core.body.motion.clip import Y_UP_TO_Z_UP, move_world
@@ -133,7 +135,8 @@ def write_event_hpe(root: Path) -> None:
             )  # fmt: skip
             path = root / action / f"event_camera/events/event{i:04d}.csv"
             path.parent.mkdir(parents=True, exist_ok=True)
-            np.savetxt(path, rows, fmt="%d", delimiter=",")
+            columns = pa.table({str(column): rows[:, column] for column in range(5)})
+            csv.write_csv(columns, path, csv.WriteOptions(include_header=False))
 
 
 def write_n_imagenet(root: Path) -> None:

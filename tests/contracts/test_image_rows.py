@@ -120,36 +120,41 @@ from data_contracts.image_rows import ImageRows
 from data_contracts.labels import Labels
 
 resource.setrlimit(resource.RLIMIT_DATA, (3 << 30, 3 << 30))
-folder, count, kind = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
-if kind == "plain":
-    frames = np.lib.format.open_memmap(folder / "frames.npy", "w+", np.uint8, (count, 512, 512, 3))  # sparse: all holes
-else:
-    with CompressedArrayWriter(folder / "frames.npy.zst") as written:
-        written.append(np.zeros((1, 512, 512, 3), np.uint8))
-        written._file.flush()
-        frame = (folder / "frames.npy.zst").read_bytes()[written._sizes[0] :]
-        for _ in range(count - 1):  # the same again, without compressing it
-            written._write(frame, 512 * 512 * 3)
-            written.rows += 1
-    frames = CompressedArray(folder / "frames.npy.zst")
-images = ImageRows.of([(frames, np.arange(count))], "name of the content")
-labels = Labels(("cat", "dog") * (count // 2), np.zeros(count, np.int64))
-options = classifier.Options(num_steps=2, batch_size=2)
-classifier.train(images, labels, options, seed=0, out=folder / "model", work=folder / "work")
-assert len(classifier.features(folder / "model", images.take(np.arange(3)))) == 3
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)
+
+
+def train(folder, count, kind):
+    folder.mkdir()
+    if kind == "plain":
+        shape = (count, 512, 512, 3)
+        frames = np.lib.format.open_memmap(folder / "frames.npy", "w+", np.uint8, shape)  # sparse: all holes
+    else:
+        with CompressedArrayWriter(folder / "frames.npy.zst") as written:
+            written.append(np.zeros((1, 512, 512, 3), np.uint8))
+            written._file.flush()
+            frame = (folder / "frames.npy.zst").read_bytes()[written._sizes[0] :]
+            for _ in range(count - 1):  # the same again, without compressing it
+                written._write(frame, 512 * 512 * 3)
+                written.rows += 1
+        frames = CompressedArray(folder / "frames.npy.zst")
+    images = ImageRows.of([(frames, np.arange(count))], "name of the content")
+    labels = Labels(("cat", "dog") * (count // 2), np.zeros(count, np.int64))
+    options = classifier.Options(num_steps=2, batch_size=2)
+    classifier.train(images, labels, options, seed=0, out=folder / "model", work=folder / "work")
+    assert len(classifier.features(folder / "model", images.take(np.arange(3)))) == 3
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10  # the peak so far
+
+
+print(*[train(Path(sys.argv[1]) / str(count), count, sys.argv[2]) for count in (100, 254_000)])
 """
 
 
 @pytest.mark.parametrize("kind", ["plain", "compressed"])
 def test_training_on_200_gb_of_frames_takes_the_memory_of_its_batches(tmp_path, kind):
     """A sparse file, or one of black frames: 254,000 frames of 512 px. Loaded, they would be 200 GB."""
-    command = [sys.executable, "-c", TRAIN, str(tmp_path)]
+    command = [sys.executable, "-c", TRAIN, str(tmp_path), kind]
     root = Path(__file__).parents[2]
-    few, many = (
-        int(subprocess.run([*command, count, kind], cwd=root, check=True, capture_output=True, text=True).stdout)
-        for count in ("100", "254000")
-    )
+    printed = subprocess.run(command, cwd=root, check=True, capture_output=True, text=True).stdout
+    few, many = map(int, printed.split())
     if kind == "plain":
-        assert (tmp_path / "frames.npy").stat().st_size > 190e9
+        assert (tmp_path / "254000" / "frames.npy").stat().st_size > 190e9
     assert many < few + 300, f"MiB: {few} for 100 frames, {many} for 254,000"

@@ -39,6 +39,7 @@ def made_run(home: Path, name: str, generator: str = "controlnet", base_model: P
     return artefact
 
 
+@pytest.mark.slow
 def test_each_line_of_the_quick_start_runs(tmp_path, monkeypatch, random_events):
     from ctlev_core.formats import evt2
 

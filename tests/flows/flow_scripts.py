@@ -85,6 +85,7 @@ def run_script_here(name: str, *arguments: str, home: Path) -> Finished:
     """
     with pytest.MonkeyPatch.context() as patch, in_one_run():
         patch.setattr("tasks.stage.run_as_task", lambda name, label, work: work()[0])
+        patch.setattr("prefect.Task.__call__", lambda task, *arguments, **named: task.fn(*arguments, **named))
         return _here(name, arguments, home, connected=contextlib.nullcontext, with_plan=lambda flow, *_: flow.fn)
 
 

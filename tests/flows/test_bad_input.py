@@ -62,7 +62,9 @@ def test_wrong_option_stops_a_real_run_too(tmp_path):
 
 def test_home_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    finished = run_script("full_experiment", "--preset", "smoke", "--home", str(tmp_path / "file" / "x"), home=tmp_path)
+    finished = plan_script(
+        "full_experiment", "--preset", "smoke", "--home", str(tmp_path / "file" / "x"), home=tmp_path
+    )
     assert finished.status == 2 and "the home folder cannot be written" in finished.errors
 
 

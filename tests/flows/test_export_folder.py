@@ -5,14 +5,14 @@ import re
 import cv2
 import numpy as np
 import pandas as pd
-from flow_scripts import artefacts, plan_script, run_script
+from flow_scripts import artefacts, plan_script, run_script_here
 
 from ctlev_core.export.event_dataset import EventDataset
 
 
 def test_synthesize_ends_in_a_plain_folder(smoke_home, tmp_path):
     folder = tmp_path / "mine"
-    finished = run_script("synthesize", "--preset", "smoke", "--set", f"export_folder={folder}", home=smoke_home)
+    finished = run_script_here("synthesize", "--preset", "smoke", "--set", f"export_folder={folder}", home=smoke_home)
     assert finished.status == 0, finished.errors
     assert re.search(r"(\d+) stages, \1 of them cached", finished.output)  # the frames were there
     assert f"exported: {folder}" in finished.output

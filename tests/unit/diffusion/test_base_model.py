@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -65,20 +66,21 @@ def test_diffusers_loads_the_folder(folder):
     assert image.shape == (1, SIDE, SIDE, 3) and np.isfinite(image).all()
 
 
-@pytest.mark.parametrize("route", ["ControlNet", "text"])
-def test_diffusers_loads_the_folder_where_there_is_no_ctlev(folder, tmp_path, route):
+def test_diffusers_loads_the_folder_where_there_is_no_ctlev(folder, tmp_path):
     """In an interpreter that cannot import ctlev: the code of the autoencoder lies in the folder."""
-    checkpoint = tmp_path / "checkpoint"
-    save_base_model(load_base_model(folder, with_controlnet=route == "ControlNet"), checkpoint)
+    checkpoints = [str(tmp_path / "ControlNet"), str(tmp_path / "text")]
+    for checkpoint, with_controlnet in zip(checkpoints, (True, False), strict=True):
+        save_base_model(load_base_model(folder, with_controlnet=with_controlnet), Path(checkpoint))
     script = f"""
 import importlib.util, sys
 assert importlib.util.find_spec("ctlev_core") is None
 import torch
 from diffusers import DiffusionPipeline
-pipeline = DiffusionPipeline.from_pretrained({str(checkpoint)!r}, trust_remote_code=True)
 image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-print(float((pipeline.vae.decode(pipeline.vae.encode(image).latent_dist.mode()).sample - image).abs().max()) < 1e-5)
-print(type(pipeline).__name__)
+for checkpoint in {checkpoints!r}:
+    pipeline = DiffusionPipeline.from_pretrained(checkpoint, trust_remote_code=True)
+    print(float((pipeline.vae.decode(pipeline.vae.encode(image).latent_dist.mode()).sample - image).abs().max()) < 1e-5)
+    print(type(pipeline).__name__)
 """
     # -P and a folder elsewhere: no path to the repository; an editable install is found by a finder of its own.
     lines = ["import sys", "sys.meta_path = [one for one in sys.meta_path if 'editable' not in repr(one).lower()]"]
@@ -91,7 +93,7 @@ print(type(pipeline).__name__)
         check=False,
     )
     assert run.returncode == 0, run.stderr[-2000:]
-    assert run.stdout.split() == ["True", f"StableDiffusion{'ControlNet' if route == 'ControlNet' else ''}Pipeline"]
+    assert run.stdout.split() == ["True", "StableDiffusionControlNetPipeline", "True", "StableDiffusionPipeline"]
 
 
 def test_text_checkpoint_is_a_stable_diffusion_folder(folder, tmp_path):

@@ -80,15 +80,15 @@ TRAINED = {
 }
 
 
-def fine_tuned(folder, base_model, device, changed, kill=None):
+def fine_tuned(folder, base_model, device, changed, num_steps=2):
     changed = dict(changed)
     tune = changed.pop("tune", "both")
     frames, conditions = make_data(24, with_images=tune != "unet")
     options = FineTuningOptions.model_validate(
         {
-            "num_steps": 4, "batch_size": 2, "num_validation": 4, "validation_every": 2, "keep": "best", "log_every": 2,
-            "sample_every": 3, "ema_decay": 0.5, "checkpoint_every_s": 1e-9, "device": device, "base_model": base_model,
-            **changed,
+            "num_steps": num_steps, "batch_size": 2, "num_validation": 4, "validation_every": num_steps // 2,
+            "keep": "best", "log_every": 2, "sample_every": num_steps - 1, "ema_decay": 0.5,
+            "checkpoint_every_s": 1e-9, "device": device, "base_model": base_model, **changed,
         }
     )  # fmt: skip
     history = train_checkpoint(
@@ -104,7 +104,7 @@ def fine_tuned(folder, base_model, device, changed, kill=None):
 def test_fine_tuning(tmp_path, base_model_folder, name):
     with simulated_gpu() as gpu:
         history, weights = fine_tuned(tmp_path / "gpu", base_model_folder, "cuda", TRAINED[name])
-    assert gpu.num_operations > 5_000 and np.isfinite(history.loss).all()
+    assert gpu.num_operations > 3_000 and np.isfinite(history.loss).all()
     if name == "float16":  # a CPU takes none
         return
     again, expected = fine_tuned(tmp_path / "cpu", base_model_folder, "cpu", TRAINED[name])
@@ -126,10 +126,10 @@ def test_a_killed_fine_tuning_goes_on(tmp_path, base_model_folder, monkeypatch):
     monkeypatch.setattr(trainer.Trainer, "update", stop_once)
     with simulated_gpu():
         with pytest.raises(KeyboardInterrupt):
-            fine_tuned(tmp_path, base_model_folder, "cuda", {})
-        _, weights = fine_tuned(tmp_path, base_model_folder, "auto", {})
+            fine_tuned(tmp_path, base_model_folder, "cuda", {}, num_steps=4)
+        _, weights = fine_tuned(tmp_path, base_model_folder, "auto", {}, num_steps=4)
     assert calls == [0, 1, 2, 2, 3]
-    _, expected = fine_tuned(tmp_path / "whole", base_model_folder, "cpu", {})
+    _, expected = fine_tuned(tmp_path / "whole", base_model_folder, "cpu", {}, num_steps=4)
     assert all(torch.equal(weights[key], expected[key]) for key in expected)
 
 

@@ -64,7 +64,7 @@ def weights(folder) -> bytes:
 
 @pytest.mark.parametrize(
     ("changes", "num_steps", "limit_px"),
-    [({}, 300, 0.6), ({"output_stride": 2, "decoding": "mean"}, 300, 1.0)],
+    [pytest.param({}, 300, 0.6, marks=pytest.mark.slow), ({"output_stride": 2, "decoding": "mean"}, 300, 1.0)],
 )
 def test_pose_network_finds_blobs(tmp_path, changes, num_steps, limit_px):
     frames, labels = blobs(200)

@@ -214,7 +214,10 @@ def score(a, b):
     return {"fd": frechet_distance(a, b), "kid": compute_kid(a, b)}
 
 
-@pytest.mark.parametrize(("shift", "frames"), [(0.5, 1), (0.5, 4), (0.0, 1)])
+@pytest.mark.parametrize(
+    ("shift", "frames"),
+    [pytest.param(0.5, 1, marks=pytest.mark.slow), (0.5, 4), pytest.param(0.0, 1, marks=pytest.mark.slow)],
+)
 def test_intervals_cover_the_mean_score_as_often_as_they_say(shift, frames):
     """The mean over 200 draws is what sets of these sizes score on average; frames of a recording resemble another."""
 

@@ -116,6 +116,7 @@ def test_isolated_pixels_are_told():
     assert found.value > 0.9 and found.low > 0.5
 
 
+@pytest.mark.usefixtures("quick_two_sample_tests")
 def test_exchanging_the_sets_gives_the_same_area_up_to_noise():
     first, second = bars(80, 0, isolated=1), bars(80, 1)
     one, other = compare(first, second), compare(second, first)
@@ -167,6 +168,7 @@ def test_copies_are_learnt_from_with_their_originals():
     assert found.value == pytest.approx(0.5, abs=0.06) and found.low <= 0.5 <= found.high
 
 
+@pytest.mark.usefixtures("quick_two_sample_tests")
 def test_images_larger_than_64_px_and_of_odd_size_are_taken():
     first = np.zeros((40, 21, 70, 3), np.uint8)
     second = first.copy()
@@ -197,6 +199,7 @@ def test_what_cannot_be_measured_is_not_a_number_with_the_reason(first, second, 
     assert row["value"] is None and {"group", "subject", *row} == {c.name for c in TWO_SAMPLE_TESTS.columns}
 
 
+@pytest.mark.usefixtures("quick_two_sample_tests")
 def test_few_recordings_have_an_area_without_an_interval_and_cannot_be_halved_twice():
     found = compare(noise(40, 0.1, 0), bars(40, 1), per_recording=10)
     assert found.value > 0.9 and np.isnan([found.low, found.high]).all()

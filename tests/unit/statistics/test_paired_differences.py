@@ -72,7 +72,12 @@ def test_intervals_cover_the_truth_about_as_often_as_they_say():
 # Percentiles alone cover the truth in 83, 91, 96 and 90 % of such studies. Of 1,000 the binomial spread is 0.7 %.
 @pytest.mark.parametrize(
     "num_recordings, num_trainings, spread, least",
-    [(5, 1, 0.0, 0.925), (10, 1, 0.0, 0.925), (10, 2, 0.1, 0.94), (10, 2, 0.5, 0.94)],
+    [
+        (5, 1, 0.0, 0.925),
+        pytest.param(10, 1, 0.0, 0.925, marks=pytest.mark.slow),
+        pytest.param(10, 2, 0.1, 0.94, marks=pytest.mark.slow),
+        (10, 2, 0.5, 0.94),
+    ],
 )
 def test_intervals_of_few_recordings_and_trainings_cover_the_truth(
     monkeypatch, num_recordings, num_trainings, spread, least

@@ -107,7 +107,6 @@ def refuse(vae, images):
     "changes",
     [
         {},
-        {"rot90_probability": 0.7},
         pytest.param({"num_processes": 2, "rot90_probability": 0.7}, marks=pytest.mark.slow),
     ],
 )

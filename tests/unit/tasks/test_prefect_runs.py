@@ -92,6 +92,7 @@ with local_server.connected():
 """
 
 
+@pytest.mark.slow
 def test_what_may_pass_is_tried_again_and_nothing_else(tmp_path):
     known = {name: value for name, value in os.environ.items() if not name.startswith(("PREFECT_", "CTLEV_"))}
     done = subprocess.run(

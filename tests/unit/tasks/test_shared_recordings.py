@@ -184,14 +184,14 @@ def test_short_recordings_share_files_and_long_ones_have_their_own(tmp_path, mon
 
 
 def test_one_worker_and_two_make_the_same(tmp_path, monkeypatch):
-    module = make_dataset(600)
+    module = make_dataset(300)
     found = [make_both(tmp_path / str(n), monkeypatch, module, workers=n) for n in (1, 2)]
     for first, second in zip(*found, strict=True):
         assert first.ref.digest == second.ref.digest, "of the manifest, which has the digests of all files"
 
 
 def test_an_interrupted_ingest_goes_on_from_its_finished_groups(tmp_path, monkeypatch):
-    read, fails_at = [], [555]
+    read, fails_at = [], [277]
 
     def note(number):
         if number in fails_at:
@@ -199,14 +199,14 @@ def test_an_interrupted_ingest_goes_on_from_its_finished_groups(tmp_path, monkey
         read.append(number)
 
     with pytest.raises(KeyboardInterrupt):
-        make_both(tmp_path / "killed", monkeypatch, make_dataset(600, note), workers=1)
-    assert read == list(range(555))
+        make_both(tmp_path / "killed", monkeypatch, make_dataset(300, note), workers=1)
+    assert read == list(range(277))
     read.clear()
     fails_at.clear()
-    again = make_both(tmp_path / "killed", monkeypatch, make_dataset(600, note), workers=1)
-    # Groups of four: that of 552 to 555 is not finished.
-    assert read == list(range(552, 600))
-    whole = make_both(tmp_path / "whole", monkeypatch, make_dataset(600), workers=1)
+    again = make_both(tmp_path / "killed", monkeypatch, make_dataset(300, note), workers=1)
+    # Groups of two: that of 276 and 277 is not finished.
+    assert read == list(range(276, 300))
+    whole = make_both(tmp_path / "whole", monkeypatch, make_dataset(300), workers=1)
     assert [made.ref.digest for made in again] == [made.ref.digest for made in whole]
 
 
