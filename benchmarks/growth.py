@@ -1,6 +1,6 @@
 """What each stage takes as its amounts grow: time and memory, one chart.
 
-    python benchmarks/growth.py                                 # half an hour on two idle cores
+    python benchmarks/growth.py                                 # an hour on two idle cores
     python benchmarks/growth.py --largest 2000 --axes rows      # minutes
     python benchmarks/growth.py --figure growth.png             # needs the extra `bench`
 
@@ -8,8 +8,8 @@ Whole experiments with class names (preset `n_imagenet` on small recordings, one
 steps) and single stages of skeletons and bodies. What a stage took is read from its record.
 
     rows       recordings and frames generated, tens to tens of thousands, of ten classes
-    classes    of 2,000 recordings
-    workers    processes, of 2,000 recordings
+    classes    of 500 recordings
+    workers    processes, of 500 recordings
 
 Times are those of the processor, which other programs hardly change, along `workers` those of the clock. A slope is
 that of a line in the chart, between its last two points: 0 = the same time for any amount, 1 = in proportion.
@@ -43,7 +43,7 @@ EVENTS = 200
 """Of a recording."""
 AMOUNTS: Mapping[str, Sequence[int]] = {
     "rows": (20, 200, 2_000, 20_000),
-    "classes": (2, 10, 100, 1_000),
+    "classes": (2, 10, 50, 250),
     "workers": (1, 2, 4),
 }
 IN_PROCESS = ("condition_samples", "simulate")
@@ -105,7 +105,7 @@ def main() -> None:
 
 def measure(axis: str, amount: int) -> list[Point]:
     """The points of an amount."""
-    numbers = {"rows": 2_000, "classes": 10}
+    numbers = {"rows": 500, "classes": 10}
     if axis != "workers":
         numbers[axis] = amount
     with tempfile.TemporaryDirectory() as name:

@@ -53,6 +53,7 @@ ALL = (
     Benchmark("many_recordings", ("20000",)),
     Benchmark("formats"),
     Benchmark("sweeps"),
+    Benchmark("growth", ("--largest", "2000", "--figure", "build/growth.png")),
     Benchmark("gpu", needs_gpu=True),
 )
 

@@ -57,6 +57,7 @@ def test_nothing_is_loaded_from_elsewhere(site):
         assert not re.search(r"url\(['\"]?(https?:)?//|@import", sheet.read_text(encoding="utf-8")), sheet.name
 
 
+@pytest.mark.release
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 def test_every_page_can_be_read_at_every_width(site, tmp_path):
     pages = sorted(str(path.relative_to(site)) for path in site.rglob("*.html"))

@@ -117,7 +117,10 @@ def test_the_page_names_files_and_variables_that_there_are():
 @pytest.mark.slow
 def test_prefect_makes_a_pool_of_the_template(tmp_path):
     """Prefect's own check of templates; the server is one of this test."""
-    environment = {"PREFECT_HOME": str(tmp_path), "PATH": str(Path(shutil.which("prefect")).parent) + ":/usr/bin:/bin"}
+    environment = {
+        "PREFECT_HOME": str(tmp_path), "PATH": str(Path(shutil.which("prefect")).parent) + ":/usr/bin:/bin",
+        "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "300",
+    }  # fmt: skip
     command = ["prefect", "--no-prompt", "work-pool", "create", "ctlev", "--type", "kubernetes"]
     template = ["--base-job-template", str(FOLDER / "job_template.json")]
     finished = subprocess.run([*command, *template], env=environment, capture_output=True, text=True, timeout=300)

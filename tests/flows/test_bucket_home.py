@@ -51,7 +51,7 @@ def test_two_machines_at_once_make_each_artefact_once_and_a_third_none(machine, 
         assert path.is_dir() or (third / path.relative_to(caches[0])).read_bytes() == path.read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_whole_experiment_is_found_by_another_machine(machine, bucket_url, smoke_home, tmp_path):
     first = machine("a")
     shutil.copytree(smoke_home / "artefacts", first / "artefacts")

@@ -138,7 +138,7 @@ def test_a_run_whose_worker_is_killed_goes_on_with_another(service, tmp_path):
     assert "ingest" in cached
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.timeout(1800)
 def test_a_whole_experiment_is_completed_although_its_worker_was_killed(service, tmp_path):
     first = service.start_run("full-experiment", tmp_path)
@@ -250,7 +250,7 @@ def test_a_schedule_becomes_a_run(service, tmp_path):
     service.api(f"flow_runs/{made}", method="DELETE")
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.timeout(2400)
 def test_scheduled_regenerations_do_not_overlap_and_a_killed_one_is_gone_on_with(service, tmp_path):
     """Two schedules fire at the same moment, a third later; the worker of a fourth run is killed while it samples."""

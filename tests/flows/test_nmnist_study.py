@@ -79,7 +79,7 @@ def asked(data, *further):
     return ["--preset", str(data / "small.yaml"), *given, *further]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_study_runs_and_tells_every_row(data, tmp_path):
     finished = run_script_here("full_experiment", *asked(data), home=tmp_path)
     assert finished.status == 0, finished.errors

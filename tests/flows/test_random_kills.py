@@ -25,7 +25,7 @@ TIMED = {"report"}
 """Its digest covers the time that each stage took."""
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.timeout(3600 + 60 * KILLS)
 def test_killed_runs_end_in_the_digests_of_an_undisturbed_one(smoke_home, tmp_path):
     with server(tmp_path) as service:  # to start one for each run would take longer than all the rest

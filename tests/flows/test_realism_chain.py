@@ -25,7 +25,7 @@ SETTINGS = (
 OPTIONS = ["--preset", "smoke", *(word for setting in SETTINGS for word in ("--set", setting))]
 ROWS = [("recorded", 0, 0), ("autoencoder", 0, 0), ("values", 0, 0), ("counts", 0, 0),
         ("denoised", 0, 0), ("denoised", 300, 4), ("sampled", 3, 3)]  # fmt: skip
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.release
 
 
 @pytest.fixture(scope="module")

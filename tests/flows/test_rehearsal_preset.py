@@ -82,7 +82,7 @@ def test_an_unknown_size_is_refused(home):
     assert refused.status == 2 and "stand_ins must be one of full, tiny, got 'huge'" in refused.errors
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.timeout(2400)
 def test_it_ends_in_a_report_with_every_table_and_figure_of_the_paper(home):
     finished = run_script("full_experiment", *TINY, home=home)

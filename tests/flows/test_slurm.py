@@ -136,6 +136,7 @@ def test_shards_of_a_cancelled_job_are_computed_again(jobs, monkeypatch):
     assert set(queued(jobs, "RUNNING")) - set(before), "another was submitted"
 
 
+@pytest.mark.release
 def test_a_run_whose_job_is_cancelled_has_the_digests_of_threads(smoke_home, cluster, tmp_path, monkeypatch):
     monkeypatch.setenv("CTLEV_RUNNER", "slurm:2")
     home = tmp_path / "home"

@@ -350,7 +350,7 @@ def test_networks_are_compiled_for_the_training_alone(tmp_path, monkeypatch):
     assert base_model.unet._compiled_call_impl is None and base_model.controlnet._compiled_call_impl is None
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_compiled_networks_learn_the_same(tmp_path):
     """For real: minutes on a CPU."""
     plain, _ = tuned(tmp_path / "plain", OPTIONS)

@@ -238,7 +238,7 @@ def benchmark(count, **environment):
     return json.loads(told.stdout.splitlines()[-1])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.timeout(1200)
 def test_twenty_thousand_recordings_take_few_files_and_hardly_more_memory(tmp_path):
     """Killed in the middle and resumed; with one worker and with two."""

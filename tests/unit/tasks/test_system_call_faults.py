@@ -14,7 +14,7 @@ HELPERS = REPOSITORY / "tests" / "helpers"
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.timeout(1800)
 @pytest.mark.skipif(COMPILER is None or not sys.platform.startswith("linux"), reason="needs Linux and a C compiler")
 def test_a_call_that_fails_once_loses_nothing_and_leaves_nothing(tmp_path):
