@@ -137,16 +137,11 @@ def _prompt(unet: Any) -> Tensor:
     """Embeddings [1, L, D], as `encode_prompts` would make them."""
     import torch
 
-    from ctlev_core.diffusion.pretrained.checks import NUM_SIZES
     from ctlev_core.diffusion.pretrained.model_kinds import is_transformer
-    from ctlev_core.diffusion.pretrained.prompts import T5_TOKENS
+    from ctlev_core.diffusion.pretrained.prompts import T5_TOKENS, num_further_values
 
-    config = unet.config
     if is_transformer(unet):
-        width, tokens, further = config.joint_attention_dim, CLIP_TOKENS + T5_TOKENS, config.pooled_projection_dim
+        width, tokens = unet.config.joint_attention_dim, CLIP_TOKENS + T5_TOKENS
     else:
-        width, tokens, further = config.cross_attention_dim, CLIP_TOKENS, 0
-        if config.addition_embed_type == "text_time":
-            sizes = NUM_SIZES * config.addition_time_embed_dim
-            further = config.projection_class_embeddings_input_dim - sizes + NUM_SIZES
-    return torch.empty(1, tokens + -(-further // width), width)
+        width, tokens = unet.config.cross_attention_dim, CLIP_TOKENS
+    return torch.empty(1, tokens + -(-num_further_values(unet) // width), width)

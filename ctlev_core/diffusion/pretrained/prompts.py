@@ -80,21 +80,25 @@ def prompt_arguments(network: Any, embeddings: Tensor) -> dict[str, Any]:
         network: the U-Net or transformer.
         embeddings: [B, L, D], of Stable Diffusion XL and 3 [B, L + R, D].
     """
+    further = num_further_values(network)
+    if further == 0:
+        return {"encoder_hidden_states": embeddings}
+    rows = -(-further // embeddings.shape[-1])
+    tokens, pooled = embeddings[:, :-rows], embeddings[:, -rows:].flatten(1)[:, :further]
+    if is_transformer(network):
+        return {"encoder_hidden_states": tokens, "pooled_projections": pooled}
+    pooled, sizes = pooled.split([further - NUM_SIZES, NUM_SIZES], dim=1)
+    return {"encoder_hidden_states": tokens, "added_cond_kwargs": {"text_embeds": pooled, "time_ids": sizes}}
+
+
+def num_further_values(network: Any) -> int:
+    """How many values follow the embeddings of tokens: a pooled embedding, for Stable Diffusion XL also image sizes."""
     config = getattr(network, "config", None)
     if is_transformer(network):
-        width = network.config.pooled_projection_dim
-        rows = -(-width // embeddings.shape[-1])
-        pooled = embeddings[:, -rows:].flatten(1)[:, :width]
-        return {"encoder_hidden_states": embeddings[:, :-rows], "pooled_projections": pooled}
+        return int(network.config.pooled_projection_dim)
     if config is None or config.get("addition_embed_type") != "text_time":
-        return {"encoder_hidden_states": embeddings}
-    width = config["projection_class_embeddings_input_dim"] - NUM_SIZES * config["addition_time_embed_dim"]
-    rows = -(-(width + NUM_SIZES) // embeddings.shape[-1])
-    pooled, sizes = embeddings[:, -rows:].flatten(1)[:, : width + NUM_SIZES].split([width, NUM_SIZES], dim=1)
-    return {
-        "encoder_hidden_states": embeddings[:, :-rows],
-        "added_cond_kwargs": {"text_embeds": pooled, "time_ids": sizes},
-    }
+        return 0
+    return int(config["projection_class_embeddings_input_dim"] - NUM_SIZES * (config["addition_time_embed_dim"] - 1))
 
 
 def put_text_encoders_aside(base_model: PretrainedModel) -> None:

@@ -9,6 +9,7 @@ from ctlev_core.diffusion.compilation import compiler_works, pays
 from ctlev_core.diffusion.sampling import sampling
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
+from data_contracts.labels import Conditions
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 1)
 
@@ -85,15 +86,32 @@ def test_nothing_heavy_is_imported():
     assert compilation.__dict__.get("torch") is None
 
 
-@pytest.mark.slow
-def test_compiled_networks_sample_the_same_frames(tmp_path):
-    """For real: a minute or two on a CPU. Five frames in batches of two, of which the last one runs uncompiled."""
-    from tiny_base_model import make_base_model, make_data
+def write_tiny(folder):
+    from tiny_base_model import SIDE, make_base_model
 
     from ctlev_core.diffusion.pretrained.loading import save_base_model
 
-    save_base_model(make_base_model(), tmp_path / "base_model")
-    conditions = make_data(5, seed=4)[1]
+    save_base_model(make_base_model(), folder)
+    return SIDE
+
+
+def write_transformer(folder):
+    from tiny_families import write_family
+    from tiny_stable_diffusion import SIDE
+
+    write_family("sd3", folder)
+    return SIDE
+
+
+@pytest.mark.parametrize(
+    "write",
+    [pytest.param(write_tiny, marks=pytest.mark.slow), pytest.param(write_transformer, marks=pytest.mark.release)],
+)
+def test_compiled_networks_sample_the_same_frames(tmp_path, write):
+    """For real: a minute or two on a CPU. Five frames in batches of two, of which the last one runs uncompiled."""
+    side = write(tmp_path / "base_model")
+    images = np.random.default_rng(4).integers(0, 256, (5, side, side, 3), np.uint8)
+    conditions = Conditions(("a photo of a cup",) * 5, images)
 
     def sample(compiled):
         options = SamplingOptions(

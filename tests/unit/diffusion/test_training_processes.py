@@ -8,6 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tiny_base_model import make_base_model, make_data
+from tiny_families import write_family
+from tiny_stable_diffusion import SIDE
 
 from ctlev_core.diffusion.pretrained.loading import load_base_model, save_base_model
 from ctlev_core.diffusion.training import loop
@@ -18,6 +20,7 @@ from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.generators import controlnet
 from ctlev_core.processes import num_cores
 from data_contracts.errors import TrainingError
+from data_contracts.labels import Conditions
 
 OPTIONS = FineTuningOptions(
     num_steps=4, batch_size=2, gradient_accumulation=4, warmup_steps=1, log_every=2, num_validation=4, ema_decay=0.5,
@@ -25,8 +28,8 @@ OPTIONS = FineTuningOptions(
 )  # fmt: skip
 
 
-def trained(folder, base_model, options, tune="both"):
-    frames, conditions = make_data(40)
+def trained(folder, base_model, options, tune="both", data=None):
+    frames, conditions = data or make_data(40)
     return train_checkpoint(
         frames,
         conditions,
@@ -106,6 +109,31 @@ def test_two_processes_end_in_the_weights_of_one(tmp_path, base_model_folder, sh
             assert_alike(value, states[1]["optimizer"]["state"][index][name])
     again = trained(tmp_path / "together", base_model_folder, OPTIONS)
     assert vars(again) == vars(together)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_thread")
+def test_a_transformer_is_shared_out_as_a_unet_is(tmp_path):
+    """Weights of Stable Diffusion 3 in two processes, beside one with whole weights."""
+    base_model = write_family("sd3", tmp_path / "sd3")
+    frames = np.random.default_rng(0).integers(0, 256, (24, SIDE, SIDE, 3), np.uint8)
+    data = frames, Conditions(("a photo of a cup", "a photo of a ball") * 12, frames[::-1].copy())
+    options = OPTIONS.model_copy(update={"num_steps": 2, "gradient_accumulation": 2, "validation_every": 1})
+    alone = trained(tmp_path / "alone", base_model, options, data=data)
+    shared = options.model_copy(update={"num_processes": 2, "fsdp": True})
+    together = trained(tmp_path / "together", base_model, shared, data=data)
+    for name in ("loss", "validation_loss", "shuffled_loss"):
+        np.testing.assert_allclose(getattr(together, name), getattr(alone, name), rtol=1e-4)
+    places = [tmp_path / name / "out" for name in ("alone", "together")]
+    one, two, start = (load_base_model(folder) for folder in (*places, base_model))
+    for name in ("unet", "controlnet"):
+        before, after = getattr(start, name).state_dict(), getattr(two, name).state_dict()
+        assert max((after[key] - before[key]).abs().max().item() for key in after) > 1e-4
+        for key, value in getattr(one, name).state_dict().items():
+            # The last block of a ControlNet as deep as its transformer is of no use: without a gradient nothing happens
+            # to its weights, with zeros in its place, as in parts of weights, they decay.
+            is_used = not torch.equal(value, before[key])
+            assert_alike(value, after[key], has_gradient=is_used and "k" not in key.split(".")[-2])
 
 
 @pytest.mark.slow

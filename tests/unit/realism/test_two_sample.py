@@ -168,7 +168,6 @@ def test_copies_are_learnt_from_with_their_originals():
     assert found.value == pytest.approx(0.5, abs=0.06) and found.low <= 0.5 <= found.high
 
 
-@pytest.mark.usefixtures("quick_two_sample_tests")
 def test_images_larger_than_64_px_and_of_odd_size_are_taken():
     first = np.zeros((40, 21, 70, 3), np.uint8)
     second = first.copy()
