@@ -9,7 +9,7 @@ steps) and single stages of skeletons and bodies. What a stage took is read from
 
     rows       recordings and frames generated, tens to tens of thousands, of ten classes
     classes    of 500 recordings
-    workers    processes, of 500 recordings
+    workers    processes, of 500 recordings: the whole experiment, and stages whose rows they share
 
 Times are those of the processor, which other programs hardly change, along `workers` those of the clock. A slope is
 that of a line in the chart, between its last two points: 0 = the same time for any amount, 1 = in proportion.
@@ -24,6 +24,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -48,6 +49,8 @@ AMOUNTS: Mapping[str, Sequence[int]] = {
 }
 IN_PROCESS = ("condition_samples", "simulate")
 """Stages that an experiment with class names does not have, run apart."""
+SHARED = ("ingest", "encode", "sample")
+"""Stages whose rows workers share; the others run beside one another."""
 MOST_SIMULATED = 2_000
 """Bodies; more take minutes."""
 QUICK_S = 0.5
@@ -112,8 +115,14 @@ def measure(axis: str, amount: int) -> list[Point]:
         folder = Path(name)
         if axis == "rows":
             run_poses(folder / "poses", amount)
+        started = time.perf_counter()
         run_classes(folder, axis, **numbers, workers=amount)
+        whole = time.perf_counter() - started
         found = [*read_records(folder / "home", axis, amount), *read_records(folder / "poses", axis, amount)]
+    if axis == "workers":
+        largest = max(point.peak_mib for point in found)
+        found = [point for point in found if point.stage in SHARED]
+        found.append(Point(axis, amount, "the whole experiment", whole, 0.0, largest))
     seconds = sum(point.seconds for point in found)
     print(f"{axis} {amount:,}: {seconds:.0f} s in stages", file=sys.stderr, flush=True)
     return found
@@ -233,10 +242,14 @@ def draw(points: Sequence[Point], path: Path) -> None:
             panels[1, column].semilogx(amounts, [one.peak_mib for one in own], "o-", ms=3, color=colour)
         panels[0, column].set_title(axis)
         panels[1, column].set_ylim(bottom=0)
-    panels[0, 0].set_ylabel("seconds of a processor, along workers of the clock")
+        panels[0, column].set_ylabel("s by the clock" if axis == "workers" else "processor seconds")
+        panels[1, column].set_xticks(AMOUNTS[axis], [f"{amount:,}" for amount in AMOUNTS[axis]])
+        panels[1, column].minorticks_off()
     panels[1, 0].set_ylabel("peak memory of the process, MiB")
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=5, fontsize=7)
+    shown = {
+        label: handle for panel in panels[0] for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(shown.values(), shown.keys(), loc="lower center", ncols=5, fontsize=7)
     figure.tight_layout(rect=(0, 0.12, 1, 1))
     figure.savefig(path, dpi=110)
 
