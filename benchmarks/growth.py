@@ -230,7 +230,7 @@ def draw(points: Sequence[Point], path: Path) -> None:
     """Time above, memory below, an axis a column."""
     import matplotlib.pyplot as plt
 
-    axes = list(dict.fromkeys(point.axis for point in points))
+    axes = [axis for axis in AMOUNTS if any(point.axis == axis for point in points)]
     stages = sorted({point.stage for point in points})
     colours = {stage: plt.get_cmap("tab20")(number % 20) for number, stage in enumerate(stages)}
     figure, panels = plt.subplots(2, len(axes), figsize=(3.6 * len(axes), 7), squeeze=False, sharex="col")
@@ -243,7 +243,8 @@ def draw(points: Sequence[Point], path: Path) -> None:
         panels[0, column].set_title(axis)
         panels[1, column].set_ylim(bottom=0)
         panels[0, column].set_ylabel("s by the clock" if axis == "workers" else "processor seconds")
-        panels[1, column].set_xticks(AMOUNTS[axis], [f"{amount:,}" for amount in AMOUNTS[axis]])
+        amounts = sorted({point.amount for point in points if point.axis == axis})
+        panels[1, column].set_xticks(amounts, [f"{amount:,}" for amount in amounts])
         panels[1, column].minorticks_off()
     panels[1, 0].set_ylabel("peak memory of the process, MiB")
     shown = {
