@@ -119,12 +119,12 @@ def measure(axis: str, amount: int) -> list[Point]:
         run_classes(folder, axis, **numbers, workers=amount)
         whole = time.perf_counter() - started
         found = [*read_records(folder / "home", axis, amount), *read_records(folder / "poses", axis, amount)]
+    seconds = sum(point.seconds for point in found)
+    print(f"{axis} {amount:,}: {seconds:.0f} s in stages", file=sys.stderr, flush=True)
     if axis == "workers":
         largest = max(point.peak_mib for point in found)
         found = [point for point in found if point.stage in SHARED]
         found.append(Point(axis, amount, "the whole experiment", whole, 0.0, largest))
-    seconds = sum(point.seconds for point in found)
-    print(f"{axis} {amount:,}: {seconds:.0f} s in stages", file=sys.stderr, flush=True)
     return found
 
 

@@ -104,7 +104,7 @@ def fine_tuned(folder, base_model, device, changed, num_steps=2):
 def test_fine_tuning(tmp_path, base_model_folder, name):
     with simulated_gpu() as gpu:
         history, weights = fine_tuned(tmp_path / "gpu", base_model_folder, "cuda", TRAINED[name])
-    assert gpu.num_operations > 3_000 and np.isfinite(history.loss).all()
+    assert gpu.num_operations > 5_000 and np.isfinite(history.loss).all()
     if name == "float16":  # a CPU takes none
         return
     again, expected = fine_tuned(tmp_path / "cpu", base_model_folder, "cpu", TRAINED[name])

@@ -107,6 +107,7 @@ def refuse(vae, images):
     "changes",
     [
         {},
+        pytest.param({"rot90_probability": 0.7}, marks=pytest.mark.slow),
         pytest.param({"num_processes": 2, "rot90_probability": 0.7}, marks=pytest.mark.slow),
     ],
 )
