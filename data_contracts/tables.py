@@ -370,6 +370,22 @@ REALISM_CHAIN = TableSchema(
         Column("note", pa.string(), "why there is no value, or what it has to be read with"),
     ),
 )
+TWO_SAMPLE_TESTS = TableSchema(
+    "two_sample_tests",
+    1,
+    None,
+    (
+        Column("group", pa.string(), "whose frames: as in the table of scores"),
+        Column("subject", pa.string(), "`A against B`: which sets are told apart"),
+        Column("value", pa.float64(), "area under the ROC curve, mean over trainings", nullable=True),
+        Column("low", pa.float64(), "lower end of its 95 % interval", nullable=True),
+        Column("high", pa.float64(), "upper end", nullable=True),
+        Column("deviation", pa.float64(), "of the area over trainings", nullable=True),
+        Column("num_first", pa.int64(), "frames of A", minimum=0),
+        Column("num_second", pa.int64(), "frames of B", minimum=0),
+        Column("note", pa.string(), "why there is no area, or what it has to be read with"),
+    ),
+)
 _ALL = (
     RECORDINGS,
     PARTS,
@@ -391,6 +407,7 @@ _ALL = (
     SPEED_VS_ERROR,
     CHAIN_FRAMES,
     REALISM_CHAIN,
+    TWO_SAMPLE_TESTS,
 )
 TABLES = {schema.name: schema for schema in _ALL}
 

@@ -23,7 +23,7 @@ _OF_TRAINING_FRAMES = ("condition_frames", "encode_latents")
 _OF_FRAMES = ("ingest", "encode", *_FRAMES_OF_CONDITIONS, *_OF_TRAINING_FRAMES)
 """Stages the rows of whose tables are recordings or frames."""
 
-_TWO_SAMPLE_TESTS = ("realism", "sequence_realism")
+_TWO_SAMPLE_TESTS = ("realism", "realism_floors", "sequence_realism")
 """Stages that spend their time on networks which tell sets of frames apart."""
 
 
@@ -75,7 +75,7 @@ class Amounts:
         stage = self._stages.get(key)
         arguments = {} if stage is None else stage.arguments
         if stage is not None and stage.stage in _TWO_SAMPLE_TESTS:
-            return self._two_sample_tests(arguments)
+            return self._two_sample_tests(stage.stage, arguments)
         if stage is not None and stage.stage == "score_model":
             frames = self.rows(arguments["data"]["manifest"])
             held_out = frames.total - frames.training
@@ -87,14 +87,15 @@ class Amounts:
         guided = 1 + sum(numbers.get(name, 1.0) > 1 for name in ("guidance_scale", "autoguidance_scale"))
         return self.rows(key).total * numbers.get("num_inference_steps", 1.0) * guided
 
-    def _two_sample_tests(self, arguments: Mapping[str, Any]) -> float:
+    def _two_sample_tests(self, stage: str, arguments: Mapping[str, Any]) -> float:
         """How many there are: each takes the same time for any number of frames, and of few frames there is none."""
         from ctlev_core.realism.two_sample import MIN_FRAMES
 
         recorded = self.rows(arguments["frames"]["manifest"])
         train, held_out = recorded.training, recorded.total - recorded.training
-        generated = [self.rows(item["manifest"]).total for item in arguments["generated"]]
-        smaller = [train / 2, held_out / 2, min(train, held_out)]
+        made = arguments.get("generated", [])
+        generated = [self.rows(item["manifest"]).total for item in (made if isinstance(made, list) else [made])]
+        smaller = [] if stage == "realism" else [train / 2, held_out / 2, min(train, held_out)]
         smaller += [min(rows, against) for rows in generated for against in (train, held_out)]
         if "length" in arguments:  # of stretches; time in random order is one more
             smaller = [rows / arguments["length"] for rows in (*smaller, train)]

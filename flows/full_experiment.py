@@ -6,7 +6,7 @@ python flows/full_experiment.py [--preset NAME] [--set key=value ...] [--dry-run
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 from ctlev_core import plugins
@@ -23,7 +23,7 @@ from flows.cli import script
 from flows.command_line import Command
 from flows.evaluate import evaluate, train_without_synthetic
 from flows.export_events import export_streams
-from flows.prepare_dataset import PreparedDataset, prepare_dataset
+from flows.prepare_dataset import PreparedDataset, held_out_of, prepare_dataset
 from flows.settings import flow
 from flows.speed_vs_error import speed_vs_error, speed_vs_error_of
 from flows.studies import load_study
@@ -32,7 +32,7 @@ from flows.train_generator import train_generator
 from tasks.ingest import ingest
 from tasks.memorisation import memorisation
 from tasks.nearest_seen import nearest_seen
-from tasks.realism import realism
+from tasks.realism import FRAMES, event_realism, realism, realism_floors
 from tasks.report import report
 from tasks.sequence_realism import sequence_realism
 from tasks.stage import call_flow, call_together
@@ -56,65 +56,50 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
             experiment.windows.duration_us,
             experiment.sequence_length,
         )
-    *own, compared, _ = call_together(
+    *own, compared, _, recorded_events, floors = call_together(
         *(partial(_own_frames, experiment, dataset, number) for number in range(experiment.num_generators)),
         lambda: call_flow(baselines, experiment, dataset),
         lambda: train_without_synthetic(experiment, dataset),
+        lambda: _event_realism(experiment, dataset),
+        lambda: realism_floors(dataset.frames, label="recorded frames"),
     )
-    evaluation = call_flow(evaluate, experiment, dataset, [synthetic for _, synthetic in own], compared)
     # What is shown are the first set of each generator and the first of several fine-tunings.
     first = {name: sets[0] for name, sets in compared.items()}
     checkpoint, synthetic = own[0]
     generated = {SYNTHETIC: synthetic} | {name: frames.synthetic for name, frames in first.items()}
     checkpoints = {SYNTHETIC: checkpoint} | {name: made.checkpoint for name, made in first.items() if made.checkpoint}
-    reference = None
-    if experiment.realism_reference is not None:
-        reference = ingest(dataset=experiment.realism_reference, label="realism reference")
-    looks = realism(
-        dataset.recordings,
-        dataset.frames,
-        list(generated.values()),
-        reference,
-        names=list(generated),
-        label=f"training frames and {', '.join(generated)}",
+    evaluation, in_time, nearest, _, *looks = call_together(
+        lambda: call_flow(evaluate, experiment, dataset, [synthetic for _, synthetic in own], compared),
+        lambda: _sequence_realism(experiment, dataset, generated),
+        lambda: _nearest_seen(experiment, dataset, checkpoint),
+        lambda: None if experiment.export is None else call_flow(export_streams, experiment, dataset, synthetic),
+        *(
+            partial(
+                realism,
+                dataset.frames,
+                frames,
+                floors,
+                name=name,
+                group=FRAMES if name == SYNTHETIC else f"{FRAMES} of {name}",
+                label=name,
+            )
+            for name, frames in generated.items()
+        ),
     )
-    in_time = None
-    if experiment.sequence_length is not None:
-        in_time = sequence_realism(
-            dataset.frames,
-            list(generated.values()),
-            names=list(generated),
-            length=experiment.sequence_length,
-            step_us=experiment.windows.duration_us,
-            label=f"training frames and {', '.join(generated)}",
-        )
-    shown = [
-        GeneratedFrames(
-            name,
-            frames,
-            memorisation(
+    copied = call_together(
+        *(
+            partial(
+                memorisation,
                 dataset.frames,
                 frames,
                 evaluation.extractor,
                 downstream=experiment.feature_extractor,
                 subject=name,
                 label=name,
-            ),
+            )
+            for name, frames in generated.items()
         )
-        for name, frames in generated.items()
-    ]
-    nearest = None
-    generator = plugins.load("generators", experiment.generator.name)
-    if experiment.target is not None and isinstance(generator, GeneratorOfNames):
-        nearest = nearest_seen(
-            checkpoint,
-            dataset.frames,
-            dataset.sample_conditions,
-            generator=experiment.generator,
-            label="nearest seen classes",
-        )
-    if experiment.export is not None:
-        call_flow(export_streams, experiment, dataset, synthetic)
+    )
     made = ReportInputs(
         title=experiment.name,
         notice=experiment.data_notice,
@@ -123,16 +108,55 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         frames=dataset.frames,
         frame_conditions=dataset.frame_conditions,
         conditions=dataset.sample_conditions,
-        generated=tuple(shown),
+        generated=tuple(
+            GeneratedFrames(name, frames, *measured)
+            for (name, frames), *measured in zip(generated.items(), copied, looks, strict=True)
+        ),
         checkpoints=tuple(Named(name, one) for name, one in checkpoints.items()),
         models=tuple(Named(*pair) for pair in zip(evaluation.model_names, evaluation.models, strict=True)),
         scores=tuple(evaluation.scores),
-        realism=looks,
+        event_realism=recorded_events,
+        realism_floors=floors,
         oracle=dataset.more_frames,
         target=dataset.target_frames,
         nearest=nearest,
     )
     return report(made, in_time, openings=evaluation.openings, label=experiment.name)
+
+
+def _event_realism(experiment: Experiment, dataset: PreparedDataset) -> ManifestRef:
+    reference = None
+    if experiment.realism_reference is not None:
+        reference = ingest(dataset=experiment.realism_reference, label="realism reference")
+    return event_realism(dataset.recordings, reference, held_out=held_out_of(experiment), label="recorded events")
+
+
+def _sequence_realism(
+    experiment: Experiment, dataset: PreparedDataset, generated: Mapping[str, ManifestRef]
+) -> ManifestRef | None:
+    if experiment.sequence_length is None:
+        return None
+    return sequence_realism(
+        dataset.frames,
+        list(generated.values()),
+        names=list(generated),
+        length=experiment.sequence_length,
+        step_us=experiment.windows.duration_us,
+        label=f"training frames and {', '.join(generated)}",
+    )
+
+
+def _nearest_seen(experiment: Experiment, dataset: PreparedDataset, checkpoint: ManifestRef) -> ManifestRef | None:
+    generator = plugins.load("generators", experiment.generator.name)
+    if experiment.target is None or not isinstance(generator, GeneratorOfNames):
+        return None
+    return nearest_seen(
+        checkpoint,
+        dataset.frames,
+        dataset.sample_conditions,
+        generator=experiment.generator,
+        label="nearest seen classes",
+    )
 
 
 def _study(study: Study) -> ManifestRef:

@@ -31,7 +31,7 @@ from tasks.downstream import train_downstream
 from tasks.evaluate import score_model
 from tasks.memorisation import memorisation
 from tasks.publish import claimed, next_number
-from tasks.realism import realism
+from tasks.realism import FRAMES, realism, realism_floors
 from tasks.score_version import score_beside_real
 from tasks.stage import call_flow, call_together
 from tasks.store import home_folder
@@ -161,7 +161,9 @@ def _score_labels(regeneration: Regeneration, dataset: PreparedDataset, syntheti
 
 def _score_realism(dataset: PreparedDataset, synthetic: ManifestRef) -> list[ManifestRef]:
     """Statistics of the version's frames beside those of recorded ones, and whether a network tells them apart."""
-    return [realism(None, dataset.tested_frames, [synthetic], None, names=[SYNTHETIC], label=SYNTHETIC)]
+    frames = dataset.tested_frames
+    floors = realism_floors(frames, label="recorded frames")
+    return [realism(frames, synthetic, floors, name=SYNTHETIC, group=FRAMES, label=SYNTHETIC)]
 
 
 def _judge(regeneration: Regeneration, checkpoint: ManifestRef, made: MadeVersion, number: int, seed: int) -> Version:

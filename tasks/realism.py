@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from ctlev_core.realism import distances, two_sample
 from ctlev_core.realism.summary import AXES, Summary, summarise_events, summarise_frames
 from ctlev_core.recordings.stored_events import stored_events
 from data_contracts import tables
+from data_contracts.labels import HeldOut, held_out_split
 from data_contracts.manifest import Manifest
 from data_contracts.training_sets import RECORDED
 from tasks.stage import Output, stage
@@ -23,67 +25,76 @@ MAX_RECORDINGS = 40
 """Of a larger split so many, evenly spread; with `MAX_EVENTS` this takes at most half a minute."""
 MAX_FRAMES = 1000
 """Of a larger set of frames so many, evenly spread."""
+FRAMES = "frames"
+"""Group of the scores of the experiment's own generator, and of the floors."""
 
 
 Frames = tuple[np.ndarray, np.ndarray]
 """Images [N, H, W, 3] uint8, and the recording [N] of each."""
 
 
-@stage(version=5, schema=tables.SCORES)
-def realism(
-    out: Output,
-    recordings: Manifest | None,
-    frames: Manifest,
-    generated: list[Manifest],
-    reference: Manifest | None,
-    *,
-    names: Sequence[str],
+@stage(version=1, schema=tables.SCORES)
+def event_realism(
+    out: Output, recordings: Manifest, reference: Manifest | None, *, held_out: HeldOut | None
 ) -> pa.Table:
-    """Events of the held-out split beside those of the training split, and generated beside recorded training frames.
+    """Events of the held-out split beside those of the training split.
 
-    `recordings` are those behind `frames`; None leaves events out. `reference` are other recordings that those of the
-    training split are compared with, `names` those of the generators behind `generated`.
+    `reference` are other recordings that those of the training split are compared with. `held_out` None: `test`, or
+    `validation` where there is no other.
 
-    Rows have the task `realism` and the group `events`, `frames` (of the first generator), `frames of NAME` or, with
-    other recordings as a reference, `reference`. Settings: the two sets, `A against B` for their distances and
-    `A against A` for the floor. Distributions lie beside the table.
+    Rows have the task `realism` and the group `events` or `reference`. Settings: the two sets, `A against B` for their
+    distances and `A against A` for the floor. Distributions lie beside the table.
+    """
+    split = held_out or held_out_split(recordings.attached(tables.PARTS)["split"].to_pylist())
+    learnt, other = (_summarise_recordings(recordings, name) for name in ("train", split))
+    found = [_compare("events", "train", split, learnt, other, recordings)]
+    if reference is not None:
+        found.append(_compare("reference", "reference", "train", _summarise_whole(reference), learnt, recordings))
+    _write_distributions(out, found)
+    return _scores(rows for rows, _ in found)
+
+
+@stage(version=1, schema=tables.TWO_SAMPLE_TESTS)
+def realism_floors(out: Output, frames: Manifest) -> pa.Table:
+    """How well a network tells recorded frames from one another: what that of generated ones is read beside.
+
+    Three rows: the halves of the training frames (`recorded against recorded`), the halves of the held-out ones (`test
+    against test`, or `validation` where these are what is held out), and held-out from training frames (`test against
+    recorded`). Generators and versions that are compared with the same frames share them.
+    """
+    recorded = {split: _read_frames(frames, rows) for split, rows in _recorded_splits(frames).items()}
+    held_out = frames.held_out
+    tests = {f"{name} against {name}": two_sample.compare_halves(*of_split) for name, of_split in recorded.items()}
+    tests[f"{held_out} against {RECORDED}"] = _tell_apart(held_out, recorded[held_out], RECORDED, recorded[RECORDED])
+    return _test_table(FRAMES, tests)
+
+
+@stage(version=6, schema=tables.SCORES)
+def realism(out: Output, frames: Manifest, generated: Manifest, floors: Manifest, *, name: str, group: str) -> pa.Table:
+    """Generated frames, of the generator `name`, beside recorded training frames; `floors` are of `realism_floors`.
+
+    Rows have the task `realism` and the given group: `FRAMES` for the experiment's own generator. Settings: the two
+    sets, `A against B` for their distances and `A against A` for the floor. Distributions lie beside the table.
 
     How well a network tells frames apart is the metric `c2st`: generated from recorded training frames (`NAME against
-    recorded`) and from recorded test frames (`NAME against test`, or
-    `validation` where these are what is held out); its floors are the halves of either (`recorded
-    against recorded`, `test against test`) and test from training frames (`test against recorded`). Where there are too
-    few frames there is no such row; the table `two_sample_tests`, which lies beside, says why.
+    recorded`) and from recorded held-out frames (`NAME against test`, or `validation`), with the floors beside them.
+    Where there are too few frames there is no such row; the table `two_sample_tests`, which lies beside, says why. The
+    floors are not in that one again.
     """
-    found, tests = [], []
-    if recordings is not None:
-        learnt = _summarise_recordings(recordings, "train")
-        held_out = _summarise_recordings(recordings, frames.held_out)
-        found.append(_compare("events", "train", frames.held_out, learnt, held_out, recordings))
-        if reference is not None:
-            found.append(_compare("reference", "reference", "train", _summarise_whole(reference), learnt, recordings))
-    real = _summarise_frames(frames)
-    other = frames.held_out
-    recorded = {RECORDED: _read_frames(frames, "train"), other: _read_frames(frames, other)}
-    floors = {
-        **{f"{name} against {name}": two_sample.compare_halves(*of_split) for name, of_split in recorded.items()},
-        f"{other} against {RECORDED}": _tell_apart(other, recorded[other], RECORDED, recorded[RECORDED]),
-    }
-    groups = ["frames", *(f"frames of {name}" for name in names[1:])]
-    for group, name, made in zip(groups, names, generated, strict=True):
-        found.append(_compare(group, RECORDED, name, real, _summarise_frames(made), made))
-        own = {
-            f"{name} against {split}": _tell_apart(name, _read_made_frames(made, of_split[1]), split, of_split)
-            for split, of_split in recorded.items()
-        }
-        # The floors are the same for all generators: beside each in the scores, once in the table of tests.
-        found.append((_test_rows(group, own | floors, made), []))
-        tests += [_test_row(group, *item) for item in ((floors | own) if group == groups[0] else own).items()]
-    for schema, rows in (
-        (distances.DISTRIBUTIONS, [row for _, distributions in found for row in distributions]),
-        (two_sample.TWO_SAMPLE_TESTS, tests),
-    ):
-        out.write_table(pa.Table.from_pylist(rows, schema.arrow()), schema)
-    return pa.Table.from_pylist([row for rows, _ in found for row in rows], schema=tables.SCORES.arrow())
+    found = _compare(group, RECORDED, name, _summarise_frames(frames), _summarise_frames(generated), generated)
+    tests = {}
+    for split, rows in _recorded_splits(frames).items():
+        recorded = _read_frames(frames, rows)
+        tests[f"{name} against {split}"] = _tell_apart(name, _read_made_frames(generated, recorded[1]), split, recorded)
+    own = _test_table(group, tests)
+    out.write_table(own, tables.TWO_SAMPLE_TESTS)
+    _write_distributions(out, [found])
+    return _scores([found[0], _test_rows(group, pa.concat_tables([own, floors.table]), generated)])
+
+
+def _recorded_splits(frames: Manifest) -> dict[str, str]:
+    """The split of recorded frames by the name of the set: training frames, and those that are held out."""
+    return {RECORDED: "train", frames.held_out: frames.held_out}
 
 
 def _read_frames(frames: Manifest, split: str) -> Frames:
@@ -113,19 +124,32 @@ def _tell_apart(first: str, of_first: Frames, second: str, of_second: Frames) ->
     )
 
 
-def _test_row(group: str, subject: str, test: two_sample.TwoSampleTest) -> dict[str, Any]:
-    return {"group": group, "subject": subject} | test.row()
+def _test_table(group: str, tests: Mapping[str, two_sample.TwoSampleTest]) -> pa.Table:
+    rows = [{"group": group, "subject": subject} | test.row() for subject, test in tests.items()]
+    return pa.Table.from_pylist(rows, schema=tables.TWO_SAMPLE_TESTS.arrow())
 
 
-def _test_rows(group: str, tests: dict[str, two_sample.TwoSampleTest], data: Manifest) -> list[dict[str, Any]]:
+def _test_rows(group: str, tests: pa.Table, data: Manifest) -> list[dict[str, Any]]:
     """Rows of the table `scores`, of those tests that have an area."""
     return [
-        _score(
-            group, subject, two_sample.C2ST, distances.Estimate(test.value, test.low, test.high), test.num_first, data
-        )
-        for subject, test in tests.items()
-        if not np.isnan(test.value)
+        _score(group, test["subject"], two_sample.C2ST, _estimate(test), test["num_first"], data)
+        for test in tests.to_pylist()
+        if test["value"] is not None
     ]
+
+
+def _estimate(test: Mapping[str, Any]) -> distances.Estimate:
+    low, high = (math.nan if test[name] is None else test[name] for name in ("low", "high"))
+    return distances.Estimate(test["value"], low, high)
+
+
+def _write_distributions(out: Output, found: Sequence[tuple[Any, list[dict[str, Any]]]]) -> None:
+    rows = [row for _, distributions in found for row in distributions]
+    out.write_table(pa.Table.from_pylist(rows, distances.DISTRIBUTIONS.arrow()), distances.DISTRIBUTIONS)
+
+
+def _scores(parts: Iterable[list[dict[str, Any]]]) -> pa.Table:
+    return pa.Table.from_pylist([row for rows in parts for row in rows], schema=tables.SCORES.arrow())
 
 
 def _summarise_recordings(recordings: Manifest, split: str) -> list[Summary]:

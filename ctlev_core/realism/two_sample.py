@@ -24,11 +24,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from ctlev_core.realism.roc import HeldOut, interval_of_mean_area
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
-from data_contracts.tables import Column, TableSchema
 
 C2ST = "c2st"
 MAX_FRAMES = 400
@@ -38,23 +36,6 @@ MIN_FRAMES = 40
 MIN_HALF = 10
 """Frames of a set to learn from, at least."""
 NUM_HALVINGS = 2
-
-TWO_SAMPLE_TESTS = TableSchema(
-    "two_sample_tests",
-    1,
-    None,
-    (
-        Column("group", pa.string(), "whose frames: as in the table of scores"),
-        Column("subject", pa.string(), "`A against B`: which sets are told apart"),
-        Column("value", pa.float64(), "area under the ROC curve, mean over trainings", nullable=True),
-        Column("low", pa.float64(), "lower end of its 95 % interval", nullable=True),
-        Column("high", pa.float64(), "upper end", nullable=True),
-        Column("deviation", pa.float64(), "of the area over trainings", nullable=True),
-        Column("num_first", pa.int64(), "frames of A", minimum=0),
-        Column("num_second", pa.int64(), "frames of B", minimum=0),
-        Column("note", pa.string(), "why there is no area, or what it has to be read with"),
-    ),
-)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 from ctlev_core.provenance.records import Record, read_records, write_provenance
 from ctlev_core.provenance.scores import paired_samples, trace_lineage
 from ctlev_core.realism.distances import DISTRIBUTIONS
-from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from ctlev_core.report.inputs import ReportInputs
 from ctlev_core.report.page.display_names import set_name
 from ctlev_core.report.page.html import Chapter, Colours, Curves, Folded, Section, render_report
@@ -134,9 +133,14 @@ def write_report(
     )
     write_provenance(folder / PROVENANCE, records)
     write_summary(folder, Summary(str(words), steps, grid, [*charts[:-1], *moving, *charts[-1:]], colours))
-    written = traced, samples, made.realism.table, made.recordings.table
+    written = traced, samples, _realism_table(made), made.recordings.table
     for name, table in zip(TABLES, written, strict=True):
         pq.write_table(table, folder / f"{name}.parquet", compression="zstd")
+
+
+def _realism_table(made: ReportInputs[Manifest]) -> pa.Table:
+    """Of events and of each generator's frames; the floors of the latter are among these."""
+    return pa.concat_tables([made.event_realism.table, *(one.realism.table for one in made.generated)])
 
 
 def _artefacts(made: ReportInputs[Manifest]) -> list[tuple[str, Path]]:
@@ -150,7 +154,9 @@ def _artefacts(made: ReportInputs[Manifest]) -> list[tuple[str, Path]]:
         *((f"frames of {one.name}", one.frames) for one in made.generated),
         *((f"model of {one.name}", one.manifest) for one in made.models),
         *((f"score of {_score_name(one)}", one) for one in made.scores),
-        ("realism", made.realism),
+        ("events of recordings", made.event_realism),
+        ("recorded frames told apart", made.realism_floors),
+        *((f"realism of {one.name}", one.realism) for one in made.generated),
         *((f"memorisation of {one.name}", one.memorisation) for one in made.generated),
         ("more recorded frames", made.oracle),
         ("target frames", made.target),
@@ -199,15 +205,15 @@ class _Quality(NamedTuple):
 
     @classmethod
     def of(cls, made: ReportInputs[Manifest], rows: list[Row], paired: PairedScores) -> _Quality:
-        distributions, tests = (
-            made.realism.attached(schema).to_pylist() for schema in (DISTRIBUTIONS, TWO_SAMPLE_TESTS)
-        )
-        realism, names = made.realism.table.to_pylist(), [one.name for one in made.generated]
+        realism, names = _realism_table(made).to_pylist(), [one.name for one in made.generated]
+        of_generators = [one.realism for one in made.generated]
+        distributions = [one.attached(DISTRIBUTIONS) for one in (made.event_realism, *of_generators)]
+        tests = [made.realism_floors.table, *(one.attached(tables.TWO_SAMPLE_TESTS) for one in of_generators)]
         frames, memorised = ([getattr(one, name) for one in made.generated] for name in ("frames", "memorisation"))
         return cls(
             frame_tables(rows),
             floor_tables(made.scores),
-            realism_sections(realism, distributions, tests),
+            realism_sections(realism, *(pa.concat_tables(parts).to_pylist() for parts in (distributions, tests))),
             memorisation_sections(made.frames, frames, memorised),
             rejection_sections({one.name: one.frames for one in made.generated}),
             usefulness_sections(usefulness_of(rows, realism, names, paired)),

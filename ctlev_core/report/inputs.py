@@ -27,11 +27,13 @@ class GeneratedFrames(Generic[M]):
         name: of the generator; the experiment's own is `synthetic`.
         frames: that it made.
         memorisation: of the training frames by these.
+        realism: these beside recorded frames.
     """
 
     name: str
     frames: M
     memorisation: M
+    realism: M
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,8 @@ class ReportInputs(Generic[M]):
         checkpoints: generators that learnt.
         models: downstream models.
         scores: of models and of sets of frames.
-        realism: generated frames beside recorded ones.
+        event_realism: events of the held-out recordings beside those of the training recordings.
+        realism_floors: recorded frames told from one another.
         oracle: other recorded frames of the moments asked for.
         target: recorded frames of another dataset, which was tested on.
         nearest: what of the training set is most like the target's classes.
@@ -67,7 +70,8 @@ class ReportInputs(Generic[M]):
     checkpoints: tuple[Named[M], ...]
     models: tuple[Named[M], ...]
     scores: tuple[M, ...]
-    realism: M
+    event_realism: M
+    realism_floors: M
     oracle: M | None = None
     target: M | None = None
     nearest: M | None = None

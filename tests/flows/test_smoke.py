@@ -25,7 +25,8 @@ from data_contracts.manifest import MANIFEST_FILE, ManifestRef, conditions_of, r
 # The report's digest covers the time each stage took.
 DETERMINISTIC = (
     "ingest", "encode", "condition_frames", "condition_samples", "finetune", "sample", "simulate", "train_downstream",
-    "score_model", "score_distance", "realism", "memorisation", "take_share", "take_label_consistent",
+    "score_model", "score_distance", "event_realism", "realism_floors", "realism", "memorisation", "take_share",
+    "take_label_consistent",
 )  # fmt: skip
 
 
@@ -216,6 +217,8 @@ def test_a_second_run_is_as_quick_as_a_bare_flow(smoke_home):
                 "label agreement of",
                 "score_distance: event_gan",
                 "score_distance: smpl_esim",
+                "realism: event_gan",
+                "realism: smpl_esim",
                 "memorisation",
                 "report",
                 "contact_sheet",
@@ -230,7 +233,7 @@ def test_a_second_run_is_as_quick_as_a_bare_flow(smoke_home):
                 "+event_gan",
                 "label agreement of event_gan",
                 "score_distance: event_gan",
-                "realism",
+                "realism: event_gan",
                 "memorisation: event_gan",
                 "report",
             },
@@ -246,6 +249,10 @@ def test_a_second_run_is_as_quick_as_a_bare_flow(smoke_home):
                 "train",
                 "take_",
                 "score",
+                "realism_floors",
+                "realism: event_gan",
+                "realism: smpl_esim",
+                "realism: synthetic",
                 "memorisation",
                 "report",
             },

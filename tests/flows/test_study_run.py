@@ -43,7 +43,7 @@ def test_a_study_runs_what_its_experiments_have_not_run_yet(study):
     new = sorted(name.partition("/")[0] for name in made.keys() - before.keys())
     # The smaller one's frames, models and scores are the larger one's; only its pages are put together anew. And the
     # generator whose solvers are compared is the larger one's.
-    pages = ["contact_sheet", "realism", "report", "study_report"]
+    pages = ["contact_sheet", "report", "study_report"]
     assert new == sorted([*pages, *["sample_timed"] * 3, "sampling_errors", "speed_report"])
     page = (home / "reports" / "pair.html").read_text()
     for expected in ("2D pose (all)", "2D pose (part)", 'href="pair/part/report.html"'):

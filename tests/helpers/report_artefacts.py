@@ -11,7 +11,6 @@ import pyarrow.parquet as pq
 
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.stretches import SHUFFLED
-from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from ctlev_core.report.inputs import GeneratedFrames, Named, ReportInputs
 from ctlev_core.scoring.memorisation import CLOSEST_PAIRS
 from data_contracts import tables
@@ -47,11 +46,14 @@ class Experiment:
         self.model_names = [f"{name}, seed {seed}" for name in TRAINING_SETS for seed in seeds]
         self.models = [self._training("train_downstream") for _ in self.model_names]
         self.scores = self._scores()
-        beside = {DISTRIBUTIONS.name: _distributions(), TWO_SAMPLE_TESTS.name: _tests()}
-        self.realism = self._put("realism", _realism(), tables.SCORES, beside)
+        no_rows = tables.SCORES.arrow().empty_table()
+        beside = {DISTRIBUTIONS.name: DISTRIBUTIONS.arrow().empty_table()}
+        self.event_realism = self._put("event_realism", no_rows, tables.SCORES, beside)
+        self.realism_floors = self._put("realism_floors", _tests("test against test"), tables.TWO_SAMPLE_TESTS)
+        self.realism = [self._realism(name) for name in ("synthetic", "gan")]
         self.memorisation = [self._memorisation(name) for name in ("synthetic", "gan")]
         arguments = {"length": STRETCH, "step_us": STEP_US}
-        beside = {TWO_SAMPLE_TESTS.name: _stretch_tests()}
+        beside = {tables.TWO_SAMPLE_TESTS.name: _stretch_tests()}
         self.sequences = self._put("sequence_realism", _sequences(), tables.SCORES, beside, (), arguments)
 
     @property
@@ -66,12 +68,21 @@ class Experiment:
             frames=self.frames,
             frame_conditions=self.frame_conditions,
             conditions=self.conditions,
-            generated=tuple(map(GeneratedFrames, names, self.generated, self.memorisation)),
+            generated=tuple(map(GeneratedFrames, names, self.generated, self.memorisation, self.realism)),
             checkpoints=tuple(map(Named, names, self.checkpoints)),
             models=tuple(map(Named, self.model_names, self.models)),
             scores=tuple(self.scores),
-            realism=self.realism,
+            event_realism=self.event_realism,
+            realism_floors=self.realism_floors,
         )
+
+    def _realism(self, name: str) -> Manifest:
+        group = "frames" if name == "synthetic" else f"frames of {name}"
+        beside = {
+            DISTRIBUTIONS.name: _distributions(group),
+            tables.TWO_SAMPLE_TESTS.name: _tests(f"{name} against recorded", group),
+        }
+        return self._put("realism", _realism(name, group), tables.SCORES, beside)
 
     def _put(self, stage: str, table: pa.Table, schema, attached=(), arrays=(), arguments=(), inputs=()) -> Manifest:
         self._count += 1
@@ -215,22 +226,22 @@ def _score(training_set: str, seed: int, value: float, model: Manifest, data: Ma
     }  # fmt: skip
 
 
-def _realism() -> pa.Table:
+def _realism(name: str, group: str) -> pa.Table:
     same = {"task": "realism", "seed": 0, "low": None, "high": None, "num_samples": 6, "num_train": 0}
-    same |= {"model_digest": "", "data_digest": "", "group": "frames", "metric": "active_pixel_share"}
-    rows = [{**same, "subject": name, "value": 0.5} for name in ("recorded", "synthetic", "synthetic against recorded")]
+    same |= {"model_digest": "", "data_digest": "", "group": group, "metric": "active_pixel_share"}
+    rows = [{**same, "subject": one, "value": 0.5} for one in ("recorded", name, f"{name} against recorded")]
     return pa.Table.from_pylist(rows, schema=tables.SCORES.arrow())
 
 
-def _distributions() -> pa.Table:
-    row = {"group": "frames", "subject": "recorded", "axis": "value", "centre": 30.0, "share": 1.0}
+def _distributions(group: str) -> pa.Table:
+    row = {"group": group, "subject": "recorded", "axis": "value", "centre": 30.0, "share": 1.0}
     return pa.Table.from_pylist([row], schema=DISTRIBUTIONS.arrow())
 
 
-def _tests() -> pa.Table:
+def _tests(subject: str, group: str = "frames") -> pa.Table:
     unknown = dict.fromkeys(("value", "low", "high", "deviation"))
-    row = {"group": "frames", "subject": "synthetic against recorded", "num_first": 12, "num_second": 6, **unknown}
-    return pa.Table.from_pylist([{**row, "note": "too few frames"}], schema=TWO_SAMPLE_TESTS.arrow())
+    row = {"group": group, "subject": subject, "num_first": 12, "num_second": 6, **unknown}
+    return pa.Table.from_pylist([{**row, "note": "too few frames"}], schema=tables.TWO_SAMPLE_TESTS.arrow())
 
 
 def _sequences() -> pa.Table:
@@ -265,4 +276,4 @@ def _stretch_tests() -> pa.Table:
         for name, area in areas.items()
     ]
     rows[-1]["note"] = "fewer than 40 frames in a set"
-    return pa.Table.from_pylist(rows, schema=TWO_SAMPLE_TESTS.arrow())
+    return pa.Table.from_pylist(rows, schema=tables.TWO_SAMPLE_TESTS.arrow())

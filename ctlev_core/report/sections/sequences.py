@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.realism.stretches import SHUFFLED, labelled_stretches, recorded_stretches
-from ctlev_core.realism.two_sample import C2ST, TWO_SAMPLE_TESTS
+from ctlev_core.realism.two_sample import C2ST
 from ctlev_core.report.page.display_names import Name, metric_name, set_name
 from ctlev_core.report.page.html import Colours, Films, Section, Table
 from ctlev_core.report.sections.two_sample import two_sample_tables
@@ -16,6 +16,7 @@ from ctlev_core.statistics.bootstrap import score_text
 from data_contracts.labels import HELD_OUT_SPLITS
 from data_contracts.manifest import Manifest
 from data_contracts.run_record import read_run_record
+from data_contracts.tables import TWO_SAMPLE_TESTS
 from data_contracts.training_sets import RECORDED
 
 NUM_FILMS = 6

@@ -203,7 +203,7 @@ def test_rows_follow_from_the_recordings(tmp_path):
                 sampling={"options": {"num_inference_steps": 4}}),
         planned("train_downstream", "g", training_sets=[ref("c")],
                 downstream={"options": {"num_steps": 7, "batch_size": 4, "sequence_length": 3}}),
-        planned("realism", "h", frames=ref("c"), generated=[ref("f")]),
+        planned("realism", "h", frames=ref("c"), generated=ref("f"), floors=ref("i")),
     ]  # fmt: skip
     amounts = Amounts({stage.key: stage for stage in stages})
     assert [amounts.rows(key) for key in "abcde"] == [
@@ -263,11 +263,17 @@ def test_what_took_time_without_any_work_does_not_make_work_endless():
 def test_realism_is_as_many_two_sample_tests_as_have_enough_frames():
     recorded = planned("encode", "a", recordings=ref("x"), num_train_recordings=90, num_test_recordings=60)
     few, many = (planned("sample", name, conditions=ref("x"), count=count) for name, count in (("b", 39), ("c", 40)))
-    whole = planned("realism", "d", frames=ref("a"), generated=[ref("b"), ref("c")])
+    of_few, of_many = (
+        planned("realism", key, frames=ref("a"), generated=ref(made), floors=ref("f"))
+        for key, made in (("d", "b"), ("g", "c"))
+    )
+    floors = planned("realism_floors", "f", frames=ref("a"))
     time = planned("sequence_realism", "e", frames=ref("a"), generated=[ref("c")], length=2)
-    amounts = Amounts({stage.key: stage for stage in (recorded, few, many, whole, time)})
-    # Halves of the training frames, these against those of the test, the larger set against both.
-    assert amounts.work("d") == 1 + 1 + 2
+    amounts = Amounts({stage.key: stage for stage in (recorded, few, many, of_few, of_many, floors, time)})
+    # Halves of the training frames, and these against those of the test.
+    assert amounts.work("f") == 1 + 1
+    # The larger set against both.
+    assert (amounts.work("d"), amounts.work("g")) == (0, 2)
     # Stretches: 45 of the training frames, in order and in none.
     assert amounts.work("e") == 1
 

@@ -12,12 +12,12 @@ from scipy.stats import mannwhitneyu
 from ctlev_core.realism.roc import HeldOut, area_under_roc, interval_of_mean_area
 from ctlev_core.realism.two_sample import (
     MIN_FRAMES,
-    TWO_SAMPLE_TESTS,
     TwoSampleTest,
     choose_rows,
     compare_frames,
     compare_halves,
 )
+from data_contracts import tables
 
 SCORES = st.lists(st.integers(0, 5).map(float), min_size=1, max_size=12).map(np.array)
 
@@ -195,7 +195,7 @@ def test_what_cannot_be_measured_is_not_a_number_with_the_reason(first, second, 
     assert np.isnan([found.value, found.low, found.high, found.deviation]).all()
     assert reason in found.note and (found.num_first, found.num_second) == (len(first), len(second))
     row = found.row()
-    assert row["value"] is None and {"group", "subject", *row} == {c.name for c in TWO_SAMPLE_TESTS.columns}
+    assert row["value"] is None and {"group", "subject", *row} == {c.name for c in tables.TWO_SAMPLE_TESTS.columns}
 
 
 @pytest.mark.usefixtures("quick_two_sample_tests")

@@ -54,5 +54,6 @@ def test_scores_over_all_rows_are_a_table(experiment):
 
 
 def test_the_place_of_a_report_is_told(experiment):
-    (experiment.realism.ref.path / "report.html").write_text("page")
-    assert f"]({(experiment.realism.ref.path / 'report.html').as_uri()})" in stage_page(experiment.realism, "report")
+    (experiment.event_realism.ref.path / "report.html").write_text("page")
+    link = (experiment.event_realism.ref.path / "report.html").as_uri()
+    assert f"]({link})" in stage_page(experiment.event_realism, "report")

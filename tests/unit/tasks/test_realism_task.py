@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from ctlev_core.realism import two_sample
-from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from data_contracts import tables
 from data_contracts.labels import Labels
 from data_contracts.manifest import label_columns, read_manifest, write_manifest
-from tasks.realism import realism
+from tasks.realism import realism, realism_floors
 from tasks.stage import Output
 
 pytestmark = pytest.mark.usefixtures("quick_two_sample_tests")
@@ -53,14 +51,24 @@ def noise(count, share, seed):
     return (active * np.uint8(150)).repeat(3, axis=-1)
 
 
+def _run(stage, folder, *inputs, **options):
+    folder.mkdir()
+    return write_manifest(folder, stage.function(Output(folder, folder), *inputs, **options), stage.schema)
+
+
 @pytest.fixture
 def run(tmp_path):
     def call(real, generated, names=("synthetic", "gan")):
-        folder = tmp_path / "made"
-        folder.mkdir()
-        table = realism.function(Output(folder, folder), None, real, generated, None, names=names)
-        tests = pq.read_table(folder / f"{TWO_SAMPLE_TESTS.name}.parquet").to_pylist()
-        return table.to_pylist(), {(test["group"], test["subject"]): test for test in tests}
+        groups = ["frames", *(f"frames of {name}" for name in names[1:])]
+        floors = read_manifest(_run(realism_floors, tmp_path / "floors", real))
+        made = [
+            read_manifest(_run(realism, tmp_path / name, real, one, floors, name=name, group=group))
+            for one, name, group in zip(generated, names, groups, strict=True)
+        ]
+        parts = [floors.table, *(one.attached(tables.TWO_SAMPLE_TESTS) for one in made)]
+        tests = [test for part in parts for test in part.to_pylist()]
+        rows = [row for one in made for row in one.table.to_pylist()]
+        return rows, {(test["group"], test["subject"]): test for test in tests}
 
     return call
 

@@ -8,7 +8,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from ctlev_core.realism.stretches import SHUFFLED
-from ctlev_core.realism.two_sample import TWO_SAMPLE_TESTS
 from data_contracts import tables
 from data_contracts.labels import Labels
 from data_contracts.manifest import label_columns, read_manifest, write_manifest
@@ -85,7 +84,7 @@ def run(tmp_path):
         folder.mkdir()
         settings = {"names": names, "length": LENGTH, "step_us": STEP_US}
         table = sequence_realism.function(Output(folder, folder), frames, generated, **settings)
-        tests = pq.read_table(folder / f"{TWO_SAMPLE_TESTS.name}.parquet").to_pylist()
+        tests = pq.read_table(folder / f"{tables.TWO_SAMPLE_TESTS.name}.parquet").to_pylist()
         return table.to_pylist(), {test["subject"]: test for test in tests}
 
     return call
