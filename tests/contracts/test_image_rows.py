@@ -148,6 +148,7 @@ print(*[train(Path(sys.argv[1]) / str(count), count, sys.argv[2]) for count in (
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plain", "compressed"])
 def test_training_on_200_gb_of_frames_takes_the_memory_of_its_batches(tmp_path, kind):
     """A sparse file, or one of black frames: 254,000 frames of 512 px. Loaded, they would be 200 GB."""

@@ -59,6 +59,7 @@ def test_it_differs_from_the_paper_in_amounts_alone(home, monkeypatch):
         assert len(different) > 5
 
 
+@pytest.mark.slow
 def test_a_dry_run_lists_the_stages_and_makes_what_is_missing_once(home):
     planned = run_script_here("full_experiment", *TINY, "--dry-run", home=home)
     assert planned.status == 0, planned.errors
@@ -68,6 +69,7 @@ def test_a_dry_run_lists_the_stages_and_makes_what_is_missing_once(home):
     assert len(set(re.findall(r"finetune: .* ([0-9a-f]{32})$", planned.output, re.MULTILINE))) == 8
 
 
+@pytest.mark.slow
 def test_own_files_are_taken_where_they_are_given(home, tmp_path):
     refused = run_script_here(
         "full_experiment", *TINY, "--set", f"paths.dhp19={tmp_path / 'none'}", "--dry-run", home=home

@@ -96,6 +96,7 @@ def test_wandb_offline(finished, smoke_home, monkeypatch):
     assert list((smoke_home / "wandb").glob("offline-run-*/*.wandb"))
 
 
+@pytest.mark.slow
 def test_the_command_tells_a_tracker(smoke_home):
     finished = run_script("full_experiment", "--preset", "smoke", "--track", "tensorboard", home=smoke_home)
     assert finished.status == 0, finished.errors

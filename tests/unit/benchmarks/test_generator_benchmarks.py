@@ -155,6 +155,7 @@ def test_errors_grow_as_digits_are_lost(benchmarks, base_model_folder, scheduler
     assert all(error.latents[0] >= error.latents[1] for error in found.values())
 
 
+@pytest.mark.slow
 def test_training_benchmark(benchmarks, base_model_folder, capsys):
     benchmarks.training.main(
         ["--base_model", str(base_model_folder), "--batch-size", "2", "--rounds", "2", "--steps", "1"]
@@ -169,6 +170,7 @@ def test_training_benchmark(benchmarks, base_model_folder, capsys):
     assert "Targets missed: " in printed
 
 
+@pytest.mark.slow
 def test_sampling_benchmark(benchmarks, base_model_folder, capsys, monkeypatch):
     monkeypatch.setattr(benchmarks.sampling, "EXTRAPOLATED_FROM", (1, 2))
     benchmarks.sampling.main(

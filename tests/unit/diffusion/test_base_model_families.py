@@ -31,7 +31,10 @@ PROMPTS = ["a photo of a cup", "a photo of a ball"]
 ROUTES = {"text": (stable_diffusion, "unet"), "ControlNet": (controlnet, "both")}
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=pytest.mark.slow) if name in ("v2", "xl") else name for name in FAMILIES],
+)
 def family(request, tmp_path_factory):
     return write_family(request.param, tmp_path_factory.mktemp(request.param) / request.param)
 

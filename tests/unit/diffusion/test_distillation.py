@@ -163,6 +163,7 @@ def files_of(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_killed_distillation_ends_the_same(tmp_path, teacher, student, monkeypatch):
     from ctlev_core.diffusion.training import loop
 

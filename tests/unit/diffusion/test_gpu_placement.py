@@ -100,7 +100,9 @@ def fine_tuned(folder, base_model, device, changed, num_steps=2):
 
 
 @pytest.mark.usefixtures("native_bfloat16")
-@pytest.mark.parametrize("name", TRAINED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in ("both", "float16") else pytest.mark.slow) for name in TRAINED]
+)
 def test_fine_tuning(tmp_path, base_model_folder, name):
     with simulated_gpu() as gpu:
         history, weights = fine_tuned(tmp_path / "gpu", base_model_folder, "cuda", TRAINED[name])
@@ -114,6 +116,7 @@ def test_fine_tuning(tmp_path, base_model_folder, name):
         assert all(torch.equal(weights[key], expected[key]) for key in expected)
 
 
+@pytest.mark.slow
 def test_a_killed_fine_tuning_goes_on(tmp_path, base_model_folder, monkeypatch):
     update, calls = trainer.Trainer.update, []
 

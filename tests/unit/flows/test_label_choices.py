@@ -74,6 +74,7 @@ def test_covering_labels_are_the_farthest_poses_and_become_the_conditions(prepar
     assert left[0] < left[1]
 
 
+@pytest.mark.slow
 def test_hard_labels_are_of_the_quarter_with_the_largest_errors_to_expect(prepared):
     asked, recordings, frames = prepared
     table = read_manifest(choose_labels(asked, recordings, recordings, frames, "hard"))

@@ -38,6 +38,7 @@ def operations(work, with_controlnet=False):
     return stable_diffusion_v1(with_controlnet).operations(work, *SIZE)
 
 
+@pytest.mark.slow
 def test_counts_of_stable_diffusion_v1_are_those_in_the_literature():
     """TFLOP an image at 512 and 256 px, counted once by torch on networks with weights."""
     published = {"denoising": (0.803, 0.180), "encoding": (1.117, 0.273), "decoding": (2.515, 0.622)}

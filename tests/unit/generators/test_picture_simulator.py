@@ -120,6 +120,7 @@ def test_panned_pictures_are_exact_means(blur_px):
     assert abs(seen[0, 0, 0] - 0.3) < 1e-6 or blur_px
 
 
+@pytest.mark.slow
 def test_calibration_finds_what_made_the_recordings():
     """Thresholds within 5 %, the leak within a quarter, the place (of other pictures) within 0.7 px."""
     made_with = {
@@ -150,6 +151,7 @@ def test_calibration_tells_a_camera_that_calls_falling_light_1():
     assert (found.flipped, found.negative) == (True, False)
 
 
+@pytest.mark.slow
 def test_what_the_user_sets_wins_and_two_recordings_are_enough():
     recordings = record(strokes(2, seed=1), threshold=0.3)
     given = {"threshold": 0.7, "centre_px": (1.0, 1.0), "negative": False, "leak_rate_hz": 0.0}

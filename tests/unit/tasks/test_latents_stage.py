@@ -102,6 +102,7 @@ def refuse(vae, images):
     raise AssertionError("encoded again")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     "changes",

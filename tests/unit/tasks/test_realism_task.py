@@ -102,7 +102,8 @@ def test_every_generator_is_told_from_training_and_test_frames_beside_both_floor
     assert {row["group"] for row in rows} == {"frames", "frames of gan"}, "no recordings, no events"
 
 
-def test_frames_for_validation_take_the_place_of_test_frames(tmp_path, run):
+def test_frames_for_validation_take_the_place_of_test_frames(tmp_path, run, monkeypatch):
+    monkeypatch.setattr("ctlev_core.realism.two_sample_network.NUM_STEPS", 2)
     splits = ["train"] * 80 + ["validation"] * 80
     real = frame_set(tmp_path / "recorded", noise(160, 0.2, 0), [f"r{row // 2}" for row in range(160)], splits)
     made = synthetic_set(tmp_path / "made_set", noise(80, 0.2, 1), ["elsewhere"] * 80)

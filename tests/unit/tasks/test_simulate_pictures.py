@@ -93,6 +93,7 @@ def test_recordings_and_their_calibration_are_the_same_again(tmp_path, monkeypat
     assert again.ref.digest == first.ref.digest
 
 
+@pytest.mark.slow
 def test_options_of_the_user_win_and_other_windows_are_around_the_middle(tmp_path, monkeypatch, inputs):
     made, *_ = make(tmp_path, monkeypatch, inputs, Windows(method="count", num_events=300), {"threshold": 0.4})
     found = json.loads((made.ref.path / "calibration.json").read_text())

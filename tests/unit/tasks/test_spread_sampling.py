@@ -95,6 +95,7 @@ def sample_part(asked, part):
 _original = spread_sampling._sample_part
 
 
+@pytest.mark.slow
 def test_frames_are_those_of_one_machine_and_none_is_sampled_here(run, elsewhere, monkeypatch):
     with monkeypatch.context() as here:
         here.setattr(task, "is_dealt_out", lambda arguments: False)
@@ -109,6 +110,7 @@ def test_frames_are_those_of_one_machine_and_none_is_sampled_here(run, elsewhere
     assert dealt.ref.digest == alone.ref.digest
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_sampled_again(run, elsewhere, tmp_path, monkeypatch):
     first = run("first")
     times = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "first_work").iterdir()}

@@ -103,6 +103,7 @@ def test_conditions_rendered_some_rows_at_a_time_are_the_same(tmp_path, monkeypa
     assert len(found) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SPREAD)
 def test_runners_make_the_same(alone, tmp_path, monkeypatch, kind):
     try:
