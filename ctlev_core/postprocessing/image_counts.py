@@ -18,6 +18,7 @@ events are then black.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -127,12 +128,11 @@ def fit_counts(histograms: np.ndarray, options: Options) -> CountModel:
     log_probabilities[:, :, FAINT:] = np.log(blurred / blurred.sum(axis=2, keepdims=True))
     num_events = np.log(counts.sum(axis=(1, 2, 3), dtype=np.float64))
     log_num_events = float(num_events.mean()), max(float(num_events.std()), LEAST_DEVIATION)
-    blurs = [_blur(width) for width in BLURS]
     tables = np.empty(log_probabilities.shape, np.float32)
     for number, scale in enumerate(grid):
         of_scale = _shares_at(scale, scales, shares)
         for blur, width in enumerate(BLURS):
-            table = _most_probable_counts(scale, of_scale, width, blurs[blur])
+            table = _most_probable_counts(scale, of_scale, width)
             tables[number, blur] = np.where(table < 0, max(scale * excess.mean(), 1.0), table)
     return CountModel(options, scales, shares, grid, log_probabilities, tables, log_num_events, excess)
 
@@ -198,13 +198,23 @@ def _level_shares(shares: np.ndarray, scale: float) -> np.ndarray:
     return np.bincount(levels, weights=_shares_of_levels(shares, levels), minlength=256)
 
 
+@functools.cache
 def _blur(width: float) -> np.ndarray:
     """[256, 256]: share of the values i that a decoder of this width turns into j; what lies outside is clipped."""
     from scipy.special import ndtr
 
     upper_ends = np.append(np.arange(255) + 0.5, np.inf)
     cumulated = ndtr((upper_ends - np.arange(256)[:, None]) / width)
-    return np.diff(cumulated, axis=1, prepend=0.0)
+    blur = np.diff(cumulated, axis=1, prepend=0.0)
+    blur.setflags(write=False)
+    return blur
+
+
+@functools.cache
+def _log_blur(width: float) -> np.ndarray:
+    log_blur = np.log(_blur(width) + 1e-300)
+    log_blur.setflags(write=False)
+    return log_blur
 
 
 def _estimate(values: np.ndarray, frequencies: np.ndarray, model: CountModel, rng: np.random.Generator) -> np.ndarray:
@@ -228,7 +238,7 @@ def _estimate(values: np.ndarray, frequencies: np.ndarray, model: CountModel, rn
     number, blur = np.unravel_index(best, model.log_probabilities.shape[:2])
     scale = float(model.grid[number])
     shares = _shares_at(scale, model.full_scales, model.count_shares)
-    table = _most_probable_counts(scale, shares, BLURS[blur], _blur(BLURS[blur]))
+    table = _most_probable_counts(scale, shares, BLURS[blur])
     wanted = (scale, scale)
     if model.options.normalisation == "three_sigma":
         # One part in 500 of it moves no value by more than half a grey level; up to 1 all events come out white.
@@ -288,11 +298,11 @@ def _nearest_counts(scale: float) -> np.ndarray:
     return table
 
 
-def _most_probable_counts(scale: float, shares: np.ndarray, width: float, blur: np.ndarray) -> np.ndarray:
+def _most_probable_counts(scale: float, shares: np.ndarray, width: float) -> np.ndarray:
     """The most probable count [256] of each value that a decoder of this width has blurred; -1 = saturated."""
     levels = _levels(scale)
     log_shares = np.log(_shares_of_levels(shares, levels))
-    found = np.argmax(log_shares[:, None] + np.log(blur[levels] + 1e-300), axis=0)
+    found = np.argmax(log_shares[:, None] + _log_blur(width)[levels], axis=0)
     # A level so close to 255 cannot be told from it; that there are saturated pixels at all decides about the scale.
     found[levels[found] >= 255 - width] = -1
     return found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import pickle
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -64,9 +63,12 @@ def write_cdehp_label(path: Path, joints: np.ndarray, partner: str = "color_name
 
 def write_atis(path: Path, t: Sequence[int], x: Sequence[int], y: Sequence[int], p: Sequence[int]) -> Path:
     """N-Caltech101's 40 bits an event, as its paper describes them: x, y, polarity and 23 bits of time, high first."""
+    columns, times, signs = np.array([x, y], np.int64), np.array(t, np.int64), np.array(p, np.int64)
+    if np.any(columns >> 8) or np.any(times >> 23) or np.any(signs >> 1):
+        raise ValueError("x and y must have 8 bits, t 23 and p one")
     path.parent.mkdir(parents=True, exist_ok=True)
-    words = [struct.pack(">BBBH", a, b, d << 7 | c >> 16, c & 0xFFFF) for a, b, c, d in zip(x, y, t, p, strict=True)]
-    path.write_bytes(b"".join(words))
+    rest = np.array([signs << 7 | times >> 16, times >> 8 & 0xFF, times & 0xFF])
+    path.write_bytes(np.concatenate([columns, rest]).astype(np.uint8).T.tobytes())
     return path
 
 

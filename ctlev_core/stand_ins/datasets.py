@@ -168,7 +168,7 @@ def write_n_caltech101(root: Path) -> None:
         for number in range(N_CALTECH101_PICTURES):
             seed = 1000 + 100 * kind + number
             columns = _shaken_outline(kind + 2, n_caltech101.FIELD, THING_EVENTS, seed)
-            writers.write_atis(root / name / f"image_{number + 1:04d}.bin", *(column.tolist() for column in columns))
+            writers.write_atis(root / name / f"image_{number + 1:04d}.bin", *columns)
 
 
 def write_amass(root: Path) -> None:
