@@ -113,7 +113,7 @@ def decoder_options(experiment: Experiment, stretches: bool = False) -> PixelDec
         PluginError: an option is unknown or wrong.
     """
     options = validate_options(PixelDecoderOptions, experiment.pixel_decoder or {}, "pixel_decoder")
-    return options if stretches else options.model_copy(update={"previous_frame": False})
+    return options if stretches else options.model_copy(update={"previous_frame": False, "moving_noise": False})
 
 
 def smooth(sampling: SamplingChoice) -> SamplingChoice:

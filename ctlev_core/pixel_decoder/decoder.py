@@ -67,6 +67,7 @@ class PixelDecoder:
             num_passes=self.options.num_passes,
             precision=self.options.precision,
             lengths=lengths if self.interval_us else None,
+            moving_noise=self.options.moving_noise,
         )
         for values in drawn:
             if self.whole_counts:

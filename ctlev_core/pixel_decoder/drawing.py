@@ -6,7 +6,7 @@ drawn in one pass is drawn pixel by pixel; the passes after it see the neighbour
 pass alone would leave pixels independent of one another.
 
 Every image has a random stream of its own. A network that sees the frame before draws the frames of a stretch one after
-another, those of several stretches at a time.
+another, those of several stretches at a time; their noise may move along (`moving_noise`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ctlev_core.cpu_precision import computed_in
+from ctlev_core.pixel_decoder.moving_noise import MovingNoise, Noise
 from ctlev_core.pixel_decoder.network import MAX_NOISE, MIN_NOISE, PixelNetwork
 from ctlev_core.pixel_decoder.value_classes import ValueClasses
 from data_contracts.image_rows import Images
@@ -83,6 +84,7 @@ def draw_values(
     num_passes: int,
     precision: str = "float32",
     lengths: Sequence[int] | None = None,
+    moving_noise: bool = False,
 ) -> Iterator[np.ndarray]:
     """Values of sampled images, one after another; image i depends on image, condition and seed i alone.
 
@@ -98,6 +100,7 @@ def draw_values(
         precision: of the convolutions.
         lengths: images of each stretch, which lie behind one another, of a network that sees the frame before; None =
             each is by itself.
+        moving_noise: whether the noise of a stretch moves with what its images show; see `MovingNoise`.
     Yields:
         [P, H, W] uint16.
     Raises:
@@ -115,13 +118,19 @@ def draw_values(
     for start in range(0, len(counts), BATCH):
         first, count = firsts[start : start + BATCH], counts[start : start + BATCH]
         rows = slice(int(first[0]), int(first[-1] + count[-1]))
-        images = as_input(image_planes(np.asarray(frames[rows]), network.num_planes))
+        shown = np.asarray(frames[rows])
+        images = as_input(image_planes(shown, network.num_planes))
         asked = None if conditions is None else torch.from_numpy(condition_planes(np.asarray(conditions[rows])))
         streams = [np.random.default_rng([seed, DRAW_STREAM]) for seed in seeds[rows]]
+        noises: list[Noise] = list(streams)
+        if moving_noise and lengths is not None:
+            noises = _noise_of_stretches(count, [seeds[row] for row in first], images.shape[2:])
         drawn = np.empty(images.shape, np.int64)
         for position in range(int(count.max())):
             # The rows at this place of their stretch.
             at = first[count > position] - rows.start + position
+            if position:
+                _move_on([noises[row] for row in at], shown[at - 1], shown[at])
             previous = None
             if network.sees_previous:
                 previous = torch.from_numpy(drawn[at - 1] if position else np.full_like(drawn[at], -1))
@@ -131,11 +140,25 @@ def draw_values(
                 images[at],
                 None if asked is None else asked[at],
                 previous,
-                [streams[row] for row in at],
+                [noises[row] for row in at],
                 dtype,
             )
         for one, stream in zip(drawn, streams, strict=True):
             yield classes.draw(one, stream.random(one.shape))
+
+
+def _noise_of_stretches(lengths: np.ndarray, seeds: Sequence[int], image_size: Sequence[int]) -> list[Noise]:
+    """Of each image that of its stretch."""
+    height, width = (side + side % 2 for side in image_size)
+    noises = [MovingNoise((height, width), seed) for seed in seeds]
+    return [noise for noise, length in zip(noises, lengths, strict=True) for _ in range(length)]
+
+
+def _move_on(noises: Sequence[Noise], before: np.ndarray, after: np.ndarray) -> None:
+    """Noise that moves goes on from some images [B, H, W, 3] to the next; the rest is drawn anew in any case."""
+    for noise, *images in zip(noises, before.max(axis=3), after.max(axis=3), strict=True):
+        if isinstance(noise, MovingNoise):
+            noise.move(*images)
 
 
 def _draw_batch(
@@ -144,7 +167,7 @@ def _draw_batch(
     images: Tensor,
     conditions: Tensor | None,
     previous: Tensor | None,
-    streams: Sequence[np.random.Generator],
+    noises: Sequence[Noise],
     dtype: torch.dtype,
 ) -> np.ndarray:
     """Classes [B, P, H, W] int64 of images on the CPU; `previous`, likewise, are those of the frames before."""
@@ -155,14 +178,14 @@ def _draw_batch(
     shape = images.shape[1:]
 
     def normal() -> Tensor:
-        return torch.from_numpy(np.stack([stream.standard_normal(shape, np.float32) for stream in streams])).to(device)
+        return torch.from_numpy(np.stack([noise.standard_normal(shape, np.float32) for noise in noises])).to(device)
 
     noisy = float(levels[0]) * normal()
     for level, following in zip(levels, [*levels[1:], None], strict=True):
         with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             noise_level = torch.full((len(images),), float(level), device=device)
             logits = network(noisy, noise_level, images, conditions, previous)
-        uniform = torch.from_numpy(np.stack([stream.random(shape, np.float32) for stream in streams]))
+        uniform = torch.from_numpy(np.stack([noise.random(shape, np.float32) for noise in noises]))
         drawn = draw_classes(logits, uniform.to(device))
         if following is not None:
             kept = float(following / level) ** 2

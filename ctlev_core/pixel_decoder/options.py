@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from data_contracts.config import ADDED_LATER, RUN_SETTING, Frozen
 
@@ -13,7 +13,7 @@ DECODER_FOLDER = "decoder"
 
 
 class PixelDecoderOptions(Frozen):
-    """How the pixel decoder is trained, and in how many passes it draws."""
+    """How the pixel decoder is trained, and how it draws."""
 
     num_steps: int = Field(default=600, ge=1, description="optimiser steps")
     batch_size: int = Field(default=16, ge=1, description="crops a step")
@@ -42,6 +42,12 @@ class PixelDecoderOptions(Frozen):
         description="the decoder also sees what it drew for the frame before, as it learnt from consecutive recorded "
         "frames; of stretches of frames that are made together, elsewhere it changes nothing",
     )
+    moving_noise: bool = Field(
+        default=False,
+        json_schema_extra=ADDED_LATER,
+        description="of stretches, with `previous_frame`: where the picture moves, the noise that values are drawn "
+        "from moves along with it, so that they move with an edge in place of being drawn anew along it",
+    )
     precision: Literal["float32", "bfloat16"] = Field(
         default="bfloat16", description="of the convolutions; weights, probabilities and losses stay float32"
     )
@@ -56,5 +62,12 @@ class PixelDecoderOptions(Frozen):
 
     @property
     def of_training(self) -> PixelDecoderOptions:
-        """What the trained decoder depends on: not in how many passes it will draw."""
-        return self.model_copy(update={"num_passes": PixelDecoderOptions.model_fields["num_passes"].default})
+        """What the trained decoder depends on: not how it will draw."""
+        drawing = ("num_passes", "moving_noise")
+        return self.model_copy(update={name: PixelDecoderOptions.model_fields[name].default for name in drawing})
+
+    @model_validator(mode="after")
+    def _moves_in_stretches(self) -> PixelDecoderOptions:
+        if self.moving_noise and not self.previous_frame:
+            raise ValueError("moving_noise needs previous_frame: true; only such a decoder knows what follows what")
+        return self

@@ -21,7 +21,7 @@ Each is a quotient of two sums over stretches, and its interval one over recordi
 measure (no joints, grey images, nothing active) is left out.
 
 Sources: 1 - D / (2 V) is the autocorrelation of a variogram, as von Neumann's ratio (Annals of Mathematical Statistics
-12, 1941) has it; the flow is that of Farneback (Two-Frame Motion Estimation Based on Polynomial Expansion, SCIA 2003).
+12, 1941) has it; the flow is that of `ctlev_core.geometry.image_flow`.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ctlev_core.geometry.image_flow import ImageFlow, image_flow
 from ctlev_core.realism.distances import Estimate
 from ctlev_core.realism.summary import ACTIVE_VALUE
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, ratio_bootstrap
@@ -40,9 +41,7 @@ LAGS = (1, 2, 4)
 STILL_DISTANCE = 1 / 8
 LEAST_DISPLACEMENT_PX = 0.5
 """Of the image on which the flow is estimated. Slower joints are lost in what the pixels round off."""
-FLOW_SIDE_PX = 64
-"""Larger images are made smaller, by a whole factor, for the flow."""
-FLOW_BLUR_PX, FLOW_WINDOW_PX, FLOW_RADIUS_PX = 1.0, 21, 2
+FLOW_RADIUS_PX = 2
 
 Sums = Mapping[str, tuple[float, float]]
 """Numerator and denominator of each number."""
@@ -75,7 +74,7 @@ def measure_stretch(frames: np.ndarray, labelled: LabelledJoints | None = None) 
     values = frames.max(axis=-1)
     active = values >= ACTIVE_VALUE
     sums = _rate_correlations(active) | {"persistent_share": _persistence(active)}
-    flows = [_flow(first, second) for first, second in itertools.pairwise(values)]
+    flows = [image_flow(first, second) for first, second in itertools.pairwise(values)]
     if frames.shape[-1] == 2:
         sums["polarity_kept_share"] = _kept_polarity(frames, active, flows)
     if labelled is not None:
@@ -161,30 +160,9 @@ def _far_from_skeletons(labelled: LabelledJoints, image_size: tuple[int, ...]) -
     return distance > STILL_DISTANCE * min(height, width)
 
 
-@dataclass(frozen=True, eq=False)
-class _Flow:
-    """Displacement [h, w, 2] from a frame to the next, in px of an image that is `factor` times smaller."""
-
-    vectors: np.ndarray
-    factor: float
-
-
-def _flow(first: np.ndarray, second: np.ndarray) -> _Flow:
-    import cv2
-
-    factor = max(1, -(-max(first.shape) // FLOW_SIDE_PX))
-    size = tuple(max(1, round(side / factor)) for side in first.shape[::-1])
-    blurred = []
-    for values in (first, second):
-        small = values if factor == 1 else cv2.resize(values, size, interpolation=cv2.INTER_AREA)
-        smooth = cv2.GaussianBlur(small.astype(np.float32), (0, 0), FLOW_BLUR_PX)
-        blurred.append(np.minimum(2 * smooth, 255).astype(np.uint8))
-    start = np.zeros((*blurred[0].shape, 2), np.float32)
-    vectors = cv2.calcOpticalFlowFarneback(blurred[0], blurred[1], start, 0.5, 3, FLOW_WINDOW_PX, 3, 5, 1.1, 0)
-    return _Flow(vectors, factor)
-
-
-def _flow_agreement(flows: Sequence[_Flow], joints2d: np.ndarray, image_size: tuple[int, ...]) -> tuple[float, float]:
+def _flow_agreement(
+    flows: Sequence[ImageFlow], joints2d: np.ndarray, image_size: tuple[int, ...]
+) -> tuple[float, float]:
     import cv2
 
     agreed = total = 0.0
@@ -206,7 +184,7 @@ def _flow_agreement(flows: Sequence[_Flow], joints2d: np.ndarray, image_size: tu
     return agreed, total
 
 
-def _kept_polarity(frames: np.ndarray, active: np.ndarray, flows: Sequence[_Flow]) -> tuple[float, float]:
+def _kept_polarity(frames: np.ndarray, active: np.ndarray, flows: Sequence[ImageFlow]) -> tuple[float, float]:
     import cv2
 
     signed = frames[..., 0].astype(np.int16) - frames[..., 1]

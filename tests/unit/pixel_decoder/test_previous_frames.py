@@ -1,5 +1,6 @@
 """A decoder that sees what it drew for the frame before: learnt from consecutive frames, drawn stretch by stretch."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -57,7 +58,8 @@ def test_values_stay_from_frame_to_frame_as_those_learnt_from_did(tmp_path):
     assert alone[:, 1:][alone[:, :-1] == 1].mean() == pytest.approx(ACTIVE, abs=0.06)
 
 
-def test_a_stretch_depends_on_its_own_rows_alone():
+@pytest.mark.parametrize("moving_noise", [False, True])
+def test_a_stretch_depends_on_its_own_rows_alone(moving_noise):
     classes, rng = fit_classes(chains(4, 4, 0)), np.random.default_rng(2)
     network, lengths = random_network(classes), [3, 1, 5, 2] * 6
     count = sum(lengths)
@@ -66,8 +68,9 @@ def test_a_stretch_depends_on_its_own_rows_alone():
     def drawn(rows, lengths):
         seeds = range(100 + rows.start, 100 + rows.stop)
         found = draw_values(
-            network, classes, frames[rows], conditions[rows], seeds=seeds, num_passes=3, lengths=lengths
-        )
+            network, classes, frames[rows], conditions[rows], seeds=seeds, num_passes=3, lengths=lengths,
+            moving_noise=moving_noise,
+        )  # fmt: skip
         return np.stack(list(found))
 
     together = drawn(slice(0, count), lengths)
@@ -120,3 +123,23 @@ def test_a_decoder_on_disk_knows_that_it_sees_the_frame_before(tmp_path):
         with pytest.raises(DataError, match="interval_us must be a whole number from 1"):
             load_decoder(tmp_path, torch.device("cpu"))
         config.write_text(config.read_text().replace(wrong, "20000", 1))
+
+
+def test_values_move_with_a_picture_where_their_noise_does():
+    """A network that knows nothing of the frame before, and images in which a texture moves by two pixels."""
+    classes = fit_classes(chains(4, 4, 0))
+    torch.manual_seed(5)
+    network = build_network(classes, 1, False, width=16, depth=1).eval().requires_grad_(False)
+    blurred = cv2.GaussianBlur(np.random.default_rng(1).standard_normal((96, 96)), (0, 0), 2.5)
+    texture = np.clip(60 + 150 * blurred, 0, 120).astype(np.uint8)
+    frames = np.stack([texture[20:68, 30 - 2 * number : 78 - 2 * number] for number in range(6)])
+    frames = np.repeat(frames[..., None], 3, axis=-1)
+
+    def agreement(moving_noise):
+        drawn = draw_values(
+            network, classes, frames, None, seeds=range(6), num_passes=4, lengths=[6], moving_noise=moving_noise
+        )
+        values = np.stack(list(drawn))[:, 0, 12:-12, 12:-12]
+        return float(np.corrcoef(values[1:, :, 2:].ravel(), values[:-1, :, :-2].ravel())[0, 1])
+
+    assert abs(agreement(False)) < 0.1 and agreement(True) > 0.6
