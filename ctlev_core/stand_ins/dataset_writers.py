@@ -1,4 +1,4 @@
-"""Files in the published layouts of event datasets, written with NumPy, SciPy and struct."""
+"""Files in the published layouts of event datasets, written with NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from ctlev_core.dataset_files import cdehp_files, dhp19_files
 
 AEDAT2_HEADER = b"#!AER-DAT2.0\r\n# This is a raw AE data file - do not edit\r\n# AEChip: eu.seebetter.Davis346blue\r\n"
+_Numbers = Sequence[int] | np.ndarray
 DHP19_SPECIAL = 0x400
 """Address of a trigger of the motion capture."""
 
@@ -61,7 +62,7 @@ def write_cdehp_label(path: Path, joints: np.ndarray, partner: str = "color_name
     path.write_text("\n".join([str(len(lines)), partner, *lines]) + "\n")
 
 
-def write_atis(path: Path, t: Sequence[int], x: Sequence[int], y: Sequence[int], p: Sequence[int]) -> Path:
+def write_atis(path: Path, t: _Numbers, x: _Numbers, y: _Numbers, p: _Numbers) -> Path:
     """N-Caltech101's 40 bits an event, as its paper describes them: x, y, polarity and 23 bits of time, high first."""
     columns, times, signs = np.array([x, y], np.int64), np.array(t, np.int64), np.array(p, np.int64)
     if np.any(columns >> 8) or np.any(times >> 23) or np.any(signs >> 1):
