@@ -183,3 +183,16 @@ def test_labels_that_do_not_follow_one_another_are_refused(home):
 def test_stretches_need_an_order_in_time(tmp_path, further, message):
     finished = run(tmp_path, "temporal_order=false", "sequence_length=null", *further)
     assert finished.status == 2 and message in finished.errors, finished.errors
+
+
+def test_noise_of_the_pixel_decoder_moves_and_trains_nothing_anew(home):
+    own = ("motion_layers=null", "stretch_length=4", "sampling.noise=stretches", "stochastic_rounding=false")
+    small = "previous_frame: true, num_steps: 2, batch_size: 2, width: 16, depth: 1, evaluations: 2, max_frames: 8"
+    for moves in ("false", "true"):
+        finished = run(home, *own, f"pixel_decoder={{{small}, moving_noise: {moves}}}")
+        assert finished.status == 0, finished.errors
+    assert len(artefacts(home, "train_pixel_decoder")) == 1
+    still, moving = (np.asarray(one.array("frames")[:]) for one in artefacts(home, "decode_pixels"))
+    assert (still != moving).any(axis=(1, 2, 3)).all()
+    refused = run(home, *own, "pixel_decoder={moving_noise: true}")
+    assert refused.status == 2 and "moving_noise needs previous_frame: true" in refused.errors
