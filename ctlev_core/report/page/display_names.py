@@ -119,6 +119,8 @@ STAGES = {
     "train_downstream": "Training of downstream models",
     "score_model": "Scores of models",
     "score_distance": "Distances",
+    "event_realism": "Statistics of recordings",
+    "realism_floors": "Recorded frames compared",
     "realism": "Statistics of frames",
     "sequence_realism": "Statistics of sequences",
     "memorisation": "Search for copies",
