@@ -93,8 +93,7 @@ class Amounts:
 
         recorded = self.rows(arguments["frames"]["manifest"])
         train, held_out = recorded.training, recorded.total - recorded.training
-        made = arguments.get("generated", [])
-        generated = [self.rows(item["manifest"]).total for item in (made if isinstance(made, list) else [made])]
+        generated = [self.rows(key).total for key in inputs_of({"generated": arguments.get("generated")})]
         smaller = [] if stage == "realism" else [train / 2, held_out / 2, min(train, held_out)]
         smaller += [min(rows, against) for rows in generated for against in (train, held_out)]
         if "length" in arguments:  # of stretches; time in random order is one more

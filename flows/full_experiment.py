@@ -32,7 +32,7 @@ from flows.train_generator import train_generator
 from tasks.ingest import ingest
 from tasks.memorisation import memorisation
 from tasks.nearest_seen import nearest_seen
-from tasks.realism import FRAMES, event_realism, realism, realism_floors
+from tasks.realism import event_realism, realism, realism_floors
 from tasks.report import report
 from tasks.sequence_realism import sequence_realism
 from tasks.stage import call_flow, call_together
@@ -74,15 +74,7 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         lambda: _nearest_seen(experiment, dataset, checkpoint),
         lambda: None if experiment.export is None else call_flow(export_streams, experiment, dataset, synthetic),
         *(
-            partial(
-                realism,
-                dataset.frames,
-                frames,
-                floors,
-                name=name,
-                group=FRAMES if name == SYNTHETIC else f"{FRAMES} of {name}",
-                label=name,
-            )
+            partial(realism, dataset.frames, frames, floors, name=name, label=name)
             for name, frames in generated.items()
         ),
     )

@@ -31,7 +31,7 @@ from tasks.downstream import train_downstream
 from tasks.evaluate import score_model
 from tasks.memorisation import memorisation
 from tasks.publish import claimed, next_number
-from tasks.realism import FRAMES, realism, realism_floors
+from tasks.realism import realism, realism_floors
 from tasks.score_version import score_beside_real
 from tasks.stage import call_flow, call_together
 from tasks.store import home_folder
@@ -163,7 +163,7 @@ def _score_realism(dataset: PreparedDataset, synthetic: ManifestRef) -> list[Man
     """Statistics of the version's frames beside those of recorded ones, and whether a network tells them apart."""
     frames = dataset.tested_frames
     floors = realism_floors(frames, label="recorded frames")
-    return [realism(frames, synthetic, floors, name=SYNTHETIC, group=FRAMES, label=SYNTHETIC)]
+    return [realism(frames, synthetic, floors, name=SYNTHETIC, label=SYNTHETIC)]
 
 
 def _judge(regeneration: Regeneration, checkpoint: ManifestRef, made: MadeVersion, number: int, seed: int) -> Version:

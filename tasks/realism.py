@@ -16,7 +16,7 @@ from ctlev_core.recordings.stored_events import stored_events
 from data_contracts import tables
 from data_contracts.labels import HeldOut, held_out_split
 from data_contracts.manifest import Manifest
-from data_contracts.training_sets import RECORDED
+from data_contracts.training_sets import RECORDED, SYNTHETIC
 from tasks.stage import Output, stage
 
 MAX_EVENTS = 500_000
@@ -66,27 +66,29 @@ def realism_floors(out: Output, frames: Manifest) -> pa.Table:
     held_out = frames.held_out
     tests = {f"{name} against {name}": two_sample.compare_halves(*of_split) for name, of_split in recorded.items()}
     tests[f"{held_out} against {RECORDED}"] = _tell_apart(held_out, recorded[held_out], RECORDED, recorded[RECORDED])
-    return _test_table(FRAMES, tests)
+    return two_sample.tests_table(FRAMES, tests)
 
 
 @stage(version=6, schema=tables.SCORES)
-def realism(out: Output, frames: Manifest, generated: Manifest, floors: Manifest, *, name: str, group: str) -> pa.Table:
+def realism(out: Output, frames: Manifest, generated: Manifest, floors: Manifest, *, name: str) -> pa.Table:
     """Generated frames, of the generator `name`, beside recorded training frames; `floors` are of `realism_floors`.
 
-    Rows have the task `realism` and the given group: `FRAMES` for the experiment's own generator. Settings: the two
-    sets, `A against B` for their distances and `A against A` for the floor. Distributions lie beside the table.
+    Rows have the task `realism` and the group `frames`, of the experiment's own generator, or `frames of NAME`.
+    Settings: the two sets, `A against B` for their distances and `A against A` for the floor. Distributions lie beside
+    the table.
 
     How well a network tells frames apart is the metric `c2st`: generated from recorded training frames (`NAME against
     recorded`) and from recorded held-out frames (`NAME against test`, or `validation`), with the floors beside them.
     Where there are too few frames there is no such row; the table `two_sample_tests`, which lies beside, says why. The
     floors are not in that one again.
     """
+    group = FRAMES if name == SYNTHETIC else f"{FRAMES} of {name}"
     found = _compare(group, RECORDED, name, _summarise_frames(frames), _summarise_frames(generated), generated)
     tests = {}
     for split, rows in _recorded_splits(frames).items():
         recorded = _read_frames(frames, rows)
         tests[f"{name} against {split}"] = _tell_apart(name, _read_made_frames(generated, recorded[1]), split, recorded)
-    own = _test_table(group, tests)
+    own = two_sample.tests_table(group, tests)
     out.write_table(own, tables.TWO_SAMPLE_TESTS)
     _write_distributions(out, [found])
     return _scores([found[0], _test_rows(group, pa.concat_tables([own, floors.table]), generated)])
@@ -122,11 +124,6 @@ def _tell_apart(first: str, of_first: Frames, second: str, of_second: Frames) ->
     return two_sample.compare_frames(
         of_first[0], of_second[0], first_groups=of_first[1], second_groups=of_second[1], names=(first, second)
     )
-
-
-def _test_table(group: str, tests: Mapping[str, two_sample.TwoSampleTest]) -> pa.Table:
-    rows = [{"group": group, "subject": subject} | test.row() for subject, test in tests.items()]
-    return pa.Table.from_pylist(rows, schema=tables.TWO_SAMPLE_TESTS.arrow())
 
 
 def _test_rows(group: str, tests: pa.Table, data: Manifest) -> list[dict[str, Any]]:

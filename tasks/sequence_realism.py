@@ -68,8 +68,7 @@ def sequence_realism(
         stretches = labelled_stretches(made, frames, step_us, length).spread(MAX_STRETCHES)
         sets[name] = _measure(made, stretches, channels, name)
     tests = _compare(sets, split, names)
-    table = [{"group": GROUP, "subject": subject} | test.row() for subject, test in tests.items()]
-    out.write_table(pa.Table.from_pylist(table, tables.TWO_SAMPLE_TESTS.arrow()), tables.TWO_SAMPLE_TESTS)
+    out.write_table(two_sample.tests_table(GROUP, tests), tables.TWO_SAMPLE_TESTS)
     scores = [
         _score(name, metric, estimate, len(set(measured.names.tolist())), measured.digest)
         for name, measured in sets.items()

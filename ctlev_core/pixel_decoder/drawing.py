@@ -130,7 +130,7 @@ def draw_values(
             # The rows at this place of their stretch.
             at = first[count > position] - rows.start + position
             if position:
-                _move_on([noises[row] for row in at], shown[at - 1], shown[at])
+                _move_on(noises, shown, at)
             previous = None
             if network.sees_previous:
                 previous = torch.from_numpy(drawn[at - 1] if position else np.full_like(drawn[at], -1))
@@ -154,11 +154,11 @@ def _noise_of_stretches(lengths: np.ndarray, seeds: Sequence[int], image_size: S
     return [noise for noise, length in zip(noises, lengths, strict=True) for _ in range(length)]
 
 
-def _move_on(noises: Sequence[Noise], before: np.ndarray, after: np.ndarray) -> None:
-    """Noise that moves goes on from some images [B, H, W, 3] to the next; the rest is drawn anew in any case."""
-    for noise, *images in zip(noises, before.max(axis=3), after.max(axis=3), strict=True):
-        if isinstance(noise, MovingNoise):
-            noise.move(*images)
+def _move_on(noises: Sequence[Noise], frames: np.ndarray, rows: np.ndarray) -> None:
+    """Noise that moves goes on to some rows of the frames from those before; the rest is drawn anew in any case."""
+    for row in rows:
+        if isinstance(noise := noises[row], MovingNoise):
+            noise.move(*frames[row - 1 : row + 1].max(axis=3))
 
 
 def _draw_batch(

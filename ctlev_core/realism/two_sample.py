@@ -19,14 +19,16 @@ threshold.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from ctlev_core.realism.roc import HeldOut, interval_of_mean_area
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
+from data_contracts.tables import TWO_SAMPLE_TESTS
 
 C2ST = "c2st"
 MAX_FRAMES = 400
@@ -145,6 +147,17 @@ def compare_halves(frames: np.ndarray, groups: Sequence[str] | np.ndarray, seed:
     return compare_frames(
         frames[in_half], frames[~in_half], first_groups=names[in_half], second_groups=names[~in_half], seed=seed
     )
+
+
+def tests_table(group: str, tests: Mapping[str, TwoSampleTest]) -> pa.Table:
+    """The table `two_sample_tests`.
+
+    Args:
+        group: whose frames they are of.
+        tests: by subject, `A against B`.
+    """
+    rows = [{"group": group, "subject": subject} | test.row() for subject, test in tests.items()]
+    return pa.Table.from_pylist(rows, schema=TWO_SAMPLE_TESTS.arrow())
 
 
 def choose_rows(count: int, wanted: int, seed: int = 0) -> np.ndarray:

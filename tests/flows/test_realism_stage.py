@@ -8,21 +8,12 @@ from flow_scripts import artefacts
 
 from ctlev_core.realism.distances import DISTRIBUTIONS
 from ctlev_core.realism.summary import summarise_frames
-from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.tables import TWO_SAMPLE_TESTS
-
-
-def artefacts_of(home, stage):
-    folders = (home / "artefacts" / stage).iterdir()
-    return [read_manifest(ManifestRef(key=folder.name, path=folder), full=True) for folder in folders]
 
 
 def realism_rows(home):
     return [
-        row
-        for stage in ("event_realism", "realism")
-        for one in artefacts_of(home, stage)
-        for row in one.table.to_pylist()
+        row for stage in ("event_realism", "realism") for one in artefacts(home, stage) for row in one.table.to_pylist()
     ]
 
 
@@ -51,8 +42,8 @@ def test_numbers_are_those_of_the_frames_that_were_sampled(smoke_home):
 
 
 def test_generator_and_baselines_are_told_from_recorded_frames_or_it_says_why_not(smoke_home):
-    (floors,) = artefacts_of(smoke_home, "realism_floors")
-    of_generators = [one.attached(TWO_SAMPLE_TESTS) for one in artefacts_of(smoke_home, "realism")]
+    (floors,) = artefacts(smoke_home, "realism_floors")
+    of_generators = [one.attached(TWO_SAMPLE_TESTS) for one in artefacts(smoke_home, "realism")]
     tests = [test for table in (floors.table, *of_generators) for test in table.to_pylist()]
     names = ("synthetic", "event_gan", "smpl_esim")
     expected = {f"{name} against {other}" for name in names for other in ("recorded", "test")}
@@ -65,7 +56,7 @@ def test_generator_and_baselines_are_told_from_recorded_frames_or_it_says_why_no
 
 
 def test_distributions_add_up_to_1(smoke_home):
-    made = [one for stage in ("event_realism", "realism") for one in artefacts_of(smoke_home, stage)]
+    made = [one for stage in ("event_realism", "realism") for one in artefacts(smoke_home, stage)]
     table = [row for one in made for row in one.attached(DISTRIBUTIONS).to_pylist()]
     sums: dict[tuple, float] = {}
     for row in table:

@@ -66,7 +66,7 @@ def test_where_nothing_moves_noise_is_drawn_anew():
 
 
 def test_noise_stays_white_whatever_the_flow():
-    """Twice as large: each cell of the canvas would lie under four pixels."""
+    """1.7 times as large: each cell of the canvas would lie under three pixels."""
     noise = MovingNoise((SIDE, SIDE), 5)
     picture = texture()[:SIDE, :SIDE]
     for scale in (1.1, 1.2, 1.3):

@@ -59,11 +59,10 @@ def _run(stage, folder, *inputs, **options):
 @pytest.fixture
 def run(tmp_path):
     def call(real, generated, names=("synthetic", "gan")):
-        groups = ["frames", *(f"frames of {name}" for name in names[1:])]
         floors = read_manifest(_run(realism_floors, tmp_path / "floors", real))
         made = [
-            read_manifest(_run(realism, tmp_path / name, real, one, floors, name=name, group=group))
-            for one, name, group in zip(generated, names, groups, strict=True)
+            read_manifest(_run(realism, tmp_path / name, real, one, floors, name=name))
+            for one, name in zip(generated, names, strict=True)
         ]
         parts = [floors.table, *(one.attached(tables.TWO_SAMPLE_TESTS) for one in made)]
         tests = [test for part in parts for test in part.to_pylist()]
