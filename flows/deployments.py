@@ -28,6 +28,7 @@ from flows import speed_vs_error as of_speed_vs_error
 from flows import synthesize as of_synthesize
 from flows import train_generator as of_train_generator
 from flows.command_line import check_home, load_experiment, publish_plan
+from flows.memory_use import use_memory
 from flows.preset_list import PRESETS, preset_names
 from flows.settings import ScriptFlow, configure, flow, run_named
 from flows.studies import load_study
@@ -74,6 +75,7 @@ def _deployable(
         with planning() as rows:
             script_flow.fn(options)
         publish_plan(rows, f"{script_flow.name}, preset {preset}, in {folder}")
+        use_memory(rows, folder)
         with run_named(script_flow.name, getattr(options, "name", "")):
             made = script_flow.fn(options)  # called as a flow it would be a second run of the same name within this one
         if publish is not None:

@@ -199,8 +199,12 @@ def stop() -> None:
 
 def _private(path: Path) -> IO[bytes]:
     """A new file that only its owner may read."""
-    path.unlink(missing_ok=True)
-    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
+    # Of two processes that start at once, the file of the later one gets the name.
+    new = path.with_name(f".{path.name}.{os.getpid()}")
+    new.unlink(missing_ok=True)
+    file = os.fdopen(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
+    new.replace(path)
+    return file
 
 
 def _detached() -> None:

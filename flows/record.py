@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from ctlev_core.datasets import studio
 from ctlev_core.duration_text import duration_text
-from ctlev_core.plugins import PluginError
+from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.progress import ProgressBar
 from ctlev_core.studio.labelled_recordings import EVENT_LABELS_FILE, LABELS_FILE, CocoTable, write_labelled
 from data_contracts.errors import DataError
@@ -93,8 +91,4 @@ def _options(count: int, overrides: Sequence[str], split: str, rate_hz: float) -
     fixed |= {"label_rate_hz": rate_hz, "record_conditions": split == "condition"}
     if wrong := sorted(values.keys() & fixed.keys()):
         raise PluginError(f"--set {wrong[0]}: is given by the number of recordings, --split and --rate")
-    try:
-        return studio.Options.model_validate(values | fixed)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise PluginError(f"--set {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    return validate_options(studio.Options, values | fixed, "studio")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ctlev_core.report.sections.rejections import count_rejections
-from ctlev_core.report.version_gates import check_gates
+from ctlev_core.report.version_gates import check_asked, check_gates
 from data_contracts.config import Frozen
 from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.published import StoredArtefact, Version, published_folder, version_file
@@ -221,8 +221,14 @@ def _show(version: Version) -> Any:
 
 
 def load_regeneration(preset: str, overrides: list[str]) -> Regeneration:
-    """The experiment a preset describes, with gates."""
-    return load_experiment(preset, overrides, Regeneration)
+    """The experiment a preset describes, with gates.
+
+    Raises:
+        DataError: as `load_experiment`, or a gate judges what is never measured.
+    """
+    regeneration = load_experiment(preset, overrides, Regeneration)
+    check_asked(regeneration.gates, regeneration.num_synthetic)
+    return regeneration
 
 
 COMMAND = Command(regenerate, lambda version, _: f"{version}\nrecord: {_record(version)}", load=load_regeneration)

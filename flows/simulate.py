@@ -68,9 +68,11 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
         from ctlev_core.video.carried_labels import label_times, write_labels
         from ctlev_core.video.frames import open_frames
         from ctlev_core.video.label_files import read_video_labels
-        from ctlev_core.video.preview import Preview
+        from ctlev_core.video.preview import Preview, check_picture_suffix
         from ctlev_core.video.simulation import VideoSimulation, interpolator_of
 
+        if options.preview is not None:
+            check_picture_suffix(options.preview)
         simulation = VideoSimulation(
             open_frames(source, frames, options.max_displacement_px),
             read_sensor(options.sensor, options.noise),

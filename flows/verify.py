@@ -40,12 +40,14 @@ def verify(store: Store) -> tuple[int, int]:
                 outdated += 1
                 tqdm.write(f"outdated, made anew when needed: {item.name}: {error}")
             except DataError as error:
-                damaged += 1
-                tqdm.write(f"damaged: {item.name}: {error}")
                 try:
-                    tqdm.write(f"  now in {store.set_aside(item.folder)}")
+                    place = store.set_aside_damaged(item.folder)
+                    damaged += place is not None
+                    if place is not None:
+                        tqdm.write(f"damaged: {item.name}: {error}\n  now in {place}")
                 except OSError as cause:
-                    failed += 1
+                    damaged, failed = damaged + 1, failed + 1
+                    tqdm.write(f"damaged: {item.name}: {error}")
                     tqdm.write(f"error: {item.name}: is damaged and cannot be set aside: {cause}", file=sys.stderr)
             except OSError as error:
                 # Too many open files, a permission: it passes, and says nothing about what is in the artefact.
@@ -116,18 +118,17 @@ def _check_latest(store: Store) -> int:
         return 1
     broken = 0
     for version in latest:
-        missing = [a for a in version.artefacts if not _is_there(store, a)]
-        broken += bool(missing)
-        for artefact in missing:
-            where = f"{artefact.stage}/{artefact.key}"
-            print(f"missing: {where} of the latest data, {version}; make the next with flows/regenerate.py")
+        wrong = [(a, found) for a in version.artefacts if (found := _digest_of(store, a)) != a.digest]
+        broken += bool(wrong)
+        for artefact, digest in wrong:
+            how, where = "changed" if digest else "missing", f"{artefact.stage}/{artefact.key}"
+            print(f"{how}: {where} of the latest data, {version}; make the next with flows/regenerate.py")
     return broken
 
 
-def _is_there(store: Store, artefact: StoredArtefact) -> bool:
-    if store.folder(artefact.stage, artefact.key).is_dir():
-        return True
-    return store.bucket is not None and store.bucket.has(artefact.stage, artefact.key)
+def _digest_of(store: Store, artefact: StoredArtefact) -> str:
+    """Of what is under the key of a published artefact, here or else in the bucket; empty where nothing is."""
+    return store.held_digest(artefact.stage, artefact.key) or ""
 
 
 def verify_home(home: Path) -> int:

@@ -45,7 +45,7 @@ def fetch_files(home: Path, bucket: Bucket, folders: tuple[str, ...] = FETCHED) 
                 if ".." in PurePosixPath(name).parts:
                     raise DataError(f"{bucket.url}/{name}: leads out of the home")
                 path = home / name
-                if path.exists() and name in state and state[name][-1] == there:
+                if path.exists() and name in state and state[name][-1] in (there, None):  # None: ours is to be sent
                     continue
                 temporary = path.with_name(f".{path.name}.fetched")
                 bucket.fetch(name, temporary)

@@ -29,6 +29,7 @@ from data_contracts.errors import DataError
 from data_contracts.event_export import EventExport
 from data_contracts.events import Events
 from data_contracts.manifest import LABEL_COLUMNS, Manifest, ManifestRef
+from tasks import file_locks
 from tasks.stage import Output, stage
 
 MAX_WINDOWS = 64
@@ -95,11 +96,14 @@ def publish_events(ref: ManifestRef, home: Path, name: str) -> str:
     """Put the newest events of an experiment where a person looks for them, and say where that is."""
     folder = events_folder(home, name)
     temporary = folder.with_name(f".{name}")
-    shutil.rmtree(temporary, ignore_errors=True)
-    shutil.copytree(ref.path / "events", temporary / "events")
-    shutil.copyfile(ref.path / "manifest.parquet", temporary / "event_streams.parquet")
-    shutil.rmtree(folder, ignore_errors=True)
-    temporary.rename(folder)
+    locks = home / "locks"
+    locks.mkdir(parents=True, exist_ok=True)
+    with file_locks.locked(locks / f"events-{name}", f"the events of {name}"):
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.copytree(ref.path / "events", temporary / "events")
+        shutil.copyfile(ref.path / "manifest.parquet", temporary / "event_streams.parquet")
+        shutil.rmtree(folder, ignore_errors=True)
+        temporary.rename(folder)
     return f"events: {ref.rows} streams in {folder}, listed in {folder / 'event_streams.parquet'}"
 
 

@@ -70,7 +70,13 @@ def check_export_folder(artefacts: Artefacts, folder: Path) -> bool:
     Raises:
         DataError: the folder holds something else.
     """
+    if folder.is_symlink() or os.path.ismount(folder):
+        # The finished folder is renamed into place, which only works where nothing else holds the name.
+        raise DataError(f"{folder}: is a link or a mount point; export to a new folder inside of it")
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        above = next(path for path in folder.absolute().parents if path.exists())
+        if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+            raise DataError(f"{folder}: cannot be made, for {above} is no folder that can be written to")
         return False
     if not (folder / PROVENANCE_FILE).is_file():
         raise DataError(f"{folder}: expected a new or an empty folder to export to, got one that holds something else")

@@ -44,7 +44,9 @@ class Claim:
             raise ValueError(f"{self.folder}: version {self.number} is claimed, not {version.number}")
         if self.version is None:
             write_version(self.folder, version)
-        if version.passed:
+        latest = read_latest(self.folder)
+        # A run that was killed may find that other machines have published newer versions since.
+        if version.passed and (latest is None or latest.number <= version.number):
             write_latest(self.folder, version)
         bucket = bucket_of(_home(self.folder))
         if bucket is not None:

@@ -65,6 +65,8 @@ from tasks.workers import current_workers, stage_workers, together
 P = ParamSpec("P")
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
+UPSTREAM_FILE = "upstream.json"
+"""In the work folder of a stage: the digests of its inputs, by their keys."""
 TIMEOUT = "CTLEV_STAGE_TIMEOUT_S"
 """Environment: seconds that the work of one stage may take; none = any."""
 RawFiles = Callable[[dict[str, Any]], Sequence[tuple[str, Path]]]
@@ -102,6 +104,8 @@ class Watcher(Protocol):
 @dataclasses.dataclass
 class _Plan:
     rows: list[PlannedStage] = dataclasses.field(default_factory=list)
+    changed: set[str] = dataclasses.field(default_factory=set)
+    """Keys of what is there, but was made from inputs of other content."""
 
 
 _plan: ContextVar[_Plan | None] = ContextVar("ctlev_plan", default=None)
@@ -258,9 +262,9 @@ class Stage:
         label = f"{self.name}: {label}" if label else self.name
         plan = _plan.get()
         if plan is not None:
-            cached = store.holds(self.name, key)
-            plan.rows.append(PlannedStage(self.name, label, key, cached, materials, arguments))
-            return ManifestRef(key=key, path=store.folder(self.name, key))
+            digest = self._planned(plan, store, key, arguments)
+            plan.rows.append(PlannedStage(self.name, label, key, digest is not None, materials, arguments))
+            return ManifestRef(key=key, path=store.folder(self.name, key), digest=digest or "")
         found = self.find(key, arguments) if _in_one_run.get() else None
         return found or run_as_task(self.name, label, functools.partial(self.run, key, arguments))
 
@@ -270,13 +274,28 @@ class Stage:
         bound.apply_defaults()
         arguments = dict(list(bound.arguments.items())[1:])
         store = Store()
-        key = self.key(arguments, store)
-        if _plan.get() is not None:  # digests are not known
-            return store.holds(self.name, key)
+        key, plan = self.key(arguments, store), _plan.get()
+        if plan is not None:
+            return self._planned(plan, store, key, arguments) is not None
         return store.find(self.name, key, self._upstream(arguments)) is not None
 
     def check(self, arguments: dict[str, Any]) -> None:
         """Raise `DataError` where the settings do not go together: where a stage is planned, and where it is run."""
+
+    def _planned(self, plan: _Plan, store: Store, key: str, arguments: dict[str, Any]) -> str | None:
+        """Digest of the artefact, as far as it is known; None where it is to be made.
+
+        Digests of inputs that are to be made are not known; that they will be what they were is taken for granted,
+        unless those were made from changed inputs themselves.
+        """
+        upstream = self._upstream(arguments)
+        known = upstream if all(upstream.values()) else None
+        digest = store.held_digest(self.name, key, known)
+        if digest is not None and plan.changed.isdisjoint(upstream):
+            return digest
+        if digest is not None or (known is not None and store.held_digest(self.name, key) is not None):
+            plan.changed.add(key)
+        return None
 
     def key(self, arguments: dict[str, Any], store: Store) -> str:
         """The cache key: 32 hexadecimal digits of a SHA-256."""
@@ -355,12 +374,13 @@ class Stage:
         started, wall, cpu = time.time(), time.perf_counter(), _cpu_seconds()
         try:
             folder.mkdir(parents=True)
-            work.mkdir(parents=True, exist_ok=True)
+            _prepare_work(work, upstream)
             opened = {name: _opened(value, store) for name, value in arguments.items()}
             # What is spread holds GPUs where it is computed.
             need = GpuNeed() if self._deals_out(arguments) else gpu_need(arguments)
             with few_threads(), gpus_held(need, self.name), _time_limit(self.name):
                 table = self.function(Output(folder, work), **opened)
+            self._check_unchanged(key, arguments, store)
             write_manifest(folder, table, self.schema)
             record = {
                 "stage": self.name,
@@ -380,6 +400,21 @@ class Stage:
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
+
+    def _check_unchanged(self, key: str, arguments: dict[str, Any], store: Store) -> None:
+        """Raise where raw files have changed since the key was made of them: what was read is of two kinds."""
+        if self.raw_files is not None and self.key(arguments, store) != key:
+            shutil.rmtree(store.work_folder(key), ignore_errors=True)
+            raise DataError(f"{self.name}: raw files have changed while they were read; run again to read them anew")
+
+
+def _prepare_work(work: Path, upstream: dict[str, str]) -> None:
+    """Make the folder of resumable state; what a killed run left there of inputs of other content is deleted."""
+    note, content = work / UPSTREAM_FILE, json.dumps(upstream, sort_keys=True)
+    if note.exists() and note.read_text(encoding="utf-8") != content:
+        shutil.rmtree(work)
+    work.mkdir(parents=True, exist_ok=True)
+    note.write_text(content, encoding="utf-8")
 
 
 class StageTimeoutError(RuntimeError):

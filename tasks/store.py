@@ -144,11 +144,21 @@ class Store:
                 self.bucket.overwrite(f"used/{stage}/{key}", b"")
         return found
 
-    def holds(self, stage: str, key: str) -> bool:
-        """Is there an artefact, made from whichever inputs? One that is in a bucket alone is not fetched."""
+    def held_digest(self, stage: str, key: str, upstream: dict[str, str] | None = None) -> str | None:
+        """Digest of the artefact that `find` would find, None where there is none. Of a bucket nothing is fetched."""
         self.use()
-        here = self._find_here(stage, key, None, make_room=False)
-        return here is not None or (self.bucket is not None and self.bucket.has(stage, key))
+        here = self._find_here(stage, key, upstream, make_room=False)
+        if here is not None:
+            return here.digest
+        if self.bucket is None:
+            return None
+        try:
+            record = self.bucket.record(stage, key)
+        except BucketError:
+            raise
+        except DataError:  # damaged
+            return None
+        return record.digest if record is not None and upstream in (None, record.upstream) else None
 
     def here(self, ref: ManifestRef) -> ManifestRef:
         """The same artefact on this machine: as it is, or of a bucket that of our cache, fetched where it is not there.
@@ -196,6 +206,23 @@ class Store:
         with contextlib.suppress(FileNotFoundError):
             folder.rename(target / f"{folder.name}.{number}")
         return target / f"{folder.name}.{number}"
+
+    def set_aside_damaged(self, folder: Path) -> Path | None:
+        """Set an artefact aside that was found damaged, unless a run has done so since, and made it anew: then None.
+
+        Raises:
+            OSError: it cannot be read or moved now.
+        """
+        if not folder.exists():
+            return None
+        with self.lock(folder.name, f"artefact {folder.parent.name}/{folder.name}"):
+            try:
+                self.check(folder)
+            except TableVersionError:
+                return None
+            except DataError:
+                return self.set_aside(folder) if folder.exists() else None
+        return None
 
     def set_aside_in_bucket(self, bucket: Bucket, stage: str, key: str) -> str:
         """The same of an artefact in the bucket, which is sent again if the cache has it; returns its new URL."""

@@ -41,6 +41,21 @@ DISTRIBUTIONS = TableSchema(
         Column("share", pa.float64(), "share of the bin, mean over recordings", minimum=0, maximum=1.000001),
     ),
 )
+FRAME_DISTANCES = (
+    "active_pixel_share",
+    "positive_share",
+    "speckle_share",
+    "isolated_pixel_share",
+    "value_mean",
+    "hot_pixel_share",
+    "rms_contrast",
+    "neighbour_correlation",
+    "value_wasserstein_grey_levels",
+    "value_js_bits",
+    "power_spectrum_wasserstein_cycles_per_px",
+    "power_spectrum_js_bits",
+)
+"""Names of all distances between sets of event images; that of `positive_share` only of images with colour."""
 _NUM_REPLICATES = 1000
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from ctlev_core.realism.distances import FRAME_DISTANCES
 from ctlev_core.realism.two_sample import C2ST, MIN_FRAMES
 from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts.errors import DataError
@@ -12,6 +13,15 @@ from data_contracts.labels import HELD_OUT_SPLITS
 from data_contracts.published import GateCheck
 from data_contracts.regeneration import Gates
 from data_contracts.training_sets import HELD_OUT, RECORDED, SYNTHETIC
+
+
+def check_asked(gates: Gates, num_frames: int) -> None:
+    """Raise `DataError` where a version of so many frames can never have the score that a gate judges."""
+    for name in gates.max_realism_distances or {}:
+        if name not in FRAME_DISTANCES:
+            raise DataError(f"gates.max_realism_distances: no distance {name!r}; known: {', '.join(FRAME_DISTANCES)}")
+    if gates.max_c2st is not None and num_frames < MIN_FRAMES:
+        raise DataError(f"gates.max_c2st: needs num_synthetic of {MIN_FRAMES} or more, got {num_frames}")
 
 
 def check_gates(

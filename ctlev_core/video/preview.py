@@ -9,11 +9,20 @@ import numpy as np
 
 from ctlev_core.video.frames import grey_levels
 from ctlev_core.video.simulation import VideoSimulation
+from data_contracts.errors import DataError
 from data_contracts.events import Events
 
 COLUMNS = 6
 FULL_SCALE = 3
 """Events of a pixel that are drawn as bright as it gets."""
+
+
+def check_picture_suffix(path: Path) -> None:
+    """Raise `DataError` unless a picture can be written under this name."""
+    import cv2
+
+    if path.suffix and not cv2.haveImageWriter(str(path)):
+        raise DataError(f"{path}: no picture is written with the suffix {path.suffix!r}; take .png or .jpg")
 
 
 class Preview:

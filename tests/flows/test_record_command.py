@@ -74,9 +74,9 @@ def test_events_in_another_format(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"overrides": ("sensor_sise=[8, 8]",)}, "--set sensor_sise"),
+        ({"overrides": ("sensor_sise=[8, 8]",)}, "unknown option 'sensor_sise'; did you mean 'sensor_size'?"),
         ({"overrides": ("num_train_recordings=3",)}, "is given by the number of recordings, --split and --rate"),
-        ({"rate_hz": 0.0}, "--set label_rate_hz: Input should be greater than 0"),
+        ({"rate_hz": 0.0}, "option 'label_rate_hz': input should be greater than 0, got 0.0"),
         ({"suffix": ".mp4"}, "no format is written with the suffix '.mp4'"),
         ({"rate_hz": 10_000.0, "overrides": ("sensor_size=[1280, 720]", "recording_duration_us=1_000_000")}, "GiB"),
     ],

@@ -211,6 +211,12 @@ def test_labels_are_carried_along(video, tmp_path):
     np.testing.assert_array_equal(events.t, plain.t)
 
 
+def test_a_preview_that_is_no_picture_is_refused_before_anything_is_simulated(video, tmp_path):
+    status, _, errors = invoke(video, tmp_path / "a.parquet", "--preview", tmp_path / "a.xyz")
+    assert status == 2 and "no picture is written with the suffix '.xyz'; take .png or .jpg" in errors
+    assert not list(tmp_path.iterdir())
+
+
 def test_wrong_labels_leave_nothing(video, tmp_path, monkeypatch):
     (tmp_path / "in.csv").write_text("frame,instance,x,y,width,height\n12,1,1,2,3,4\n")
     status, _, errors = invoke(video, tmp_path / "a.parquet", "--labels", tmp_path / "in.csv")

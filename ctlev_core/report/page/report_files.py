@@ -6,6 +6,7 @@ import html
 import json
 import re
 import shutil
+import uuid
 from pathlib import Path
 
 from ctlev_core.duration_text import duration_text
@@ -113,7 +114,7 @@ def _made_by(record: RunRecord) -> list[str]:
 
 def publish_file(source: Path, target: Path, facts: str = "") -> None:
     """Copy a file so that whoever reads the target sees the old one or the new one; pages with their facts."""
-    temporary = target.with_name(f".{target.name}")
+    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex}")  # two runs may publish at once
     if facts and source.suffix == ".html":
         temporary.write_text(source.read_text(encoding="utf-8").replace(FACTS, facts, 1), encoding="utf-8")
     else:

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from data_contracts.errors import DataError
-from flows import memory_use
+from flows import deployments, memory_use
 from flows.stage_costs import StageCost
 from tasks.stage import PlannedStage
 from tasks.workers import num_workers
@@ -44,6 +44,18 @@ def _own_environment(monkeypatch):
 def test_processes_are_as_many_as_fit(monkeypatch, tmp_path, capsys, needs, free, workers):
     assert run_with(monkeypatch, tmp_path, needs, free=free) == workers
     assert ("processes: the largest stages do not fit" in capsys.readouterr().err) == (workers < 4)
+
+
+def test_deployed_runs_are_checked_before_any_stage(monkeypatch, tmp_path):
+    def refuse(rows, home):
+        assert home == tmp_path and rows[0].stage == "ingest"
+        raise DataError("too large")
+
+    monkeypatch.setattr(deployments, "publish_plan", lambda *_: None)
+    monkeypatch.setattr(deployments, "use_memory", refuse)
+    with pytest.raises(DataError, match="too large"):
+        deployments.full_experiment.fn("smoke", home=str(tmp_path))
+    assert not (tmp_path / "artefacts").exists()
 
 
 def test_what_has_been_done_needs_nothing(monkeypatch, tmp_path):

@@ -1,9 +1,12 @@
 """Gates before a version becomes the latest: each at, below and above its limit."""
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from ctlev_core.report.version_gates import check_gates
+from ctlev_core.realism.distances import FRAME_DISTANCES, estimate_distances
+from ctlev_core.realism.summary import summarise_frames
+from ctlev_core.report.version_gates import check_asked, check_gates
 from data_contracts.errors import DataError
 from data_contracts.regeneration import Gates, Regeneration
 
@@ -43,6 +46,25 @@ def scores(distance=6.0, error=9.0, copies=(0.01, 0.02), metric="mpjpe2d_px", re
         row("realism", "synthetic", "isolated_pixel_share", 0.9, "frames"),
         row("realism", "synthetic against recorded", "isolated_pixel_share", realism[1], "frames"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("gates", "num_frames", "message"),
+    [
+        ({"max_realism_distances": {"isolated_pixels": 1}}, 100, "no distance 'isolated_pixels'; known: active_pixel_"),
+        ({"max_c2st": 0.8}, 39, "max_c2st: needs num_synthetic of 40 or more, got 39"),
+    ],
+)
+def test_what_will_never_be_measured_is_refused_before_anything_runs(gates, num_frames, message):
+    with pytest.raises(DataError, match=message):
+        check_asked(Gates(**gates), num_frames)
+    check_asked(Gates(max_c2st=0.8, max_realism_distances={"value_js_bits": 0.1}), 40)
+
+
+def test_every_distance_of_frames_has_a_name():
+    frames = np.random.default_rng(0).integers(0, 256, (4, 16, 16, 3), dtype=np.uint8)
+    summaries = [summarise_frames(frames)] * 2
+    assert set(estimate_distances(summaries, summaries)) == set(FRAME_DISTANCES)
 
 
 def check(gates, found, rejected_share=0.0):

@@ -62,8 +62,8 @@ def test_what_one_machine_makes_another_finds_byte_for_byte(machine):
     first, second = machine("a"), machine("b")
     made = publish(first, 1, inputs=(7,))
     assert second.home != first.home
-    assert not second.holds("encode", key(2)) and second.find("encode", key(2)) is None
-    assert second.holds("encode", key(1)) and not (second.home / "artefacts").exists(), "a plan fetches nothing"
+    assert second.held_digest("encode", key(2)) is None and second.find("encode", key(2)) is None
+    assert second.held_digest("encode", key(1)) and not (second.home / "artefacts").exists(), "a plan fetches nothing"
     assert second.find("encode", key(1), {key(7): "1" * 64}) is None, "made from other inputs"
     found = second.find("encode", key(1), {key(7): "0" * 64})
     assert found.rows == TABLE.num_rows and found.path.is_relative_to(second.home)
@@ -112,7 +112,7 @@ def test_an_artefact_of_a_machine_that_was_killed_while_sending_is_none_until_it
     killed, other = machine("a"), machine("b")
     names = bucket_server.objects(bucket_url)
     assert len([name for name in names if name.startswith("artefacts/")]) == 2
-    assert not other.holds("encode", key(1)) and other.find("encode", key(1)) is None
+    assert other.held_digest("encode", key(1)) is None and other.find("encode", key(1)) is None
     assert killed.find("encode", key(1)) is not None, "what was computed is kept"
     assert killed.send_unsent() == 1 and killed.send_unsent() == 0
     assert files(other.find("encode", key(1)).path) == files(killed.folder("encode", key(1)))
@@ -292,7 +292,7 @@ def test_a_full_bucket_is_a_named_error_and_the_next_run_sends_what_was_made(mac
     assert message.startswith(f"{store.bucket.url}: an object could not be written: ")
     assert "(XMinioStorageFull)" in message and "Storage backend has reached its limit" in message
     assert f"encode/{key(1)} is kept in {store.home}, and the next run sends it" in message
-    assert store.find("encode", key(1)) is not None and not machine("b").holds("encode", key(1))
+    assert store.find("encode", key(1)) is not None and machine("b").held_digest("encode", key(1)) is None
     again = machine("a")
     again.connect(send=True)
     assert machine("b").find("encode", key(1)) is not None

@@ -15,7 +15,7 @@ from data_contracts.published import StoredArtefact, Version, published_folder, 
 from data_contracts.regeneration import Gates
 from flows.command_line import PRESETS, load_preset
 from flows.show import find_page, show_report
-from tasks.bucket import Bucket
+from tasks.bucket import Bucket, BucketError
 from tasks.bucket_files import fetch_files, send_files
 from tasks.openings import note_opening
 from tasks.publish import claimed
@@ -57,6 +57,23 @@ def test_reports_reach_other_machines_and_the_newest_stays(machine, bucket):
     write(first, "reports/demo/tables.md", "table")
     assert send_files(first, bucket) == 0, "written anew with the same content"
     assert fetch_files(first, bucket) == 1 and (first / "reports/demo.html").read_text() == "two"
+
+
+def test_what_could_not_be_sent_is_sent_by_the_next_run(machine, bucket, monkeypatch):
+    home = machine("a")
+    write(home, "reports/demo.html", "Monday")
+    send_files(home, bucket)
+    write(home, "reports/demo.html", "Tuesday")
+
+    def fail(path, name):
+        raise BucketError("the network is down")
+
+    with monkeypatch.context() as without, pytest.raises(BucketError, match="down"):
+        without.setattr(bucket, "send", fail)
+        send_files(home, bucket)
+    assert fetch_files(home, bucket) == 0 and (home / "reports/demo.html").read_text() == "Tuesday"
+    assert send_files(home, bucket) == 1 and fetch_files(machine("b"), bucket) == 1
+    assert (machine("b") / "reports/demo.html").read_text() == "Tuesday"
 
 
 def test_show_finds_the_report_of_another_machine(machine, bucket, capsys):
@@ -148,8 +165,13 @@ def test_a_version_that_was_begun_and_made_elsewhere_is_not_made_again(machine):
         assert claim.number == 1  # and the run is killed
     with claimed(second) as claim:
         claim.finish(version(claim.number))
+    for number in (2, 3):
+        with claimed(second) as claim:
+            assert claim.number == number
+            claim.finish(version(number))
     with claimed(first) as claim:
         assert claim.version == version(1)
         claim.finish(claim.version)
+    assert read_latest(first).number == 3, "the claim of an old version does not bring it back"
     with claimed(first) as claim:
-        assert claim.number == 2
+        assert claim.number == 4

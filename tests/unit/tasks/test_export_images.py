@@ -188,6 +188,12 @@ def test_what_is_in_the_way_is_refused_and_kept(tmp_path):
     assert (tmp_path / ".next.partial" / "a.txt").read_text() == "mine"
     with pytest.raises(DataError, match="expected a new or an empty folder"):
         export(made, tmp_path / "notes" / "a.txt")
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "linked").symlink_to(tmp_path / "disk")
+    with pytest.raises(DataError, match="is a link or a mount point; export to a new folder inside of it"):
+        export(made, tmp_path / "linked")
+    with pytest.raises(DataError, match="is no folder that can be written to"):
+        export(made, tmp_path / "notes" / "a.txt" / "mine")
     (tmp_path / "empty").mkdir()
     assert len(EventDataset(export(made, tmp_path / "empty"))) == 6
     # While planning there are keys, but no digests yet.

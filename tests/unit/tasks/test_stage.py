@@ -242,7 +242,40 @@ def test_artefact_of_changed_input_is_made_anew():
     write_run_record(source.path, written.model_copy(update={"digest": changed.digest}))
     repeated, cached = run(first, windows=Windows(), seed=1)
     assert cached and repeated.digest != source.digest
+    with planning() as rows:
+        of_second = second(first(windows=Windows(), seed=1))
+        second(of_second)
+    assert [row.cached for row in rows] == [True, False, False], "what depends on it will be another, too"
     made, cached = run(second, repeated)
+    assert not cached and read_manifest(made).column("loss") == [14.0]
+    with planning() as rows:
+        second(first(windows=Windows(), seed=1))
+    assert [row.cached for row in rows] == [True, True]
+
+
+def test_work_of_a_killed_run_is_kept_for_the_same_inputs_alone(home):
+    @stage(version=1, schema=tables.TRAINING)
+    def resumes(out, source):
+        """Fails after its first half, which it keeps."""
+        state = out.work / "half"
+        if not state.exists():
+            state.write_text(str(sum(source.column("loss"))))
+            raise InterruptedError
+        return curve([float(state.read_text())])
+
+    def changed(ref, losses):
+        (ref.path / "manifest.parquet").unlink()
+        digest = write_manifest(ref.path, curve(losses), tables.TRAINING).digest
+        write_run_record(ref.path, read_run_record(ref.path).model_copy(update={"digest": digest}))
+        return run(first, windows=Windows(), seed=1)[0]
+
+    source, _ = run(first, windows=Windows(), seed=1)
+    with pytest.raises(InterruptedError):
+        run(resumes, source)
+    other = changed(source, [7, 7])
+    for _ in range(2):
+        with contextlib.suppress(InterruptedError):
+            made, cached = run(resumes, other)
     assert not cached and read_manifest(made).column("loss") == [14.0]
 
 
@@ -358,6 +391,23 @@ def test_content_of_raw_folders_enters_the_key_and_their_place_does_not(tmp_path
         (tmp_path / name / "unet" / "config.json").write_text(content)
     assert key(tmp_path / "a") == key(tmp_path / "b") != key(tmp_path / "c")
     assert key(tmp_path / "a", tmp_path / "b") != key(tmp_path / "a")
+
+
+def test_raw_files_that_change_while_they_are_read_are_an_error(home, tmp_path):
+    file = tmp_path / "recording"
+    file.write_text("one")
+
+    def reads(out):
+        (out.work / "shard").write_text(file.read_text())
+        file.write_text("another")
+        return curve([1.0])
+
+    reading = stage(version=1, schema=tables.TRAINING, raw_files=lambda arguments: [("recording", file)])(reads)
+    with pytest.raises(DataError, match="reads: raw files have changed while they were read; run again"):
+        run(reading)
+    assert not (home / "artefacts").exists() and not list((home / "work").rglob("shard"))
+    _, cached = run(reading)
+    assert not cached
 
 
 def test_linked_folders_are_read_and_loops_are_not(tmp_path):

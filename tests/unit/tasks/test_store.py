@@ -26,6 +26,7 @@ from data_contracts.errors import DataError
 from data_contracts.manifest import write_manifest
 from data_contracts.published import StoredArtefact, Version, published_folder, write_latest, write_version
 from data_contracts.regeneration import Gates
+from data_contracts.run_record import read_run_record, write_run_record
 from data_contracts.tables import TABLES
 from flows import cli
 from tasks.store import Store, StoreInUseError
@@ -397,7 +398,8 @@ def test_what_another_version_of_the_code_wrote_is_no_damage_and_stays(tmp_path,
 def publish(store, number, folder, *others):
     """A record of synthetic data that refers to artefacts."""
     artefacts = [
-        StoredArtefact(stage=path.parent.name, key=path.name, digest="0" * 64, rows=2) for path in (folder, *others)
+        StoredArtefact(stage=path.parent.name, key=path.name, digest=read_run_record(path).digest, rows=2)
+        for path in (folder, *others)
     ]
     record = Version(
         experiment="walks",
@@ -450,6 +452,35 @@ def test_latest_data_that_is_not_there_is_found(tmp_path, monkeypatch, capsys):
     flip_a_bit(folder)
     assert command("verify", monkeypatch, tmp_path) == 1
     assert f"missing: sample/{folder.name} of the latest data, version 1 of walks" in capsys.readouterr().out
+    record = read_run_record(add(store, 1, stage="sample"))
+    assert command("verify", monkeypatch, tmp_path) == 0, "made anew with the same content"
+    (folder / "manifest.parquet").unlink()
+    digest = write_manifest(folder, TABLE.slice(0, 1), tables.TRAINING).digest
+    write_run_record(folder, record.model_copy(update={"digest": digest}))
+    assert command("verify", monkeypatch, tmp_path) == 1
+    assert f"changed: sample/{folder.name} of the latest data, version 1 of walks" in capsys.readouterr().out
+
+
+def test_what_a_run_has_made_anew_since_it_was_found_damaged_stays(tmp_path, monkeypatch, capsys):
+    store = Store(tmp_path)
+    folder = add(store, 1)
+    flip_a_bit(folder)
+    check, calls = Store.check, []
+
+    def check_and_make_anew(self, place):
+        calls.append(place)
+        try:
+            check(self, place)
+        except DataError:
+            self.set_aside(place)
+            add(self, 1)
+            raise
+
+    monkeypatch.setattr(Store, "check", check_and_make_anew)
+    assert command("verify", monkeypatch, tmp_path) == 0
+    assert calls == [folder, folder] and "0 of them damaged" in capsys.readouterr().out
+    assert len(list((tmp_path / "damaged/encode").iterdir())) == 1
+    check(store, folder)
 
 
 def test_what_was_set_aside_is_neither_overwritten_nor_pruned(tmp_path, monkeypatch):
