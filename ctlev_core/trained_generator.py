@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ctlev_core import plugins
 from ctlev_core.diffusion.motion_files import has_motion_layers
-from ctlev_core.diffusion.pretrained.adapters import is_adapter
+from ctlev_core.diffusion.pretrained.adapters import is_adapter, read_adapter
 from ctlev_core.diffusion.sampling.options import OF_STUDENTS
 from ctlev_core.diffusion.student_files import distilled_evaluations
 from ctlev_core.pixel_decoder.options import DECODER_FOLDER
@@ -212,7 +212,8 @@ def _of_folder(
         raise DataError(
             f"{folder}: expected an artefact of the stage finetune or a diffusers folder; no model_index.json"
         )
-    name = "controlnet" if (folder / "controlnet").is_dir() else "stable_diffusion"
+    told = read_adapter(folder).with_controlnet if is_adapter(folder) else None
+    name = "controlnet" if told or (told is None and (folder / "controlnet").is_dir()) else "stable_diffusion"
     return TrainedGenerator(folder, name, decoder, defaults or _defaults_of(folder))
 
 

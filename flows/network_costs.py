@@ -17,8 +17,9 @@ from typing import Any
 
 from ctlev_core import plugins
 from ctlev_core.cpu_precision import computed_in
+from ctlev_core.diffusion.pretrained.loading import ENCODE_PIXELS
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.training.latent_files import ENCODE_BATCH, ENCODE_PIXELS
+from ctlev_core.diffusion.training.latent_files import ENCODE_BATCH
 from ctlev_core.diffusion.training.options import FineTuningOptions, LatentOptions, StudentOptions, TrainingOptions
 from ctlev_core.processes import few_threads, use_cores_for
 from data_contracts.config import Choice

@@ -25,10 +25,16 @@ def pretrain(options: PretrainingOptions) -> ManifestRef:
 
 
 def load_pretraining(preset: str, overrides: list[str]) -> PretrainingOptions:
-    """The options that a preset of `flows/presets/pretraining` describes."""
-    from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions
+    """The options that a preset of `flows/presets/pretraining` describes.
 
-    return load_preset(PretrainingOptions, PRESETS / "pretraining", preset, overrides)
+    Raises:
+        DataError: the base model to go on from is of another shape.
+    """
+    from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions, check_start
+
+    options = load_preset(PretrainingOptions, PRESETS / "pretraining", preset, overrides)
+    check_start(options)
+    return options
 
 
 COMMAND = Command(

@@ -26,7 +26,7 @@ def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     return ([] if start is None else files_of([start])) + pictures
 
 
-@stage(version=4, schema=tables.TRAINING, raw_files=_raw_files)
+@stage(version=5, schema=tables.TRAINING, raw_files=_raw_files)
 def pretrain(out: Output, *, options: PretrainingOptions) -> pa.Table:
     """Train the small base model on pictures; the artefact's `base_model/` is an ordinary diffusers folder."""
     from ctlev_core.diffusion.pretraining.pretraining import pretrain

@@ -24,7 +24,7 @@ from data_contracts.labels import Conditions, History
 if TYPE_CHECKING:  # torch, which plans do without
     from ctlev_core.diffusion.training.latent_files import Latents
 
-VERSION = 3
+VERSION = 4
 
 
 class Options(FineTuningOptions):

@@ -48,12 +48,14 @@ class Adapter:
         controlnet: as `load_base_model` takes it.
         networks: those that were adapted.
         digest: of the weights that were adapted.
+        with_controlnet: whether condition images steer it; None = not said by an older version.
     """
 
     base_model: Path
     controlnet: Path | None
     networks: tuple[str, ...]
     digest: str
+    with_controlnet: bool | None = None
 
 
 def prefix_of(name: str, network: Any) -> str:
@@ -89,7 +91,7 @@ def read_adapter(checkpoint: Path) -> Adapter:
         raise DataError(
             f"{path}: the base model that this adapter belongs to is not at {base_model}; set {BASE_MODEL} to its place"
         )
-    return Adapter(base_model, controlnet, networks, digest)
+    return Adapter(base_model, controlnet, networks, digest, found.get("with_controlnet"))
 
 
 def check_base_model(checkpoint: Path, adapter: Adapter) -> None:
@@ -103,7 +105,9 @@ def check_base_model(checkpoint: Path, adapter: Adapter) -> None:
         )
 
 
-def write_adapter(checkpoint: Path, base_model: Path | None, controlnet: Path | None, networks: list[str]) -> None:
+def write_adapter(
+    checkpoint: Path, base_model: Path | None, controlnet: Path | None, networks: list[str], *, with_controlnet: bool
+) -> None:
     """Say what the weights in a checkpoint folder belong to.
 
     Args:
@@ -111,14 +115,18 @@ def write_adapter(checkpoint: Path, base_model: Path | None, controlnet: Path | 
         base_model: folder or file; None = the bundled one.
         controlnet: as `load_base_model` took it.
         networks: those that were adapted.
+        with_controlnet: whether condition images steer it.
     """
     place = base_model or BUNDLED_BASE_MODEL
+    if controlnet is not None and not (len(controlnet.parts) == 1 and (place / controlnet).is_dir()):
+        controlnet = controlnet.absolute()  # elsewhere than in the base model, and found from any folder
     inside = place.parent == BUNDLED_BASE_MODEL.parent
     content: dict[str, Any] = {
         "base_model": f"{_BUNDLED}{place.name}" if inside else str(place.absolute()),
         "controlnet": None if controlnet is None else str(controlnet),
         "digest": _digest(place, controlnet),
         "networks": networks,
+        "with_controlnet": with_controlnet,
     }
     (checkpoint / ADAPTER_FILE).write_text(json.dumps(content, indent=2) + "\n")
 

@@ -29,6 +29,9 @@ from ctlev_core.processes import use_cores_for
 from data_contracts.errors import DataError
 
 LIBRARIES = ("diffusers", "transformers")
+ENCODE_PIXELS = 4 * 512**2
+"""Pixels that the autoencoder encodes at once: images of 512 px take .7 GB each in Stable Diffusion's. A CPU gains
+nothing from more of them, and is not told that its memory runs out before the process is killed."""
 logger = logging.getLogger(__name__)
 
 
@@ -170,6 +173,21 @@ def load_autoencoder(path: Path, device: str | torch.device = "cpu") -> Any:
     return vae
 
 
+def load_text_encoder(path: Path) -> tuple[Any, Any]:
+    """Tokenizer and first text encoder of a base model or an adapter alone, as `load_base_model` has them in float32.
+
+    Raises:
+        DataError: as `load_base_model`.
+    """
+    if is_adapter(path):
+        adapter = read_adapter(path)
+        check_base_model(path, adapter)
+        path = adapter.base_model
+    files = read_parts(path)
+    encoder = build_model(files.parts["text_encoder"], torch.float32)
+    return _load_tokenizer(files.tokenizer, encoder.config.max_position_embeddings), encoder
+
+
 def _use_cores_for(*models: Any) -> None:
     """Large networks are computed with many threads, also small ones beside them."""
     use_cores_for(sum(weight.nbytes for model in models for weight in model.parameters()))
@@ -285,7 +303,9 @@ def control_input(base_model: PretrainedModel, images: torch.Tensor | None) -> t
     if images is None or base_model.controlnet is None or not is_transformer(base_model.controlnet):
         return images
     vae, config = base_model.vae, base_model.controlnet.config
-    latents = vae.encode(2 * images.to(vae.device, vae.dtype) - 1).latent_dist.mean.float()
+    count = max(1, ENCODE_PIXELS // (images.shape[2] * images.shape[3]))
+    parts = (2 * part.to(vae.device, vae.dtype) - 1 for part in images.split(count))
+    latents = torch.cat([vae.encode(part).latent_dist.mean.float() for part in parts])
     if config.get("force_zeros_for_pooled_projection"):
         return latents * base_model.scaling_factor
     return base_model.scale_latents(latents)

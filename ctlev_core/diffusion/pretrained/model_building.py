@@ -47,10 +47,23 @@ def build_model(part: ModelPart, dtype: torch.dtype) -> Any:
             )
         if expected[name].is_floating_point() and tensor.dtype not in FLOATS:
             raise DataError(f"{tensor.path}: weight {name} is of type {tensor.dtype}; expected {', '.join(FLOATS)}")
-    model.load_state_dict({name: load_tensor(tensor, dtype) for name, tensor in stored.items()}, assign=True)
+    exact = _exact_modules(model, dtype)
+    loaded = {
+        name: load_tensor(tensor, dtype if exact.isdisjoint(name.split(".")) else torch.float32)
+        for name, tensor in stored.items()
+    }
+    model.load_state_dict(loaded, assign=True)
     if part.name == "text_encoder_3":
         model.tie_weights()
     return model.eval().requires_grad_(False)
+
+
+def _exact_modules(model: Any, dtype: torch.dtype) -> set[str]:
+    """Names of modules whose weights stay float32, as where transformers and diffusers load them in float16.
+
+    Such are the last layers of T5's feed-forward networks, whose outputs do not fit into float16.
+    """
+    return set(getattr(model, "_keep_in_fp32_modules", None) or ()) if dtype == torch.float16 else set()
 
 
 def make_model(part: ModelPart) -> Any:

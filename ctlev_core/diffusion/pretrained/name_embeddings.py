@@ -15,14 +15,17 @@ def embed_names(checkpoint: Path, names: Sequence[str]) -> np.ndarray:
     have CLIP's text encoder without it.
 
     Args:
-        checkpoint: a diffusers pipeline folder; its parts `tokenizer` and `text_encoder` are read, and no other.
+        checkpoint: a diffusers pipeline folder, a checkpoint in one file, or an adapter, whose base model has the
+            encoder; nothing but tokenizer and text encoder is loaded.
         names: N texts.
+    Raises:
+        DataError: they cannot be read.
     """
     import torch
-    from transformers import CLIPTextModel, CLIPTokenizer
 
-    tokenizer = CLIPTokenizer.from_pretrained(checkpoint / "tokenizer", local_files_only=True)
-    encoder = CLIPTextModel.from_pretrained(checkpoint / "text_encoder", local_files_only=True, use_safetensors=True)
+    from ctlev_core.diffusion.pretrained.loading import load_text_encoder
+
+    tokenizer, encoder = load_text_encoder(checkpoint)
     tokens = tokenizer(list(names), padding="max_length", truncation=True, return_tensors="pt")
     with torch.no_grad():
-        return encoder.float().eval()(tokens.input_ids).pooler_output.numpy()
+        return getattr(encoder, "text_model", encoder)(tokens.input_ids).pooler_output.numpy()

@@ -28,7 +28,7 @@ from ctlev_core.diffusion.pretrained.loading import (
     load_base_model,
     save_base_model,
 )
-from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, find_controlnet, read_parts
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.pretraining import procedural_images
 from ctlev_core.diffusion.pretraining.architecture import IMAGE_SIZE, WIDTHS, PredictionType, build_base_model
@@ -43,6 +43,7 @@ from ctlev_core.pictures import labelled_pictures
 from ctlev_core.pictures.labelled_pictures import PictureOptions
 from ctlev_core.processes import die_with_parent
 from data_contracts.config import RUN_SETTING, Frozen, cache_material
+from data_contracts.errors import DataError
 from data_contracts.labels import History
 
 FIT_IMAGES = 384
@@ -125,6 +126,8 @@ class PretrainingOptions(Frozen):
     def _check(self) -> PretrainingOptions:
         if self.num_processes > 1 and self.max_seconds is not None:
             raise ValueError("max_seconds must be null with several processes, which would not end together")
+        if self.training.sample_every:
+            raise ValueError("sample_every draws samples of a fine-tuning; pre-training has none, set it to 0")
         if self.pictures.root is not None and self.tune != "unet":
             raise ValueError(f"pictures of one's own have no condition images; set tune=unet, got {self.tune!r}")
         DistributedContext(0, self.num_processes).batches(self.training.gradient_accumulation)
@@ -254,6 +257,28 @@ def start_folder(options: PretrainingOptions) -> Path | None:
     return options.start or (BUNDLED_BASE_MODEL if options.tune == "controlnet" else None)
 
 
+def check_start(options: PretrainingOptions) -> None:
+    """Raise `DataError` where the base model to go on from is not of the shape that the options ask for."""
+    start = start_folder(options)
+    if start is None:
+        return
+    files = read_parts(start)
+    unet, vae = files.parts["unet"].config, files.parts["vae"].config
+    patch_px = 2 ** (len(vae["block_out_channels"]) - 1)
+    found = {
+        "image_size": unet["sample_size"] * patch_px,
+        "widths": tuple(unet["block_out_channels"]),
+        "patch_px": patch_px,
+        "prediction_type": files.scheduler_config.get("prediction_type", "epsilon"),
+    }
+    # What is left at its default is not asked for; but pictures are drawn in the size that the options say.
+    for name in (options.model_fields_set | {"image_size"}) & found.keys():
+        if getattr(options, name) != found[name]:
+            raise DataError(f"{name}: {start} has {found[name]}, got {getattr(options, name)}")
+    if options.tune != "unet" and find_controlnet(start, None) is None:
+        raise DataError(f"tune={options.tune}: {start} has no subfolder 'controlnet'; set tune=unet")
+
+
 def new_base_model(options: PretrainingOptions) -> PretrainedModel:
     """The base model before training: fitted patch code, trained tokenizer and random networks, or those of `start`."""
     start = start_folder(options)
@@ -315,7 +340,9 @@ def pretrain(options: PretrainingOptions, out: Path, work: Path) -> History:
         must grow, or the base model does not heed what it is asked for.
     Raises:
         TrainingError: the loss stayed not finite, or one of several processes failed.
+        DataError: as `check_start`.
     """
+    check_start(options)
     if options.num_processes == 1:
         return _pretrain(options, out, work, SINGLE_PROCESS)
     job = {"device": "cpu", "options": options.model_dump(mode="json"), "out": str(out), "work": str(work)}

@@ -196,7 +196,13 @@ def decode_frames(
         values = values * torch.tensor([1.0, 0.0, 1.0], device=values.device)[:, None, None]
     if base_model.value_table is not None:
         expected = values.permute(0, 2, 3, 1).float().cpu().numpy()
-        return draw_values(expected, base_model.value_table, [(int(seed), VALUE_STREAM) for seed in seeds])
+        streams = [(int(seed), VALUE_STREAM) for seed in seeds]
+        if options.palette == "grey":
+            return draw_values(expected[..., :1], base_model.value_table, streams).repeat(3, axis=3)
+        drawn = draw_values(expected, base_model.value_table, streams)
+        if options.palette == "red_blue":
+            drawn[..., 1] = 0
+        return drawn
     values = torch.where(values < options.black_threshold, 0.0, values)
     return values.round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
 

@@ -12,7 +12,7 @@ scatter, and training frames are few.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from torch import Tensor
 from ctlev_core.diffusion.denoising import Denoiser, NoiseSchedule, generator_for, noise_schedule
 from ctlev_core.diffusion.flow_matching import FlowSchedule
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, decode_latents
+from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from data_contracts.errors import DataError
 
 TABLE_FOLDER, TABLE_NAME = "value_table", "probability.npy"
@@ -31,6 +32,11 @@ MIN_PIXELS = 100_000
 """Pixels of training frames that the table is made of at least; few frames are noised several times."""
 MAX_PIXELS = 20_000_000
 _BATCH = 32
+
+
+def max_table_frames(shape: Sequence[int]) -> int:
+    """How many frames of a shape [H, W, 3] a table is made of at most."""
+    return max(MAX_PIXELS // int(np.prod(shape)), 1)
 
 
 def fit_value_table(
@@ -52,15 +58,17 @@ def fit_value_table(
     if not len(frames):
         raise DataError("a table of values needs at least one training frame, got none")
     per_frame = int(np.prod(frames.shape[1:]))
-    kept = np.arange(len(frames))[: max(MAX_PIXELS // per_frame, 1)]
-    repeats = max(-(-MIN_PIXELS // (per_frame * len(kept))), 1)
-    counts = np.zeros((256, 256))
+    count = min(len(frames), max_table_frames(frames.shape[1:]))
+    repeats = max(-(-MIN_PIXELS // (per_frame * count)), 1)
+    counts, batches = np.zeros((256, 256)), ShrinkingBatches(_BATCH)
     schedule = noise_schedule(base_model.scheduler_config)
     for repeat in range(repeats):
-        for rows in _batches(kept):
-            expected = _expected(
-                base_model, schedule, latents[rows], embeddings[rows], timestep, (seed, repeat, int(rows[0]))
-            )
+
+        def expect(rows: slice, repeat: int = repeat) -> np.ndarray:
+            entropy = seed, repeat, rows.start
+            return _expected(base_model, schedule, latents[rows], embeddings[rows], timestep, entropy)
+
+        for rows, expected in batches.map(expect, count):
             np.add.at(counts, (expected.ravel(), frames[rows].ravel()), 1)
     return _probabilities(counts)
 
@@ -69,11 +77,11 @@ def draw_values(expected: np.ndarray, table: np.ndarray, seeds: Sequence[tuple[i
     """Values drawn from the table's rows.
 
     Args:
-        expected: [N, H, W, 3] float, 0 .. 255.
+        expected: [N, H, W, C] float, 0 .. 255.
         table: [256, 256] as `fit_value_table` returns it.
         seeds: N of one or more integers each; image i depends on its own alone.
     Returns:
-        [N, H, W, 3] uint8.
+        [N, H, W, C] uint8.
     """
     cumulated = np.cumsum(table.astype(np.float64), axis=1)
     cumulated /= cumulated[:, -1:]
@@ -124,11 +132,6 @@ def read_value_table(checkpoint: Path) -> np.ndarray:
     if not is_table or (table < 0).any() or np.abs(table.sum(axis=1) - 1).max() > 1e-3:
         raise DataError(f"{path}: expected [256, 256] float32 probabilities, got {list(table.shape)} {table.dtype}")
     return table
-
-
-def _batches(rows: np.ndarray) -> Iterator[np.ndarray]:
-    for start in range(0, len(rows), _BATCH):
-        yield rows[start : start + _BATCH]
 
 
 @torch.no_grad()

@@ -25,7 +25,7 @@ from ctlev_core.diffusion.pretraining.architecture import break_zeros
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
-from ctlev_core.diffusion.sampling.value_table import fit_value_table
+from ctlev_core.diffusion.sampling.value_table import fit_value_table, max_table_frames
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.latent_cache import (
     LatentCache,
@@ -133,14 +133,13 @@ def fine_tune(
     )
     check_cache(cache, conditions, latents_are_checked=latents is not None)
     put_text_encoders_aside(base_model)
-    num_pictures = round(options.batch_size * options.rehearsal_share)
-    rehearsal = Rehearsal(options.rehearsal, base_model.image_size[0]) if num_pictures else None
+    rehearsal = Rehearsal(options.rehearsal, base_model.image_size[0]) if options.num_pictures else None
 
     def steered(batch: Batch) -> Batch:
         return replace(batch, conditions=control_input(base_model, batch.conditions))
 
     def fetch(number: int) -> Batch:
-        rows = training_rows[sample_rows(seed, number, options.batch_size - num_pictures, len(training_rows))]
+        rows = training_rows[sample_rows(seed, number, options.batch_size - options.num_pictures, len(training_rows))]
         turns = draw_turns(len(rows), options.rot90_probability, seed, number) if options.rot90_probability else None
         generator = generator_for(seed, LATENT_STREAM, number)
         batch = steered(cache.batch(rows, generator, options.prompt_dropout, device, turns))
@@ -168,7 +167,7 @@ def fine_tune(
     )
     for network in networks.values():
         network.eval().requires_grad_(False)
-    if options.values_at and distributed.rank == 0:
+    if options.values_at and (distributed.rank == 0 or distributed.sharded):  # of shards no process has the whole
         history.value_table = _value_table(base_model, frames, cache, training_rows, options, seed)
     return history
 
@@ -232,6 +231,7 @@ def _value_table(
     options: FineTuningOptions,
     seed: int,
 ) -> np.ndarray:
+    rows = rows[: max_table_frames(frames.shape[1:])]
     batch = cache.batch(rows, generator_for(seed, VALUE_STREAM), 0.0, torch.device("cpu"))
     timestep = round(options.values_at * (noise_schedule(base_model.scheduler_config).num_timesteps - 1))
     return fit_value_table(base_model, frames[rows], batch.latents, batch.embeddings, timestep=timestep, seed=seed)

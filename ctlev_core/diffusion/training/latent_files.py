@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctlev_core.diffusion.pretrained.loading import encode_posterior
+from ctlev_core.diffusion.pretrained.loading import ENCODE_PIXELS, encode_posterior
 from ctlev_core.diffusion.sampling.out_of_memory import ShrinkingBatches
 from ctlev_core.diffusion.training.distributed import DistributedContext
 from ctlev_core.progress import ProgressBar
@@ -32,9 +32,8 @@ logger = logging.getLogger(__name__)
 USUAL_SIZE = (0.4, 4.0)
 """Root mean square of scaled latents, about 1: .7 to 2.5 of the bundled base models' images, black to white; .9 to 1.8
 of photographs and event images in Stable Diffusion's space, where they are 5 to 10 if not scaled, .2 to .3 if twice."""
-ENCODE_BATCH, ENCODE_PIXELS = 32, 4 * 512**2
-"""Images and pixels that are encoded at once, unless memory runs out: of 512 px each takes .7 GB in Stable Diffusion's.
-A CPU gains nothing from more of them, and is not told that its memory runs out before the process is killed."""
+ENCODE_BATCH = 32
+"""Images that are encoded at once, fewer where they have more than `ENCODE_PIXELS` together or memory runs out."""
 FILE_FRAMES = 1024
 """Frames of a file of the stage, whole batches: what a killed run loses at most. 128 MB for 512 px and no turns."""
 CHECK_BYTES = 8 << 20

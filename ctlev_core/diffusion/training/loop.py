@@ -146,8 +146,9 @@ def _compute_gradients(
     for part in distributed.batches(options.gradient_accumulation):
         number = trainer.step * options.gradient_accumulation + part
         noise = generator_for(seed, number)
+        batch = fetch(number)  # whose frozen encoders compute as exactly as where their outputs are cached
         with autocast(options, device):
-            loss = loss_of(fetch(number), noise)
+            loss = loss_of(batch, noise)
         trainer.scaler.scale(loss / options.gradient_accumulation).backward()
         total += loss.item() / options.gradient_accumulation
     return distributed.sum_gradients(trainer.parameters, total)

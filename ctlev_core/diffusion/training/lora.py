@@ -91,4 +91,5 @@ def save_lora(base_model: PretrainedModel, options: FineTuningOptions, controlne
         # Not by diffusers, which writes a set beside them, whose order is another in each process.
         save_file({key: weights[key].contiguous() for key in sorted(weights)}, path, metadata={"format": "pt"})
     training_scheduler(base_model.scheduler_config).save_pretrained(folder / "scheduler")
-    write_adapter(folder, options.base_model, controlnet, adapted)
+    with_controlnet = base_model.controlnet is not None
+    write_adapter(folder, options.base_model, controlnet, adapted, with_controlnet=with_controlnet)

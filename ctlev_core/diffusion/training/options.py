@@ -187,6 +187,11 @@ class FineTuningOptions(TrainingOptions):
     )
 
     @property
+    def num_pictures(self) -> int:
+        """Of a batch, pictures that are rehearsed."""
+        return round(self.batch_size * self.rehearsal_share)
+
+    @property
     def num_turns(self) -> int:
         """Quarter turns in which frames may be shown, the one as they are among them."""
         return 4 if self.rot90_probability else 1
@@ -195,6 +200,11 @@ class FineTuningOptions(TrainingOptions):
     def _rehearsal_needs_pictures(self) -> Self:
         if self.rehearsal_share and self.rehearsal.root is None:
             raise ValueError("rehearsal_share needs rehearsal.root, the pictures that are shown")
+        if self.rehearsal_share and not 0 < self.num_pictures < self.batch_size:
+            raise ValueError(
+                f"rehearsal_share {self.rehearsal_share:g} of batch_size {self.batch_size} is {self.num_pictures} "
+                "pictures; expected at least one, and at least one frame beside them"
+            )
         return self
 
 
@@ -225,6 +235,12 @@ class MotionOptions(TrainingOptions):
     def stretches_at_a_time(self) -> int:
         """Whole stretches that `batch_size` frames have room for, one at least."""
         return max(1, self.batch_size // self.context)
+
+    @model_validator(mode="after")
+    def _draws_no_samples(self) -> Self:
+        if self.sample_every:
+            raise ValueError("sample_every draws samples of a fine-tuning; a training of motion layers has none")
+        return self
 
 
 class StudentOptions(TrainingOptions):

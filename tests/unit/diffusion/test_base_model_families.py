@@ -10,6 +10,7 @@ import torch
 from diffusers import DiffusionPipeline
 from tiny_families import FAMILIES, POOLED, check_refusal, with_entries, write_family
 from tiny_stable_diffusion import SIDE
+from transformers import T5Config, T5EncoderModel
 
 from ctlev_core.diffusion.denoising import Denoiser
 from ctlev_core.diffusion.pretrained.loading import conditions_to_tensor, load_base_model, save_base_model
@@ -90,6 +91,29 @@ def test_diffusers_samples_the_same(family, tmp_path, route):
             found = ours(base_model, images, options)
             assert found.std() > 0.1
             torch.testing.assert_close(found, of_diffusers(tmp_path / str(zeros), base_model, images, options))
+
+
+def test_t5_keeps_in_float16_what_its_own_library_keeps_in_float32(tmp_path):
+    """Where the last layers of its feed-forward networks overflow in half precision, as those of the published T5."""
+    folder = write_family("sd3", tmp_path / "sd3")
+    config = T5Config(
+        vocab_size=200, d_model=32, d_kv=8, num_heads=2, d_ff=32, num_layers=2, feed_forward_proj="gated-gelu"
+    )
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(0)
+        encoder = T5EncoderModel(config).eval()
+        for block in encoder.encoder.block:
+            layers = block.layer[1].DenseReluDense
+            layers.wi_0.weight *= 25
+            layers.wi_1.weight *= 25
+            layers.wo.weight *= 300
+    encoder.save_pretrained(folder / "text_encoder_3")
+
+    def embedded(dtype):
+        return encode_prompts(load_base_model(folder, dtype=dtype, with_controlnet=False), PROMPTS[:1]).float()
+
+    exact, half = embedded(torch.float32), embedded(torch.float16)
+    assert (half - exact).square().mean().sqrt() < 0.01 * exact.square().mean().sqrt()
 
 
 @pytest.mark.parametrize("route", ROUTES)

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +14,14 @@ from tiny_base_model import make_base_model, make_data
 
 from ctlev_core.diffusion.pretrained.adapters import ADAPTER_FILE, WEIGHTS_FILE
 from ctlev_core.diffusion.pretrained.loading import load_base_model, save_base_model
+from ctlev_core.diffusion.pretrained.name_embeddings import embed_names
 from ctlev_core.diffusion.sampling.devices import spread_over_cores
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
 from ctlev_core.diffusion.training import finetuning, loop
 from ctlev_core.diffusion.training.entry import train_checkpoint
 from ctlev_core.diffusion.training.options import FineTuningOptions
+from ctlev_core.trained_generator import load_generator
 from data_contracts.errors import DataError, TrainingError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -150,6 +154,25 @@ def test_what_does_not_learn_has_no_weights(base_folder, tmp_path, tune):
     assert json.loads((checkpoint / ADAPTER_FILE).read_text())["networks"] == [tune]
     assert len(load_file(checkpoint / files[0])) > 0
     load_base_model(checkpoint)
+
+
+def test_a_generator_is_of_the_route_that_it_was_trained_on(base_folder, tmp_path, monkeypatch):
+    """Also where the ControlNet did not learn, or lies elsewhere."""
+    shutil.copytree(base_folder / "controlnet", tmp_path / "nets" / "own")
+    monkeypatch.chdir(tmp_path)
+    frames, conditions = make_data(40)
+    options = OPTIONS.model_copy(update={"base_model": base_folder, "num_steps": 1})
+    routes = {"steered": ("unet", None), "elsewhere": ("both", Path("nets/own")), "text": ("unet", None)}
+    for name, (tune, controlnet) in routes.items():
+        asked = replace(conditions, images=None) if name == "text" else conditions
+        job = {"tune": tune, "with_controlnet": name != "text", "controlnet": controlnet, "seed": 1}
+        train_checkpoint(frames, asked, options, **job, out=tmp_path / name, work=tmp_path / f"work of {name}")
+    monkeypatch.chdir("/")
+    for name in routes:
+        assert load_generator(tmp_path / name).name == ("stable_diffusion" if name == "text" else "controlnet")
+    assert load_base_model(tmp_path / "elsewhere").controlnet is not None
+    names = ["cup", "ball"]
+    assert np.array_equal(embed_names(tmp_path / "text", names), embed_names(base_folder, names))
 
 
 def test_a_training_that_was_killed_ends_in_the_same_adapter(base_folder, tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from diffusers.models.unets.unet_motion_model import MotionAdapter, UNetMotionModel
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from tiny_base_model import SIDE, make_base_model, make_data
 
 from ctlev_core.diffusion.denoising import mix_noise
@@ -281,6 +282,8 @@ def test_they_lower_the_loss_of_stretches_held_back(tmp_path, checkpoint):
 def test_stretches_that_are_too_short_are_refused(tmp_path, checkpoint):
     with pytest.raises(DataError, match="stretches of 4 consecutive frames, the longest has 3"):
         train(checkpoint, tmp_path, length=3)
+    with pytest.raises(ValidationError, match="a training of motion layers has none"):
+        MotionOptions(sample_every=1)
     assert [MotionOptions(context=5, batch_size=size).stretches_at_a_time for size in (4, 5, 14, 15)] == [1, 1, 2, 3]
 
 

@@ -6,16 +6,23 @@ import torch
 
 from ctlev_core.body.motion.procedural import HELD_OUT
 from ctlev_core.diffusion.pretrained.loading import load_base_model
+from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_MODEL
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.pretraining import picture_styles, pretraining, procedural_images
 from ctlev_core.diffusion.pretraining.architecture import WORD_GAIN, learn_merges, train_tokenizer
 from ctlev_core.diffusion.pretraining.picture_styles import DataMixture
-from ctlev_core.diffusion.pretraining.pretraining import ImageStream, PretrainingOptions, new_base_model, pretrain
+from ctlev_core.diffusion.pretraining.pretraining import (
+    ImageStream,
+    PretrainingOptions,
+    check_start,
+    new_base_model,
+    pretrain,
+)
 from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.studio.compositions import RELATIONS, parse_composition
 from ctlev_core.studio.object_drawing import draw_object
 from ctlev_core.studio.objects import COLOURS, NAMES, OBJECTS
-from data_contracts.errors import TrainingError
+from data_contracts.errors import DataError, TrainingError
 
 TINY = PretrainingOptions(
     training=TrainingOptions(num_steps=4, batch_size=4, warmup_steps=1, log_every=1, validation_every=2, ema_decay=0.5),
@@ -176,11 +183,29 @@ def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monk
         ({"num_processes": 2}, "multiple of the 2 processes"),
         ({"num_processes": 2, "max_seconds": 5.0}, "max_seconds must be null with several processes"),
         ({"data_mixture": {"styles": {"lines": 0.5}}}, "shares of styles must sum to 1, got 0.5"),
+        ({"training": {"sample_every": 1}}, "sample_every draws samples of a fine-tuning"),
     ],
 )
 def test_what_does_not_go_together_is_refused(changed, message):
     with pytest.raises(ValueError, match=message):
         PretrainingOptions(**changed)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"tune": "controlnet", "image_size": 32}, "image_size: .*small has 64, got 32"),
+        ({"tune": "controlnet", "widths": (32, 32)}, r"widths: .*small has \(64, 64, 96\), got \(32, 32\)"),
+        ({"tune": "controlnet", "prediction_type": "v_prediction"}, "prediction_type: .*small has sample, got v_pred"),
+        ({"tune": "both", "start": BUNDLED_OBJECT_MODEL}, "small_objects has no subfolder 'controlnet'; set tune=unet"),
+        ({"tune": "controlnet", "start": BUNDLED_OBJECT_MODEL}, "small_objects has no subfolder 'controlnet'"),
+    ],
+)
+def test_a_base_model_of_another_shape_is_refused_before_training(tmp_path, asked, message):
+    with pytest.raises(DataError, match=message):
+        pretrain(PretrainingOptions(**asked), tmp_path / "out", tmp_path / "work")
+    assert not list(tmp_path.iterdir())
+    check_start(PretrainingOptions(tune="controlnet", widths=(64, 64, 96)))
 
 
 def test_captions_call_things_by_their_other_names_and_pictures_stay_the_same():

@@ -12,7 +12,7 @@ from ctlev_core.diffusion.pretrained.loading import load_base_model
 from ctlev_core.diffusion.pretraining import picture_styles, pretraining
 from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
 from ctlev_core.diffusion.pretraining.pretraining import PretrainingOptions, draw_chunk, pretrain, split_pictures
-from ctlev_core.diffusion.training import finetuning
+from ctlev_core.diffusion.training import finetuning, loop
 from ctlev_core.diffusion.training.finetuning import fine_tune, move_frames
 from ctlev_core.diffusion.training.options import FineTuningOptions, TrainingOptions
 from ctlev_core.pictures.image_moves import Moves
@@ -90,6 +90,31 @@ def test_what_is_for_the_text_route_is_refused_elsewhere(tmp_path, asked):
 def test_rehearsal_needs_pictures():
     with pytest.raises(ValidationError, match=r"rehearsal_share needs rehearsal\.root"):
         FineTuningOptions(rehearsal_share=0.5)
+
+
+@pytest.mark.parametrize(("batch_size", "share", "count"), [(4, 0.1, 0), (2, 0.25, 0), (4, 0.9, 4)])
+def test_a_share_that_leaves_no_pictures_or_no_frames_is_refused(pictures, batch_size, share, count):
+    with pytest.raises(ValidationError, match=f"of batch_size {batch_size} is {count} pictures"):
+        FineTuningOptions(rehearsal_share=share, rehearsal=pictures, batch_size=batch_size)
+
+
+def test_frozen_encoders_compute_in_float32_as_where_their_outputs_are_cached(tmp_path, pictures, monkeypatch):
+    seen = []
+    encode = finetuning.encode_images
+
+    def watched(*arguments):
+        seen.append(torch.is_autocast_enabled("cpu"))
+        return encode(*arguments)
+
+    monkeypatch.setattr(finetuning, "encode_images", watched)
+    autocast = torch.autocast("cpu", torch.bfloat16)
+    monkeypatch.setattr(loop, "autocast", lambda options, device: autocast)  # as on a processor that has bfloat16
+    moves = Moves(shift=0.2)
+    options = FineTuningOptions(
+        num_steps=1, batch_size=4, num_validation=0, moves=moves, rehearsal_share=0.5, rehearsal=pictures
+    )
+    tuned(options, tmp_path / "w")
+    assert seen == [False, False]
 
 
 TINY = PretrainingOptions(

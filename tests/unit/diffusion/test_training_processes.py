@@ -1,6 +1,7 @@
 """Processes that train together end where one alone does."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from tiny_families import write_family
 from tiny_stable_diffusion import SIDE
 
 from ctlev_core.diffusion.pretrained.loading import load_base_model, save_base_model
+from ctlev_core.diffusion.sampling.value_table import read_value_table
 from ctlev_core.diffusion.training import loop
 from ctlev_core.diffusion.training.distributed import DistributedContext
 from ctlev_core.diffusion.training.entry import train_checkpoint
@@ -134,6 +136,22 @@ def test_a_transformer_is_shared_out_as_a_unet_is(tmp_path):
             # to its weights, with zeros in its place, as in parts of weights, they decay.
             is_used = not torch.equal(value, before[key])
             assert_alike(value, after[key], has_gradient=is_used and not key.endswith(("to_k.bias", "k_proj.bias")))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_thread")
+def test_parts_of_weights_give_a_table_of_values(tmp_path):
+    frames, conditions = make_data(with_images=False)
+    save_base_model(replace(make_base_model(), controlnet=None), tmp_path / "base_model")
+    options = OPTIONS.model_copy(update={"num_steps": 1, "values_at": 0.4, "keep": "last"})
+    asked = {"alone": {}, "shared": {"num_processes": 2, "fsdp": True}}
+    for name, changed in asked.items():
+        train_checkpoint(
+            frames, conditions, options.model_copy(update={"base_model": tmp_path / "base_model", **changed}),
+            tune="unet", with_controlnet=False, seed=0, out=tmp_path / name, work=tmp_path / f"work of {name}",
+        )  # fmt: skip
+    one, two = (read_value_table(tmp_path / name) for name in asked)
+    np.testing.assert_allclose(one, two, atol=1e-2)
 
 
 @pytest.mark.slow

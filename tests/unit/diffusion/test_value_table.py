@@ -11,7 +11,7 @@ from ctlev_core.diffusion.pretrained.loading import images_to_tensor, save_base_
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.sampling import value_table
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.sampling.sampling import sample_checkpoint
+from ctlev_core.diffusion.sampling.sampling import decode_frames, sample_checkpoint
 from ctlev_core.diffusion.sampling.value_table import (
     draw_values,
     fit_value_table,
@@ -19,7 +19,9 @@ from ctlev_core.diffusion.sampling.value_table import (
     read_value_table,
     write_value_table,
 )
+from ctlev_core.diffusion.training import finetuning
 from ctlev_core.diffusion.training.finetuning import fine_tune
+from ctlev_core.diffusion.training.latent_cache import cache_latents
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions
@@ -83,6 +85,51 @@ def test_drawn_values_have_the_moments_of_their_row_and_depend_on_their_seed_alo
     # 12,288 draws of deviation 87: the mean is off by 4 at most in five standard deviations.
     assert abs(drawn[:2, :, 32:].mean() - 100) < 4
     assert np.array_equal(draw_values(expected[1:2], table, [(8, 1)])[0], drawn[1]), "alone or with others"
+
+
+@pytest.mark.parametrize("palette", ["grey", "red_blue"])
+def test_drawn_values_keep_to_the_palette(palette):
+    table = np.zeros((256, 256), np.float32)
+    table[:, [0, 102]] = 0.85, 0.15  # isolated events anywhere
+    base_model = replace(make_base_model(), value_table=table)
+    latents = torch.randn((4, base_model.unet.config.in_channels, 4, 4), generator=torch.Generator().manual_seed(0))
+    frames = decode_frames(base_model, latents, SamplingOptions(palette=palette, values="drawn"), [1, 2, 3, 4])
+    assert set(np.unique(frames)) == {0, 102} and abs((frames[..., 0] > 0).mean() - 0.15) < 0.05
+    if palette == "grey":
+        assert (frames == frames[..., :1]).all()
+    else:
+        assert not frames[..., 1].any() and (frames[..., 0] != frames[..., 2]).any()
+
+
+def test_frames_beyond_what_a_table_takes_are_not_read(monkeypatch):
+    frames, conditions = make_data(with_images=False)
+    monkeypatch.setattr(value_table, "MAX_PIXELS", 5 * frames[0].size)
+    base_model, asked = replace(make_base_model(), controlnet=None), []
+    cache = cache_latents(base_model, frames, conditions)
+    options = FineTuningOptions(num_validation=0, values_at=0.3)
+    monkeypatch.setattr(finetuning, "fit_value_table", lambda model, shown, *_, **__: asked.append(shown))
+    finetuning._value_table(base_model, frames, cache, np.arange(len(frames)), options, seed=0)
+    assert np.array_equal(asked[0], frames[:5])
+
+
+def test_a_table_is_made_of_fewer_frames_at_a_time_where_memory_runs_out(monkeypatch):
+    frames, conditions = make_data(with_images=False)
+    base_model = replace(make_base_model(), controlnet=None)
+    batch = cache_latents(base_model, frames, conditions).batch(
+        np.arange(len(frames)), torch.Generator().manual_seed(0), 0.0, torch.device("cpu")
+    )
+    expected, sizes = value_table._expected, []
+
+    def with_room_for_three(*arguments):
+        sizes.append(len(arguments[2]))
+        if sizes[-1] > 3:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return expected(*arguments)
+
+    monkeypatch.setattr(value_table, "_expected", with_room_for_three)
+    table = fit_value_table(base_model, frames, batch.latents, batch.embeddings, timestep=300, seed=0)
+    np.testing.assert_allclose(table.sum(axis=1), 1, atol=1e-5)
+    assert max(sizes[-5:]) <= 3
 
 
 def test_a_checkpoint_carries_its_table(tmp_path):
