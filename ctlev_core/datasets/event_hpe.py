@@ -35,7 +35,7 @@ from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_lab
 if TYPE_CHECKING:
     from ctlev_core.geometry.camera import Camera
 
-VERSION = 3
+VERSION = 4
 JOINT_SET = "smpl"
 
 EXPECTED_TREE = """expected the preprocessed download of EventHPE (layout `preprocessed`):
@@ -114,6 +114,23 @@ def read_windows(recording: Recording, options: Options) -> np.ndarray:
     raw = _read_raw(recording)
     labelled = np.isin(raw.numbers + 1, list(_poses(recording)))
     return np.stack([raw.bounds[:-1], raw.bounds[1:]], axis=1)[labelled]
+
+
+def read_window_labels(recording: Recording, options: Options) -> Labels:
+    """The pose that ends each window of `read_windows`, one row a window.
+
+    `labels_at_windows` would also average the pose before into it where two windows touch in the same microsecond.
+
+    Raises:
+        DataError: as `read_labels`.
+    Source: event_pose_estimation/dataloader.py.
+    """
+    poses = np.array(list(_poses(recording)), np.int64)
+    dated = poses[_times_us(recording, poses, options)[1]]
+    ends = np.array([number + 1 for number in _read_raw(recording).numbers if number + 1 in _poses(recording)])
+    # The pose of a window without events may have no time; such a window is not used.
+    rows = np.minimum(np.searchsorted(dated, ends), len(dated) - 1)
+    return read_labels(recording, options).take(rows)
 
 
 def read_labels(recording: Recording, options: Options) -> Labels:

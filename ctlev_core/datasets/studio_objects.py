@@ -34,7 +34,7 @@ from data_contracts.labels import ImageTrack, Labels, Part, Recording
 if TYPE_CHECKING:
     from ctlev_core.studio.moving_screen import MovingScreen
 
-VERSION = 1
+VERSION = 2
 
 CLASSES = tuple(NAMES)
 """The ordinary classes, nouns of `ctlev_core.studio.objects.OBJECTS` with outlines of their own."""
@@ -191,7 +191,7 @@ def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:
     if options.intensity_rate_hz is None:
         raise DataError(f"studio_objects recording {recording.recording_id!r}: intensity_rate_hz asks for no pictures")
     screen = moving_screen(recording, options)
-    count = int(1e-6 * options.recording_duration_us * options.intensity_rate_hz) + 1
+    count = int(1e-6 * options.recording_duration_us * options.intensity_rate_hz + 1e-6) + 1
     times_s = np.arange(count) / options.intensity_rate_hz
     images = np.stack([np.rint(255 * screen(time_s)).astype(np.uint8) for time_s in times_s])
     return ImageTrack(images, np.rint(1e6 * times_s).astype(np.int64))

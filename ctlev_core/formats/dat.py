@@ -43,8 +43,8 @@ def read(path: Path) -> Events:
     """The whole file.
 
     Raises:
-        DataError: other events than of type 2d or CD, no or cut ones, an unknown sensor size, events outside the
-            sensor, or time that runs backwards (an overflow of the 32-bit clock does not).
+        DataError: a version before 2, other events than of type 2d or CD, no or cut ones, an unknown sensor size,
+            events outside the sensor, or time that runs backwards (an overflow of the 32-bit clock does not).
     """
     return record_files.read(_open(path))
 
@@ -78,6 +78,9 @@ def _open(path: Path) -> record_files.RecordFile:
         raise DataError(
             f"{path}: not a DAT file: expected lines that start with '% ', then the type and size of events"
         )
+    version = header.fields.get("Version", "")
+    if version.isdecimal() and int(version) < 2:
+        raise DataError(f"{path}: expected DAT of version 2, got version {version}, which packs x, y and p otherwise")
     if kind[0] not in (TYPE_2D, TYPE_CD) or kind[1] != _EVENT_BYTES:
         name = _TYPES.get(kind[0], "unknown")
         raise DataError(

@@ -51,10 +51,12 @@ def displacements(track: Labels, moments_us: np.ndarray, reach_us: int, where: s
     """Displacements [N, 2, J, 2] px of the joints of a track, from N moments to `reach_us` before and after.
 
     Between labels joints move on straight lines; beyond the first and last label as fast as over `reach_us` within.
+    Of labels of one time the first counts.
 
     Raises:
-        DataError: the track has no joints in 2D, or fewer than two labels.
+        DataError: the track has no joints in 2D, or fewer than two labels of different times.
     """
+    track = track.take(np.unique(track.t_us, return_index=True)[1])
     if track.joints2d is None or len(track) < 2:
         got = "no joints2d" if track.joints2d is None else f"{len(track)} label"
         raise DataError(f"{where}: displacements need two labels with joints2d, got {got}")

@@ -55,6 +55,7 @@ def interpolate_labels(labels: Labels, t_us: np.ndarray) -> Labels:
         raise ValueError(f"{t_us[np.argmin(known)]} us lies outside the labels, {span}, or in a gap of them")
     if not labels.arrays:
         return replace(labels.take(np.zeros(len(t_us), np.int64)), t_us=t_us)
+    labels = labels.take(np.unique(labels.t_us, return_index=True)[1])
     before, after, fraction = _neighbours(labels.t_us, t_us)
     found = labels.take(np.where(fraction <= 0.5, before, after))
     moving = np.flatnonzero(after > before)

@@ -18,6 +18,7 @@ many recordings, so that it is a little too high: a set that lies below it canno
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -84,7 +85,8 @@ def estimate_numbers(summaries: Sequence[Summary], seed: int = 0) -> dict[str, E
     found = numbers(np.ones((1, len(summaries))))
     count = len(summaries)
     replicates = numbers(_draws(count, seed)) if count >= MIN_RECORDINGS else {}
-    return {name: _estimate(float(value[0]), replicates.get(name), count) for name, value in found.items()}
+    having = _having(summaries)
+    return {name: _estimate(float(value[0]), replicates.get(name), having[name]) for name, value in found.items()}
 
 
 def estimate_distances(first: Sequence[Summary], second: Sequence[Summary], seed: int = 0) -> dict[str, Estimate]:
@@ -92,11 +94,15 @@ def estimate_distances(first: Sequence[Summary], second: Sequence[Summary], seed
     ones = np.ones((1, len(first))), np.ones((1, len(second)))
     found = _distances(_means(first, ones[0]), _means(second, ones[1]))
     replicates: dict[str, np.ndarray] = {}
-    fewest = min(len(first), len(second))
-    if fewest >= MIN_RECORDINGS:
+    if min(len(first), len(second)) >= MIN_RECORDINGS:
         draws = _draws(len(first), seed), _draws(len(second), seed + 1)
         replicates = _distances(_means(first, draws[0]), _means(second, draws[1]))
-    return {name: _estimate(float(value[0]), replicates.get(name), fewest) for name, value in found.items()}
+    having = [_having(summaries) for summaries in (first, second)]
+    estimates = {}
+    for name, value in found.items():
+        of = name if name in having[0] else next(axis for axis in AXES if name.startswith(f"{axis}_"))
+        estimates[name] = _estimate(float(value[0]), replicates.get(name), min(each[of] for each in having))
+    return estimates
 
 
 def estimate_floor(summaries: Sequence[Summary], seed: int = 0) -> dict[str, Estimate]:
@@ -146,6 +152,11 @@ def _means(summaries: Sequence[Summary], weights: np.ndarray) -> dict[str, np.nd
     return found
 
 
+def _having(summaries: Sequence[Summary]) -> Counter[str]:
+    """How many recordings have each number and distribution."""
+    return Counter(name for summary in summaries for name in (*summary.numbers, *summary.distributions))
+
+
 def _distances(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Distances [R] of means [R, numbers or bins]."""
     found = {}
@@ -170,8 +181,8 @@ def _draws(count: int, seed: int) -> np.ndarray:
 
 
 def _estimate(value: float, replicates: np.ndarray | None, count: int) -> Estimate:
-    """`count`: recordings that were drawn, of the smaller set."""
-    if replicates is None or not np.isfinite(replicates).any():
+    """`count`: recordings that have the number, of the smaller set."""
+    if replicates is None or count < MIN_RECORDINGS or not np.isfinite(replicates).any():
         return Estimate(value)
     low, high = np.quantile(replicates[np.isfinite(replicates)], percentile_levels(count))
     return Estimate(value, float(low), float(high))

@@ -66,7 +66,10 @@ def score_rows(
         if not all(count.any() for _, count in sums.values()):
             raise ValueError("nothing to score in these rows")
         scores = quotients(sums)
-        return (scores, {}, {}) if few else (scores, *ratio_bootstrap(sums, recordings))
+        enough = {
+            name: pair for name, pair in sums.items() if len(np.unique(recordings[pair[1] > 0])) >= MIN_RECORDINGS
+        }
+        return (scores, *ratio_bootstrap(enough, recordings))
     # Names are compared once rather than for each of many resamplings.
     prepared = isinstance(metric.module, PreparedMetric)
     resampled = metric.module.prepare(pick(every), labels, metric.options) if prepared else compute

@@ -40,7 +40,8 @@ ROUNDS, TRIES, TOLERANCE = 3, 5, 0.005
 SIZE_POWER = 1.2
 """Spread grows less than size, for the path has its share of it."""
 MIN_THRESHOLD, MAX_THRESHOLD = 0.02, 3.0
-LEAK_SIGMAS = 3.0
+LEAK_SIGMAS = NOISE_SIGMAS = 3.0
+"""What is taken for leak, and for events of a picture, must be this many standard deviations above chance."""
 
 
 @dataclass(eq=False)
@@ -85,7 +86,7 @@ def fit(
     Returns:
         All those options, and what was measured.
     Raises:
-        DataError: no recording has events.
+        DataError: no recording has events, or all of them are noise.
     """
     real, size = _sum_up(recordings, duration_us)
     rows = _pictures_for(class_names, picture_names)
@@ -116,6 +117,8 @@ def fit(
     signal = np.where(quiet, 0.0, real.counts - (noise_hz * real.seconds)[:, None, None])
     set_open(negative=bool(found["negative"]) ^ (_agreement(real, simulated(**silent)) < 0))
     wanted = signal.sum(axis=(1, 2)) / real.num
+    if wanted.sum() * real.num <= NOISE_SIGMAS * np.sqrt(real.counts.sum()):
+        raise DataError("calibration: expected recordings of pictures, got none with more events than their noise")
     if found["flipped"]:
         wanted = wanted[::-1]  # from here on by light
     for _ in range(ROUNDS):

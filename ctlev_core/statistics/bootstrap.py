@@ -119,7 +119,7 @@ def cluster_bootstrap(
         for counts in draws:
             with suppress(ValueError):
                 replicates.append(compute(by_group[_repeated(sizes, counts)]))
-    if not replicates:
+    if 2 * len(replicates) < num_resamples:  # those that are left are like the whole set, and vary too little
         return {}, {}
     scores = [name for name in replicates[0] if name in whole]
     found = np.array([[replicate[name] for name in scores] for replicate in replicates])
@@ -163,12 +163,16 @@ def ratio_bootstrap(
         num_resamples: bootstrap replicates; one in which a denominator is 0 is left out.
         seed: of the resampling.
     Returns:
-        The lower and the upper ends by name; both empty with fewer than two groups.
+        The lower and the upper ends by name; both empty with fewer than two groups that add to a denominator.
     """
     names, index = np.unique(np.asarray(groups), return_inverse=True)
     if len(names) < 2 or not sums:
         return {}, {}
     columns = np.array([np.bincount(index, weights=column) for pair in sums.values() for column in pair])
+    scored = (columns[1::2] > 0).any(axis=0)  # a group that is in no score is not there to be drawn
+    names, columns = names[scored], columns[:, scored]
+    if len(names) < 2:
+        return {}, {}
     found = np.concatenate([draws @ columns.T for draws in _draws(len(names), num_resamples, seed)])
     totals, counts = found[:, ::2], found[:, 1::2]
     usable = (counts > 0).all(axis=1)

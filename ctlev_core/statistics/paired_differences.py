@@ -112,10 +112,12 @@ def share_of_gain(start: Trainings, reached: Trainings, oracle: Trainings, seed:
     gain = _contrast(varied, {0: -1.0, 2: 1.0})
     if not gain.is_certain:
         return None
-    by = widening(varied.parts({0: 1.0, 1: 1.0, 2: 1.0}))
-    value, draws = varied.values, varied.values + varied.deviations * by
+    value = varied.values
+    share = float((value[1] - value[0]) / (value[2] - value[0]))
+    # Of what the share varies with to first order: what all training sets have in common is not part of it.
+    draws = value + varied.deviations * widening(varied.parts({0: share - 1.0, 1: 1.0, 2: -share}))
     shares = (draws[:, 1] - draws[:, 0]) / (draws[:, 2] - draws[:, 0])
-    return Difference(float((value[1] - value[0]) / (value[2] - value[0])), *_ends(shares))
+    return Difference(share, *_ends(shares))
 
 
 def unpaired_difference(before: Trainings, after: Trainings, seed: int = 0) -> Difference:

@@ -84,7 +84,9 @@ def _mot_cells(row: list[str], where: str) -> dict[str, str] | None:
     cells: dict[str, str] = dict(zip(("frame", "instance", *BOX), (cell.strip() for cell in row), strict=False))
     if len(row) == MOT_CATEGORY + 2:
         cells["category"] = row[MOT_CATEGORY].strip()
-    return cells | {"frame": repr(float(row[0]) - 1)}
+    # Frames and the corner of a box count from 1.
+    first = {name: repr(float(cells[name]) - 1) for name in ("frame", "x", "y") if _is_number(cells[name])}
+    return cells | first
 
 
 def _frame(cells: dict[str, str], where: str) -> int:

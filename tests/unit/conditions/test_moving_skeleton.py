@@ -48,6 +48,15 @@ def test_short_tracks_and_unknown_joints():
     assert np.isnan(moved[0, :, 4]).all() and np.isfinite(np.delete(moved, 4, axis=2)).all()
 
 
+@pytest.mark.parametrize("times", [[0, 0, 10, 20], [0, 10, 10, 20], [0, 10, 20, 20]])
+def test_of_labels_of_one_time_the_first_counts(times):
+    joints = pose() + np.array(times)[:, None, None]
+    twice = 1 + int(np.argmin(np.diff(times)))
+    joints[twice] += 99
+    moved = displacements(track(times, joints), np.array([0, 4, 10, 20]), 10, "r")
+    assert np.allclose(moved[:, 0], -10, atol=1e-4) and np.allclose(moved[:, 1], 10, atol=1e-4)
+
+
 def test_three_skeletons_in_three_colours():
     labels = track([0, 1], np.stack([pose(1), pose(2)]))
     moved = np.zeros((2, 2, 13, 2))

@@ -249,6 +249,22 @@ def test_raw_windows_are_files_and_end_at_their_label(raw):
     assert pictures.images.shape == (4, 1280, 800) and pictures.t_us.tolist() == labels.t_us.tolist()
 
 
+@pytest.mark.parametrize("gap_us", [0, 1])
+def test_windows_that_touch_have_the_pose_at_their_end_alone(tmp_path, gap_us):
+    for number in range(4):
+        start_us = 1000 * number + gap_us
+        write_events(tmp_path, 10 + number, [(0, 0, start_us, 0, 1), (9, 9, 1000 * number + 1000, 0, 0)])
+    write_poses(tmp_path, (10, 11, 12, 13))
+    recording, options = first(tmp_path)
+    labels = check_labels(event_hpe.read_window_labels(recording, options), "windows")
+    assert len(labels) == len(event_hpe.read_windows(recording, options)) == 3
+    camera = event_hpe.read_camera(recording, options)
+    for row, number in enumerate((11, 12, 13)):
+        expected = project(camera, pose_values(number)[3])
+        np.testing.assert_allclose(labels.joints2d[row], expected, atol=1e-2)
+    assert labels.t_us.tolist() == [1000, 2000, 3000]
+
+
 def test_windows_without_a_pose_at_their_end_are_left_out_and_empty_files_stay(raw):
     (raw / f"pose_events/{ACTION}/pose0012.pkl").unlink()
     write_events(raw, 12, [])

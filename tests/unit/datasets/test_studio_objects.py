@@ -236,6 +236,15 @@ def test_intensity_frames_are_what_the_sensor_sees():
         studio_objects.read_intensity_frames(first_of("clock"), SMALL)
 
 
+@pytest.mark.parametrize(
+    ("duration_us", "rate_hz", "count"), [(100_000, 10.0, 2), (70_000, 100.0, 8), (99_000, 10.0, 1)]
+)
+def test_there_is_a_picture_at_the_end_where_the_rate_says_so(duration_us, rate_hz, count):
+    options = SMALL.model_copy(update={"recording_duration_us": duration_us, "intensity_rate_hz": rate_hz})
+    track = studio_objects.read_intensity_frames(first_of("clock", options), options)
+    assert track.t_us.tolist() == np.rint(1e6 * np.arange(count) / rate_hz).tolist()
+
+
 def test_other_sensor_sizes_have_objects_of_the_same_share():
     options = Options(sensor_size=(120, 80), classes=("star",), sensor_preset="ideal")
     events = studio_objects.read_events(first_of("star", options), options)

@@ -78,6 +78,11 @@ def test_dat_without_a_size_gets_the_smallest_sensor(tmp_path):
     assert read_both_ways(path, "dat").sensor_size == (320, 320)
 
 
+def test_dat_of_the_first_version_is_refused(tmp_path):
+    path = write_dat(tmp_path / "a.dat", [(0, 1, 1, 0)], header="% Version 1\n")
+    raises_both_ways(path, "dat", "expected DAT of version 2, got version 1, which packs x, y and p otherwise")
+
+
 def test_dat_clock_overflows_at_32_bits(tmp_path):
     clock = [0, 2**31, 2**32 - 1, 0, 2**31 - 1, 2**32 - 2, 5]
     path = write_dat(tmp_path / "a.dat", [(t, 1, 1, 0) for t in clock])

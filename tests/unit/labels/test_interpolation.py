@@ -56,6 +56,16 @@ def test_bodies_equal_scipys_slerp_and_straight_lines(count, seed):
         assert found.class_names[row] == labels.class_names[nearest]
 
 
+def test_of_labels_of_one_time_the_first_counts():
+    labels = body_track([0, 10, 10, 20, 20])
+    once = labels.take([0, 1, 3])
+    moments = np.array([0, 9, 10, 11, 15, 20])
+    one, two = (interpolate_labels(track, moments) for track in (labels, once))
+    for name, array in one.arrays.items():
+        np.testing.assert_array_equal(array, two.arrays[name])
+    assert one.class_names == two.class_names
+
+
 def test_a_joint_turns_at_constant_speed_through_half_a_turn():
     pose = np.zeros((2, 72), np.float32)
     pose[:, 2] = 3.0, -3.0  # rad about z: 0.28 rad apart, through half a turn

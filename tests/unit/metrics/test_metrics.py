@@ -5,12 +5,15 @@ from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, precision_score, recall_score
 
 from ctlev_core.metrics import classification, frechet, mpjpe2d, oks, pck2d
+from ctlev_core.plugins import load_options
+from ctlev_core.scoring.scored_rows import score_rows
 from ctlev_core.statistics.bootstrap import (
     bootstrap_interval,
     cluster_bootstrap,
     ratio_bootstrap,
     score_text,
 )
+from data_contracts.config import MetricChoice
 from data_contracts.labels import Labels
 
 
@@ -208,6 +211,38 @@ def test_replicates_that_cannot_be_scored_are_left_out():
         return {"score": 1.0}
 
     assert cluster_bootstrap(compute, ["a", "b", "c"]) == ({"score": 1.0}, {"score": 1.0})
+
+
+def test_replicates_that_are_rarely_of_use_give_no_interval():
+    """A score that needs all classes, with a recording each: what is left is the whole set, drawn again."""
+
+    def compute(rows):
+        if len(set(rows.tolist())) < 10:
+            raise ValueError("a class is missing")
+        return {"score": 1.0}
+
+    assert cluster_bootstrap(compute, np.arange(10).astype(str)) == ({}, {})
+
+
+def test_recordings_with_nothing_to_score_are_not_drawn():
+    random = np.random.default_rng(0)
+    scored = np.repeat(np.arange(5), 3)
+    sums = {"error": (random.normal(10, 1, 15), np.ones(15))}
+    padded = {"error": tuple(np.concatenate([values, np.zeros(35)]) for values in sums["error"])}
+    groups = np.concatenate([scored, np.arange(5, 40)])
+    assert ratio_bootstrap(padded, groups) == ratio_bootstrap(sums, scored)
+
+
+def test_few_scored_recordings_have_no_interval():
+    options = load_options(MetricChoice(name="mpjpe2d"))
+    joints = np.random.default_rng(0).uniform(0, 64, (24, 13, 2)).astype(np.float32)
+    prediction = {"joints2d": joints + 1}
+    recordings, visible = np.repeat(np.arange(6), 4).astype(str), np.ones((24, 13), bool)
+    for num_scored, has_interval in ((6, True), (5, True), (4, False)):
+        seen = visible & (np.repeat(np.arange(6), 4) < num_scored)[:, None]
+        labels = Labels(("a",) * 24, np.arange(24), joints, seen, "dhp19")
+        scores, low, high = score_rows(options, prediction, labels, np.arange(24), recordings)
+        assert scores["mpjpe2d_px"] == pytest.approx(2**0.5) and ("mpjpe2d_px" in low) == has_interval == bool(high)
 
 
 def test_the_interval_of_a_score_that_grows_as_rows_repeat_has_the_score_in_it():

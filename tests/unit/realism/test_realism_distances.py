@@ -75,6 +75,18 @@ def test_few_recordings_have_no_interval():
     assert np.isnan(estimate_distances(random_set(4, 0, 0), random_set(9, 0, 1))["a"].low)
 
 
+def test_recordings_that_lack_a_number_do_not_count():
+    """Of six recordings two have a value: black frames have none."""
+    some = [Summary({"a": float(row)} | ({"b": float(row)} if row < 2 else {}), {}) for row in range(6)]
+    all_six = [Summary({"a": float(row), "b": float(row)}, {}) for row in range(6)]
+    for found in (estimate_numbers(some), estimate_distances(some, all_six), estimate_distances(all_six, some)):
+        assert np.isfinite(found["a"].low) and np.isnan([found["b"].low, found["b"].high]).all()
+    lack = [Summary({}, {"interval": at_bin(3)} if row < 4 else {}) for row in range(6)]
+    have = [Summary({}, {"interval": at_bin(5)}) for _ in range(6)]
+    assert all(np.isnan(one.low) for one in estimate_distances(lack, have).values())
+    assert all(np.isfinite(one.low) for one in estimate_distances(have, have).values())
+
+
 def test_distances_tell_sets_apart_and_the_floor_does_not():
     first, second, same = random_set(20, 0, 0), random_set(20, 5, 1), random_set(20, 0, 2)
     floor = estimate_floor(first)

@@ -148,6 +148,35 @@ def test_the_share_of_a_gain_is_a_ratio_of_differences():
     assert share_of_gain(trainings(start), trainings(start - gain), trainings(start + noise - noise.mean())) is None
 
 
+def test_what_is_hard_for_every_training_does_not_narrow_the_share_of_a_gain():
+    random = np.random.default_rng(2)
+    own = [score + random.normal(0, 0.1, (2, 1)) + random.normal(0, 0.2, (2, 40)) for score in (10.0, 9.3, 9.0)]
+    common = random.normal(0, 10, 40)
+    found = share_of_gain(*map(trainings, own))
+    among_others = share_of_gain(*(trainings(values + common) for values in own))
+    assert found is not None and found.low < found.value < found.high
+    assert (among_others.low, among_others.high) == pytest.approx((found.low, found.high), rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_trainings", [2, 3])
+def test_intervals_of_shares_cover_the_truth(monkeypatch, num_trainings):
+    monkeypatch.setattr(paired_differences, "NUM_RESAMPLES", 1000)
+    random, covered, runs = np.random.default_rng(11), 0, 0
+    for _ in range(300):
+        common = random.normal(0, 3, 40)
+        sets = [
+            trainings(
+                score + common + random.normal(0, 0.1, (num_trainings, 1)) + random.normal(0, 0.1, (num_trainings, 40))
+            )
+            for score in (10.0, 9.5, 9.0)
+        ]
+        found = share_of_gain(*sets)
+        if found is not None:
+            runs, covered = runs + 1, covered + (found.low <= 0.5 <= found.high)
+    assert runs > 150 and covered / runs >= 0.94
+
+
 def test_results_do_not_depend_on_the_order_of_trainings():
     random = np.random.default_rng(0)
     values, other = random.normal(size=(3, 40)), trainings(random.normal(size=(2, 40)))

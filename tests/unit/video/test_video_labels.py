@@ -198,7 +198,7 @@ def test_mot_challenge_counts_frames_from_one_and_has_rows_to_ignore(tmp_path):
     labels = tmp_path / "gt.txt"
     labels.write_text("1,5,4,6,10,12,1,2,0.9\n2,5,6,6,10,12,1,2,0.9\n1,6,1,1,9,9,0,8,1\n")
     found = carried(labels, folder_of(tmp_path / "f"), [0, 5000])
-    assert [one["bbox"] for (one,) in found.values()] == [[4, 6, 10, 12], [5, 6, 10, 12]]
+    assert [one["bbox"] for (one,) in found.values()] == [[3, 5, 10, 12], [4, 5, 10, 12]]
 
 
 def test_keypoints_of_a_table_may_be_missing(tmp_path):
