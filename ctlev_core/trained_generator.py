@@ -145,8 +145,9 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
     """The generator of a run, or of a folder.
 
     Args:
-        place: name of a report (its experiment's own generator, with its pixel decoder), the path of an artefact of the
-            stage `finetune`, `train_motion_layers` or `distill`, or of a diffusers folder that training wrote.
+        place: name of a report, of a study STUDY/EXPERIMENT (the experiment's own generator, with its pixel decoder);
+            the path of an artefact of the stage `finetune`, `train_motion_layers` or `distill`, or of a diffusers
+            folder that training wrote.
         home: folder of all state, where `place` is a name, or URL of a bucket, of which what is in the cache of this
             machine is found; None = CTLEV_HOME, else `.ctlev`.
     Raises:
@@ -158,10 +159,11 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
     state = home_folder(home)
     report = state / "reports" / str(place)
     if not (report / "provenance.json").is_file():
-        known = sorted(one.parent.name for one in (state / "reports").glob("*/provenance.json"))
+        reports = state / "reports"
+        known = sorted(one.parent.relative_to(reports).as_posix() for one in reports.rglob("provenance.json"))
         raise DataError(
             f"generator {str(place)!r}: is neither a folder nor a report of {state}, which has "
-            f"{', '.join(known) or 'none'}; of a study name the folder of a checkpoint"
+            f"{', '.join(known) or 'none'}; of a study name one of its experiments, as STUDY/EXPERIMENT"
         )
     records = read_provenance(report / "provenance.json")
     own = next(

@@ -57,7 +57,7 @@ class ManifestRef(Frozen):
     Attributes:
         key: the cache key of the stage that made it; names the artefact in the store.
         path: the artefact's folder.
-        digest: SHA-256 of manifest.parquet; empty while it is planned to be made.
+        digest: SHA-256 of manifest.parquet; empty while only planned.
         rows: rows of the table; -1 while only planned.
     """
 

@@ -126,9 +126,12 @@ def apply_override(values: dict[str, Any], override: str) -> None:
 def print_plan(rows: list[PlannedStage]) -> None:
     """One line per stage: cached or to run, and its key."""
     width = max(len(row.label) for row in rows)
-    for row in rows:
+    stages = {}
+    for row in rows:  # branches of an experiment ask for the same stages
+        stages.setdefault(row.key, row)
+    for row in stages.values():
         print(f"{'cached' if row.cached else 'to run':7} {row.label:{width}}  {row.key}")
-    print(f"{sum(row.cached for row in rows)} of {len(rows)} stages are cached")
+    print(f"{sum(row.cached for row in stages.values())} of {len(stages)} stages are cached")
 
 
 def publish_plan(rows: list[PlannedStage], description: str) -> None:

@@ -25,6 +25,7 @@ from data_contracts.training_sets import (
 from flows.baselines import BaselineFrames, baselines
 from flows.cli import script
 from flows.command_line import Command
+from flows.inputs import check_num_classes
 from flows.prepare_dataset import PreparedDataset, prepare_dataset
 from flows.settings import flow
 from flows.synthesize import synthesize
@@ -59,6 +60,7 @@ def evaluate(
     compared: dict[str, list[BaselineFrames]] | None = None,
 ) -> Evaluation:
     """Train and score every training set and seed; what is not given is made first."""
+    check_num_classes(experiment)
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     if synthetic is None:

@@ -181,6 +181,23 @@ def _check_classes(experiment: Experiment) -> None:
             plugin.module.check_classes(names, plugin.options)
 
 
+def check_num_classes(experiment: Experiment) -> None:
+    """Raise `DataError` where a classifier would have a single class to learn, as far as recordings name classes.
+
+    Generators learn from one class as well, so that it is not asked of what is only sampled.
+    """
+    for choice in (experiment.downstream, experiment.feature_extractor):
+        if choice is None or not getattr(plugins.load("downstream", choice.name), "NEEDS_CLASSES", False):
+            continue
+        dataset = plugins.load_options(experiment.dataset)
+        recordings = dataset.module.list_recordings(dataset.options)
+        classes = {one.class_name for one in recordings if any(part.split == "train" for part in one.parts)}
+        if len(classes) == 1 and "" not in classes:
+            raise DataError(
+                f"dataset {dataset.name!r}: {choice.name} needs at least two classes, got {classes.pop()!r} alone"
+            )
+
+
 def _check_base_models(experiment: Experiment) -> None:
     """Raise `DataError` where event images or conditions do not fit the weights a generator starts from."""
     encoding = plugins.load_options(experiment.encoding).options

@@ -42,7 +42,7 @@ def record_people(
         suffix: of the files of events, which says their format.
         overwrite: replace a folder that is there, if it holds recordings of this command.
     Returns:
-        Exit status: 0 written, 2 wrong input.
+        Exit status: 0 written, 2 wrong input, 130 interrupted.
     """
     started, partial = time.perf_counter(), folder.with_name(f".partial-{folder.name}")
     try:
@@ -64,6 +64,10 @@ def record_people(
         shutil.rmtree(partial, ignore_errors=True)
         print(f"error: {str(error).replace(str(partial), str(folder))}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        shutil.rmtree(partial, ignore_errors=True)
+        print("interrupted; nothing was written", file=sys.stderr)
+        return 130
     width, height = options.sensor_size
     print(
         f"{len(recordings)} recordings of {width} x {height} px and {1e-6 * options.recording_duration_us:g} s, "

@@ -80,9 +80,22 @@ def encode(
     splits = set(pc.unique(table["split"]).to_pylist()) if len(table) else set()
     for split in ("train", held_out or "test"):
         if split not in splits:
-            raise DataError(f"encode: no window in split {split!r}; the recordings are too short for {windows!r}")
+            raise DataError(f"encode: no window in split {split!r}: {_why_none(recordings, split, windows)}")
     _check_classes(recordings, table, windows, ("train", held_out or "test"))
     return table
+
+
+def _why_none(recordings: Manifest, split: str, windows: Windows) -> str:
+    """Why no recording of a split has a window."""
+    if windows.method != "count":
+        return f"the recordings are too short for {windows!r}"
+    parts = recordings.attached(tables.PARTS)
+    parts = parts.filter(pc.equal(parts["split"], split))
+    most = max((row["event_stop"] - row["event_start"] for row in parts.to_pylist()), default=0)
+    return (
+        f"its recordings have {most:,} events at most there, and a window takes "
+        f"{windows.num_events:,}; set windows.num_events to less"
+    )
 
 
 class _FrameTable:

@@ -57,7 +57,7 @@ class _DistanceScores(Stage):
         check_distances(arguments["downstream"], arguments["distances"])
 
 
-@partial(_ModelScores, version=10, schema=tables.SCORES, raw_files=None, optional=("sensor",))
+@partial(_ModelScores, version=11, schema=tables.SCORES, raw_files=None, optional=("sensor",))
 def score_model(
     out: Output,
     model: Manifest,

@@ -26,6 +26,7 @@ from data_contracts.image_folder import (
     PROVENANCE_FILE,
     README_FILE,
     file_names,
+    read_image_table,
     write_image_table,
 )
 from data_contracts.manifest import Manifest, ManifestRef, read_manifest
@@ -82,7 +83,18 @@ def check_export_folder(artefacts: Artefacts, folder: Path) -> bool:
         raise DataError(f"{folder}: expected a new or an empty folder to export to, got one that holds something else")
     if not _holds(artefacts, folder):
         raise DataError(f"{folder}: holds the export of other data; choose a new folder, or remove this one")
+    missing = _missing_files(folder)
+    if missing:
+        raise DataError(f"{folder}: {len(missing)} files are missing, such as {missing[0]}; remove it to export anew")
     return True
+
+
+def _missing_files(folder: Path) -> list[str]:
+    """Files that the table of an exported folder names and that are not there."""
+    table = read_image_table(folder)
+    columns = {"file_name", "condition_file_name", EVENT_COLUMNS["file"]} & set(table.column_names)
+    named = dict.fromkeys(name for column in columns for name in table[column].to_pylist() if name)
+    return [name for name in named if not (folder / name).is_file()]
 
 
 def _holds(artefacts: Artefacts, folder: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,8 @@ from data_contracts.labels import Recording
 from data_contracts.manifest import LabelKinds
 from tasks.stage import Output, stage
 from tasks.workers import map_shards
+
+logger = logging.getLogger(__name__)
 
 
 def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
@@ -64,7 +67,26 @@ def ingest(out: Output, *, dataset: DatasetChoice) -> pa.Table:
     synonyms = plugin.module.read_synonyms(plugin.options) if named_further else {}
     named = [{"class_name": name, "names": list(names)} for name, names in sorted(synonyms.items())]
     out.write_table(pa.Table.from_pylist(named, tables.SYNONYMS.arrow()), tables.SYNONYMS)
-    return pa.concat_tables(rows)
+    table = pa.concat_tables(rows)
+    _warn_of_sizes(plugin, table)
+    return table
+
+
+def _warn_of_sizes(plugin: plugins.Plugin, table: pa.Table) -> None:
+    """Say where recordings whose camera can be named have sensors of several sizes: some may have been guessed."""
+    if not hasattr(plugin.options, "sensor_size") or plugin.options.sensor_size is not None:
+        return
+    counted = table.group_by(["sensor_width_px", "sensor_height_px"]).aggregate([([], "count_all")]).to_pylist()
+    if len(counted) > 1:
+        sizes = ", ".join(
+            f"{row['sensor_width_px']} x {row['sensor_height_px']} px ({row['count_all']})"
+            for row in sorted(counted, key=lambda row: (row["sensor_width_px"], row["sensor_height_px"]))
+        )
+        logger.warning(
+            "recordings are of sensors of %s, and each is drawn at its own scale. Files that do not state a size have "
+            "the smallest common one that holds their events: if one camera recorded all, set "
+            "dataset.options.sensor_size=[WIDTH,HEIGHT]", sizes,
+        )  # fmt: skip
 
 
 def _ingest_group(dataset: DatasetChoice, work: Path, numbered: tuple[int, Sequence[Recording]]) -> Path:

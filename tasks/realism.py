@@ -33,7 +33,7 @@ Frames = tuple[np.ndarray, np.ndarray]
 """Images [N, H, W, 3] uint8, and the recording [N] of each."""
 
 
-@stage(version=1, schema=tables.SCORES)
+@stage(version=2, schema=tables.SCORES)
 def event_realism(
     out: Output, recordings: Manifest, reference: Manifest | None, *, held_out: HeldOut | None
 ) -> pa.Table:
@@ -69,7 +69,7 @@ def realism_floors(out: Output, frames: Manifest) -> pa.Table:
     return two_sample.tests_table(FRAMES, tests)
 
 
-@stage(version=6, schema=tables.SCORES)
+@stage(version=7, schema=tables.SCORES)
 def realism(out: Output, frames: Manifest, generated: Manifest, floors: Manifest, *, name: str) -> pa.Table:
     """Generated frames, of the generator `name`, beside recorded training frames; `floors` are of `realism_floors`.
 

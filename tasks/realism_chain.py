@@ -111,7 +111,7 @@ def _rounding(
     return lambda made, images, seeds: np.stack(list(opened.redraw(made, images, seeds)))
 
 
-@stage(version=2, schema=tables.REALISM_CHAIN)
+@stage(version=3, schema=tables.REALISM_CHAIN)
 def chain_realism(
     out: Output, frames: Manifest, conditions: Manifest, processed: list[Manifest], *, links: list[Link], seed: int
 ) -> pa.Table:

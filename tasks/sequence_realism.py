@@ -35,7 +35,7 @@ CHANNEL_FRAMES = 64
 GROUP = "sequences"
 
 
-@stage(version=1, schema=tables.SCORES)
+@stage(version=2, schema=tables.SCORES)
 def sequence_realism(
     out: Output,
     frames: Manifest,

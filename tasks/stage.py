@@ -104,6 +104,8 @@ class Watcher(Protocol):
 @dataclasses.dataclass
 class _Plan:
     rows: list[PlannedStage] = dataclasses.field(default_factory=list)
+    digests: dict[str, str] = dataclasses.field(default_factory=dict)
+    """By key, of what is there."""
     changed: set[str] = dataclasses.field(default_factory=set)
     """Keys of what is there, but was made from inputs of other content."""
 
@@ -262,9 +264,9 @@ class Stage:
         label = f"{self.name}: {label}" if label else self.name
         plan = _plan.get()
         if plan is not None:
-            digest = self._planned(plan, store, key, arguments)
-            plan.rows.append(PlannedStage(self.name, label, key, digest is not None, materials, arguments))
-            return ManifestRef(key=key, path=store.folder(self.name, key), digest=digest or "")
+            cached = self._is_cached(plan, store, key, arguments)
+            plan.rows.append(PlannedStage(self.name, label, key, cached, materials, arguments))
+            return ManifestRef(key=key, path=store.folder(self.name, key))
         found = self.find(key, arguments) if _in_one_run.get() else None
         return found or run_as_task(self.name, label, functools.partial(self.run, key, arguments))
 
@@ -276,26 +278,27 @@ class Stage:
         store = Store()
         key, plan = self.key(arguments, store), _plan.get()
         if plan is not None:
-            return self._planned(plan, store, key, arguments) is not None
+            return self._is_cached(plan, store, key, arguments)
         return store.find(self.name, key, self._upstream(arguments)) is not None
 
     def check(self, arguments: dict[str, Any]) -> None:
         """Raise `DataError` where the settings do not go together: where a stage is planned, and where it is run."""
 
-    def _planned(self, plan: _Plan, store: Store, key: str, arguments: dict[str, Any]) -> str | None:
-        """Digest of the artefact, as far as it is known; None where it is to be made.
+    def _is_cached(self, plan: _Plan, store: Store, key: str, arguments: dict[str, Any]) -> bool:
+        """Will a run find the artefact?
 
         Digests of inputs that are to be made are not known; that they will be what they were is taken for granted,
         unless those were made from changed inputs themselves.
         """
-        upstream = self._upstream(arguments)
+        upstream = {name: plan.digests.get(name, digest) for name, digest in self._upstream(arguments).items()}
         known = upstream if all(upstream.values()) else None
         digest = store.held_digest(self.name, key, known)
         if digest is not None and plan.changed.isdisjoint(upstream):
-            return digest
+            plan.digests[key] = digest
+            return True
         if digest is not None or (known is not None and store.held_digest(self.name, key) is not None):
             plan.changed.add(key)
-        return None
+        return False
 
     def key(self, arguments: dict[str, Any], store: Store) -> str:
         """The cache key: 32 hexadecimal digits of a SHA-256."""

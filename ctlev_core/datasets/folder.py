@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -25,7 +26,7 @@ from ctlev_core.dataset_files.trees import recording_ids
 from ctlev_core.events import files as event_files
 from data_contracts.config import ADDED_LATER, RUN_SETTING, Frozen
 from data_contracts.errors import DataError
-from data_contracts.events import Events
+from data_contracts.events import Events, check_events
 from data_contracts.labels import Labels, Part, Recording
 
 VERSION = 1
@@ -57,6 +58,12 @@ class Options(Frozen):
         lt=1,
         json_schema_extra=ADDED_LATER,
         description="the same, before what is tested: to choose options by (`evaluate_on: validation`)",
+    )
+    sensor_size: tuple[int, int] | None = Field(
+        default=None,
+        json_schema_extra=ADDED_LATER,
+        description="(width, height) px of the camera of all recordings; null = as each file says, or the smallest "
+        "common size that holds its events, which may differ from file to file",
     )
 
     @model_validator(mode="after")
@@ -105,7 +112,7 @@ def read_events(recording: Recording, options: Options) -> Events:
     events = event_files.read_events_file(file)
     if len(events) == 0:
         raise DataError(f"{file}: expected a recording, got a file without events")
-    return events
+    return _on_sensor(events, file, options)
 
 
 def read_event_chunks(recording: Recording, options: Options) -> Iterator[Events]:
@@ -114,7 +121,16 @@ def read_event_chunks(recording: Recording, options: Options) -> Iterator[Events
     Raises:
         DataError: the file cannot be read.
     """
-    return event_files.read_event_chunks(recording.files[0])
+    file = recording.files[0]
+    for chunk in event_files.read_event_chunks(file):
+        yield _on_sensor(chunk, file, options)
+
+
+def _on_sensor(events: Events, file: Path, options: Options) -> Events:
+    """The events on the sensor that was named."""
+    if options.sensor_size is None:
+        return events
+    return check_events(replace(events, sensor_size=options.sensor_size), f"{file}, on the sensor_size that was set")
 
 
 def read_labels(recording: Recording, options: Options) -> Labels:

@@ -29,6 +29,8 @@ from data_contracts.labels import History, Labels
 if TYPE_CHECKING:
     import torch
 
+NEEDS_CLASSES = True
+"""It learns to tell classes apart: one alone is an error before anything runs."""
 VERSION = 1
 NAME = "classifier"
 PREDICTS = ("classes",)
@@ -219,7 +221,7 @@ def _check_training_set(frames: Images, labels: Labels, options: Options) -> tup
         raise DataError(f"{where}: row {labels.class_names.index('')} has no class name")
     classes = tuple(sorted(set(labels.class_names)))
     if len(classes) < 2:
-        raise DataError(f"{where}: needs at least two classes, got {', '.join(classes) or 'no rows'}")
+        raise DataError(f"{where}: needs at least two classes, got {f'{classes[0]!r} alone' if classes else 'no rows'}")
     if options.architecture != SMALL_CNN:
         check_batch(options.batch_size, frames.shape[1], frames.shape[2], where)
     columns = {name: column for column, name in enumerate(classes)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -87,6 +87,8 @@ def compute_joint_errors_mm(predicted: Mapping[str, Any], target: Labels, alignm
     Raises:
         ValueError: shapes differ, no joint is known, a prediction is not finite, or the joint set has no hips.
     """
+    if alignment not in get_args(Alignment):
+        raise ValueError(f"alignment must be one of {', '.join(get_args(Alignment))}, got {alignment!r}")
     if target.joints3d is None:
         raise ValueError("the target labels have no joints3d")
     points, joints = np.asarray(predicted["joints3d"], dtype=np.float64), target.joints3d.astype(np.float64)

@@ -85,7 +85,7 @@ def test_each_line_of_the_readme_runs(tmp_path, monkeypatch, random_events):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("CTLEV_HOME", raising=False)
     evt2.write(Path("recording.raw"), random_events)
-    made_run(Path(".ctlev").absolute(), "demo_objects", "stable_diffusion", BUNDLED_OBJECT_MODEL)
+    made_run(Path(".ctlev").absolute(), "demo/objects", "stable_diffusion", BUNDLED_OBJECT_MODEL)
     monkeypatch.setattr(ctlev, "EventDataset", lambda folder: [folder])
     given = {}
     exec(block, given)
@@ -152,6 +152,8 @@ def test_scores_are_those_of_the_definitions():
     errors = np.linalg.norm(moved - target, axis=-1)
     assert ctlev.mpjpe(moved, target, alignment="none") == pytest.approx(errors.mean())
     assert ctlev.mpjpe(target + 50, target) == pytest.approx(0, abs=1e-9)
+    with pytest.raises(ValueError, match="alignment must be one of none, pelvis, procrustes, got 'Procrustes'"):
+        ctlev.mpjpe(moved, target, alignment="Procrustes")
     assert ctlev.frechet(joints[:, 0], joints[:, 0]) == 0
 
 

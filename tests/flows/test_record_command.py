@@ -88,6 +88,15 @@ def test_wrong_input_is_named_and_leaves_nothing(tmp_path, capsys, changes, mess
     assert message in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
+def test_an_interrupted_run_leaves_nothing(tmp_path, capsys, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("flows.record.write_labelled", interrupt)
+    assert record_people(tmp_path / "out", 1, SMALL) == 130
+    assert "interrupted; nothing was written" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 def test_what_is_there_is_kept_unless_told(people, capsys):
     before = sorted(people.iterdir())
     assert record_people(people, 1, SMALL) == 2

@@ -211,6 +211,16 @@ def test_labels_are_carried_along(video, tmp_path):
     np.testing.assert_array_equal(events.t, plain.t)
 
 
+def test_what_is_read_is_not_written_over(tmp_path):
+    video = write_video(tmp_path / "square.avi", 3)
+    before = video.read_bytes()
+    (tmp_path / "link.avi").symlink_to(video)
+    for arguments in ((video, "--format", "evt2"), (tmp_path / "a.parquet", "--preview", tmp_path / "link.avi")):
+        status, _, errors = invoke(video, *arguments, "--overwrite")
+        assert status == 2 and "is what is read; choose another name to write to" in errors
+    assert video.read_bytes() == before and not (tmp_path / "a.parquet").exists()
+
+
 def test_a_preview_that_is_no_picture_is_refused_before_anything_is_simulated(video, tmp_path):
     status, _, errors = invoke(video, tmp_path / "a.parquet", "--preview", tmp_path / "a.xyz")
     assert status == 2 and "no picture is written with the suffix '.xyz'; take .png or .jpg" in errors

@@ -171,8 +171,11 @@ def _plugin_version(tree: ast.Module) -> int | None:
 def _stages(tree: ast.Module) -> Iterator[tuple[str, int]]:
     for node in tree.body:
         for decorator in getattr(node, "decorator_list", []):
-            if isinstance(decorator, ast.Call) and ast.unparse(decorator.func) == "stage":
-                given = {keyword.arg: keyword.value for keyword in decorator.keywords}
+            if not isinstance(decorator, ast.Call):
+                continue
+            given = {keyword.arg: keyword.value for keyword in decorator.keywords}
+            # `@stage(...)`, or `@partial(_OwnStage, ...)`.
+            if ast.unparse(decorator.func) in ("stage", "partial") and {"version", "schema"} <= given.keys():
                 yield node.name, ast.literal_eval(given["version"])  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -1,6 +1,7 @@
 """A changed helper does not leave stale results: versions were raised, or somebody said that results are the same."""
 
 import ast
+import importlib
 import json
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import import_closures
 import pytest
 
 from ctlev_core import plugins
+from tasks.stage import Stage
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,11 @@ def test_no_code_changed_without_a_word(code):
 def test_every_plugin_and_stage_is_known(code):
     found = {unit for kind in plugins.KINDS for unit in (f"{kind} {name}" for name in plugins.names(kind))}
     assert found == {unit for unit in code.versions if not unit.startswith("stage ")}
-    assert {"stage ingest", "stage encode", "stage sample", "stage report"} <= set(code.versions)
+    modules = [importlib.import_module(f"tasks.{path.stem}") for path in (import_closures.ROOT / "tasks").glob("*.py")]
+    stages = {value for module in modules for value in vars(module).values() if isinstance(value, Stage)}
+    assert {f"stage {stage.name}": stage.version for stage in stages} == {
+        unit: version for unit, version in code.versions.items() if unit.startswith("stage ")
+    }
     assert all(
         code.versions[f"{kind} {name}"] == v for kind in plugins.KINDS for name, v in plugins.versions(kind).items()
     )

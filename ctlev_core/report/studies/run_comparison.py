@@ -33,6 +33,7 @@ from ctlev_core.statistics.paired_differences import (
 )
 from data_contracts.errors import DataError
 from data_contracts.tables import TableSchema, check_table
+from data_contracts.training_sets import LabelAgreement
 
 DATA_STAGES = ("ingest", "encode", "condition_frames", "condition_samples", "sample", "simulate", "finetune")
 _ABSENT = "(none)"
@@ -130,7 +131,7 @@ def _scores_table(first: Run, second: Run) -> Table:
         rows = [of_run.get(key, []) for of_run in found]
         subject, metric = key
         row: list[Cell] = [
-            subject_name(subject),
+            subject_name(subject) if LabelAgreement.parse(subject) is None else f"labels of {subject_name(subject)}",
             metric_heading(metric),
             *map(cell_text, rows),
             "",

@@ -50,6 +50,20 @@ def test_recordings_in_a_stable_order(root):
     assert all(r.has_events for r in recordings)
 
 
+def test_all_recordings_are_of_the_sensor_that_is_named(root):
+    options = folder.Options(root=root, sensor_size=(64, 48))
+    for recording in folder.list_recordings(options):
+        assert folder.read_events(recording, options).sensor_size == (64, 48)
+        assert {chunk.sensor_size for chunk in folder.read_event_chunks(recording, options)} == {(64, 48)}
+    events = Events(np.zeros(1, np.int64), *(np.full(1, 5, np.uint16) for _ in "xy"), np.ones(1, np.uint8), (8, 6))
+    plugins.load("formats", "parquet").write(root / "car" / "b.parquet", events)
+    options = folder.Options(root=root, sensor_size=(4, 48))
+    recording = next(one for one in folder.list_recordings(options) if one.recording_id == "car/b")
+    for read in (folder.read_events, lambda *asked: list(folder.read_event_chunks(*asked))):
+        with pytest.raises(DataError, match=r"b\.parquet, on the sensor_size that was set: "):
+            read(recording, options)
+
+
 def test_split_by_time_gives_each_file_two_parts_that_meet(root):
     for recording in listed(root, test_fraction=0.25):
         assert recording.parts == (Part("train", 0.0, 0.75), Part("test", 0.75, 1.0))

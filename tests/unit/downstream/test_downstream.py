@@ -190,7 +190,7 @@ def test_bad_training_sets_are_named(tmp_path):
         pose2d.train(frames, labels, pose2d.Options(**FAST_POSE, num_steps=1, flip=True), **folders)
     with pytest.raises(DataError, match="row 1 has no class name"):
         classifier.train(frames, Labels(("a", "", "b", "a", "b", "a"), labels.t_us), classifier.Options(), **folders)
-    with pytest.raises(DataError, match="at least two classes, got a"):
+    with pytest.raises(DataError, match="at least two classes, got 'a' alone"):
         classifier.train(frames, Labels(("a",) * 6, labels.t_us), classifier.Options(), **folders)
 
 

@@ -177,6 +177,11 @@ def test_what_is_in_the_way_is_refused_and_kept(tmp_path):
     with pytest.raises(DataError, match="holds the export of other data; choose a new folder"):
         export(other, folder)
     assert contents(folder) == before
+    hidden = folder / "images" / "000"
+    hidden.rename(tmp_path / "hidden")
+    with pytest.raises(DataError, match=r"mine: 6 files are missing, such as images/000/.*; remove it to export"):
+        export(made, folder)
+    (tmp_path / "hidden").rename(hidden)
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("mine")
     with pytest.raises(DataError, match="expected a new or an empty folder to export to"):

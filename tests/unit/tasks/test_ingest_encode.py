@@ -127,6 +127,14 @@ def test_test_recordings_are_not_encoded_where_options_are_chosen(frames_of):
     np.testing.assert_array_equal(chosen.array("frames"), every.array("frames")[kept])
 
 
+def test_recordings_of_fewer_events_than_a_window_say_how_many_they_have(frames_of):
+    said = (
+        r"no window in split 'train': its recordings have \d+ events at most there, and a window takes 1,000,000; set"
+    )
+    with pytest.raises(DataError, match=said):
+        frames_of(make_dataset(), windows=Windows(num_events=1_000_000))
+
+
 def test_without_recordings_for_validation_there_are_no_frames(frames_of):
     with pytest.raises(DataError, match="no window in split 'validation'"):
         frames_of(make_dataset(), held_out="validation")

@@ -89,6 +89,8 @@ def test_a_report_differs_from_itself_in_nothing(published):
     scores, *others = compare_runs(read_run("a", published / "tiny"), read_run("b", published / "tiny"))
     assert not scores.bold and all(not table.rows for table in others)
     assert {row[-1] for row in scores.rows} == {"paired", "intervals"}
+    named = [(str(row[0]), str(row[1])) for row in scores.rows]
+    assert len(set(named)) == len(named), "what differs is not called the same"
 
 
 def test_the_four_pictures_are_of_median_activity(experiment):

@@ -1,0 +1,49 @@
+"""What is wrong with a folder of recordings is said before anything runs, or where it is read."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from data_contracts.config import DatasetChoice
+from data_contracts.errors import DataError
+from flows.command_line import load_experiment
+from flows.inputs import check_num_classes
+from tasks.ingest import ingest
+from tasks.store import Store
+
+
+def write_blob(path, left, top):
+    """Events of a blob of a few pixels, as a table without a sensor size."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    random = np.random.default_rng(0)
+    x, y = (start + random.integers(0, 8, 200) for start in (left, top))
+    rows = np.stack([np.sort(random.integers(0, 100_000, 200)), x, y, random.integers(0, 2, 200)], axis=1)
+    np.savetxt(path, rows, "%d", ",", header="t,x,y,p", comments="")
+
+
+def run_ingest(root, **options):
+    arguments = {"dataset": DatasetChoice(name="folder", options={"root": str(root), **options})}
+    return ingest.run(ingest.key(arguments, Store()), arguments)
+
+
+@pytest.mark.usefixtures("home")
+def test_sizes_that_differ_are_named_unless_the_camera_is(tmp_path, caplog):
+    write_blob(tmp_path / "own" / "near" / "a.csv", 20, 20)
+    write_blob(tmp_path / "own" / "far" / "a.csv", 500, 400)
+    with caplog.at_level(logging.WARNING):
+        run_ingest(tmp_path / "own", sensor_size=(640, 480))
+        assert not caplog.messages
+        run_ingest(tmp_path / "own")
+    (message,) = caplog.messages
+    assert "34 x 34 px (1), 640 x 480 px (1), and each is drawn at its own scale" in message
+    assert "set dataset.options.sensor_size=[WIDTH,HEIGHT]" in message
+
+
+def test_a_classifier_of_one_class_is_refused_and_a_generator_is_not(tmp_path):
+    write_blob(tmp_path / "zero" / "a.csv", 20, 20)
+    experiment = load_experiment("folder", [f"dataset.options.root={tmp_path}"])  # as all that only samples
+    with pytest.raises(DataError, match="classifier needs at least two classes, got 'zero' alone"):
+        check_num_classes(experiment)
+    write_blob(tmp_path / "one" / "a.csv", 20, 20)
+    check_num_classes(experiment)
