@@ -20,7 +20,7 @@ from data_contracts.config import (
     Windows,
 )
 from data_contracts.event_export import EventExport
-from data_contracts.labels import HeldOut
+from data_contracts.labels import SPLITS, HeldOut
 from data_contracts.training_sets import (
     LABEL_CONSISTENT,
     ORACLE,
@@ -270,11 +270,20 @@ class Experiment(Frozen):
     @classmethod
     def _names_are_free(cls, baselines: dict[str, Baseline]) -> dict[str, Baseline]:
         for name in baselines:
-            if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in SOURCES:
+            if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in (*SOURCES, *SPLITS):
                 raise ValueError(
-                    f"a baseline's name is made of a-z, 0-9 and _, and is not {' or '.join(SOURCES)}, got {name!r}"
+                    f"a baseline's name is made of a-z, 0-9 and _, and is not {' or '.join((*SOURCES, *SPLITS))}, "
+                    f"got {name!r}"
                 )
         return baselines
+
+    @field_validator("metrics", "distances", "downstream_seeds")
+    @classmethod
+    def _nothing_is_there_twice(cls, asked: tuple[Any, ...]) -> tuple[Any, ...]:
+        for number, one in enumerate(asked):
+            if one in asked[:number]:
+                raise ValueError(f"expected each once, got {getattr(one, 'name', one)!r} twice with the same options")
+        return asked
 
     @field_validator("scaling")
     @classmethod

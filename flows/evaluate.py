@@ -11,7 +11,7 @@ from typing import Any
 from ctlev_core.scoring.sensor_pixels import SensorSource, check_in_image, is_on_sensor
 from data_contracts.config import DownstreamChoice, Frozen
 from data_contracts.experiment import Experiment
-from data_contracts.manifest import ManifestRef
+from data_contracts.manifest import ManifestRef, read_manifest
 from data_contracts.training_sets import (
     HELD_OUT,
     LABEL_CONSISTENT,
@@ -31,9 +31,9 @@ from flows.settings import flow
 from flows.synthesize import synthesize
 from tasks.downstream import train_downstream
 from tasks.evaluate import score_distance, score_model
-from tasks.openings import note_opening
-from tasks.stage import call_flow, call_together, numbered
-from tasks.store import home_folder
+from tasks.openings import note_opening, test_set_digest
+from tasks.stage import call_flow, call_together, is_planning, numbered
+from tasks.store import Store, home_folder
 from tasks.subset import take_label_consistent, take_share
 
 Generated = dict[str, list[ManifestRef]]
@@ -77,8 +77,9 @@ def evaluate(
         calls.append(partial(_distances, experiment, experiment.feature_extractor, dataset, generated))
     found = call_together(*calls)
     openings = None
-    if experiment.evaluate_on == "test":
-        openings = note_opening(home_folder(), dataset.tested_frames, experiment)
+    if experiment.evaluate_on == "test" and not is_planning():
+        frames = read_manifest(Store().here(dataset.tested_frames))
+        openings = note_opening(home_folder(), test_set_digest(frames), experiment)
     return Evaluation(
         extractor=found[-1][0] if experiment.feature_extractor is not None else None,
         scores=[score for _, scores in found for score in scores],

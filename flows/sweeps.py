@@ -62,6 +62,7 @@ def find_sweeps(values: Mapping[str, Any], overrides: list[str]) -> dict[str, li
         if len(parts) > 1:
             several[name] = parts
         else:
+            several.pop(name, None)  # the last word on an option counts
             apply_override(changed, override)  # it may name the plug-in whose option has several values
     types_of = {name: _annotation(Experiment, changed, name.split(".")) for name in several}
     return {name: parts for name, parts in several.items() if _is_sweep(types_of[name], parts)}
@@ -76,7 +77,7 @@ def expand_sweeps(sweeps: Mapping[str, list[str]]) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for chosen in itertools.product(*sweeps.values()):
         pairs = list(zip(sweeps, chosen, strict=True))
-        own = "-".join(f"{option.rpartition('.')[2]}_{value}" for option, value in pairs)
+        own = "-".join(f"{_short(option)}_{value}" for option, value in pairs)
         label = re.sub(r"[^A-Za-z0-9.-]+", "_", own).strip("_")
         if label in found:
             raise PluginError(f"--set {pairs[-1][0]}: two experiments would be called {label!r}; values must differ")
@@ -84,6 +85,12 @@ def expand_sweeps(sweeps: Mapping[str, list[str]]) -> dict[str, list[str]]:
         if len(found) > MAX_EXPERIMENTS:
             raise PluginError(f"--set: {', '.join(sweeps)} give more than {MAX_EXPERIMENTS} experiments")
     return found
+
+
+def _short(option: str) -> str:
+    """`generator_num_steps` of `generator.options.num_steps`: other parts have options of the same name."""
+    first, *rest = option.split(".")
+    return f"{first}_{rest[-1]}" if rest else first
 
 
 def study_of(values: Mapping[str, Any], overrides: list[str], sweeps: Mapping[str, list[str]]) -> dict[str, Any]:
@@ -104,7 +111,7 @@ def study_of(values: Mapping[str, Any], overrides: list[str], sweeps: Mapping[st
         for change in changes:
             apply_override(experiments[label], change)
         experiments[label]["name"] = f"{name}_{label}"
-    own = re.sub(r"[^A-Za-z0-9.-]+", "_", "-".join(f"{o.rpartition('.')[2]}_{'_'.join(v)}" for o, v in sweeps.items()))
+    own = re.sub(r"[^A-Za-z0-9.-]+", "_", "-".join(f"{_short(o)}_{'_'.join(v)}" for o, v in sweeps.items()))
     return {
         "name": f"{name}_{own}"[:100].strip("_"),
         "data_notice": common.get("data_notice", ""),

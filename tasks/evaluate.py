@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -57,7 +57,7 @@ class _DistanceScores(Stage):
         check_distances(arguments["downstream"], arguments["distances"])
 
 
-@partial(_ModelScores, version=11, schema=tables.SCORES, raw_files=None, optional=("sensor",))
+@partial(_ModelScores, version=12, schema=tables.SCORES, raw_files=None, optional=("sensor",))
 def score_model(
     out: Output,
     model: Manifest,
@@ -124,6 +124,7 @@ def score_model(
             if group == "all" and isinstance(metric.module, MetricOfRows):
                 columns = {"sample_id": sample_ids, "recording_id": recordings}
                 sample_scores.append(pa.table(columns | score_each_row(metric, predicted, true, scores)))
+            _refuse_twice(metric, scores, {row["metric"] for row in found if row["group"] == group})
             found += [
                 {
                     **same,
@@ -139,6 +140,14 @@ def score_model(
     if sample_scores:
         out.write_table(pa.concat_tables(sample_scores), tables.SAMPLE_SCORES)
     return pa.Table.from_pylist(found, schema=tables.SCORES.arrow())
+
+
+def _refuse_twice(metric: plugins.Plugin, scores: Iterable[str], known: Collection[str]) -> None:
+    """Raise `DataError` where options that a score's name does not hold give two scores of one name."""
+    if twice := sorted(set(scores) & set(known)):
+        raise DataError(
+            f"{metric.kind} {metric.name!r} is asked for twice, and both give a score {twice[0]!r}: leave one out"
+        )
 
 
 def _predict_of(module: Any, data: Manifest, rows: np.ndarray) -> Any:
@@ -254,7 +263,9 @@ def score_distance(
             predicted_groups=groups[0],
             target_groups=groups[1],
         )
-        named |= {name_distance(plugin, folder, extractor.ref.digest, name): one for name, one in estimates.items()}
+        of_metric = {name_distance(plugin, folder, extractor.ref.digest, name): one for name, one in estimates.items()}
+        _refuse_twice(metric, of_metric, named.keys())
+        named |= of_metric
     out.write_table(estimates_table(subject, named), DISTANCE_ESTIMATES)
     found = [
         {

@@ -35,7 +35,7 @@ from data_contracts.study import SPEED_VS_ERROR
 from tasks.stage import Output, stage
 
 
-@stage(version=14, schema=tables.REPORT)
+@stage(version=15, schema=tables.REPORT)
 def study_report(
     out: Output,
     reports: list[Manifest],

@@ -21,7 +21,8 @@ def score_each_row(
     """What each row adds to the one of the metric's scores that is the rows' mean, and its weight in that mean.
 
     Joints count alike in a score, not frames: of a frame of which half is out of the picture there are fewer. Which of
-    several scores the rows belong to is seen from their mean.
+    several scores the rows belong to is seen from their mean; where it is not the first, and the first is a quotient of
+    sums, those of the first are taken.
     """
     values = metric.module.compute_rows(prediction, labels, metric.options)
     sums = (
@@ -37,7 +38,12 @@ def score_each_row(
             return np.inf
         return round(abs(float(np.average(values[scored], weights=of[name][scored])) - scores[name]), 9)
 
-    name = min(scores, key=distance)  # the first of those that are as near
+    name, first = min(scores, key=distance), next(iter(scores))  # of those that are as near the first
+    if name != first and first in sums:
+        # The first score is what training sets are compared by; its rows are what they add to it.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            numerators, denominators = (np.asarray(part, np.float64) for part in sums[first])
+            name, values = first, np.where(denominators > 0, numerators / denominators, np.nan)
     return {
         "metric": pa.array([name] * len(values), pa.string()),
         "value": pa.array(values, pa.float64(), from_pandas=True),

@@ -21,10 +21,11 @@ MAX_SINGLE_SUBJECTS = 10
 
 
 def class_groups(class_names: Sequence[str]) -> list[Group]:
-    """All rows, and those of each class."""
+    """All rows, and those of each class; one that is called `all` itself is `class all`."""
     names = np.array(class_names)
     classes = [name for name in dict.fromkeys(class_names) if name]
-    return [("all", np.arange(len(names))), *((name, np.flatnonzero(names == name)) for name in sorted(classes))]
+    of_class = [(f"class {name}" if name == "all" else name, np.flatnonzero(names == name)) for name in sorted(classes)]
+    return [("all", np.arange(len(names))), *of_class]
 
 
 def origin_groups(class_names: Sequence[str], real: Collection[str], sampled: Collection[str]) -> list[Group]:

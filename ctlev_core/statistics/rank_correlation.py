@@ -40,9 +40,10 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> Differe
     if norm == 0:
         return Difference(math.nan, math.nan, math.nan)
     value = float(np.clip(centred[0] @ centred[1] / norm, -1, 1))
-    if abs(value) == 1:  # whose z is infinite
-        return Difference(value, value, value)
     half = t_quantile(math.inf) * math.sqrt(1.06 / (len(x) - 3))
+    if abs(value) == 1:  # whose z is infinite: the inner end is that of the value next to it
+        inner = math.tanh(math.atanh(1 - 12 / (len(x) * (len(x) ** 2 - 1))) - half)
+        return Difference(value, *sorted((value, value * inner)))
     z = math.atanh(value)
     return Difference(value, math.tanh(z - half), math.tanh(z + half))
 

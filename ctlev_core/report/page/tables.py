@@ -155,12 +155,13 @@ def render_markdown(tables: Sequence[Table], *, title: str, lead: str = "", verd
     Args:
         tables: in reading order.
         title: heading of the document.
-        lead: what data this is about.
+        lead: what data this is about, one paragraph: what follows is the answer, and is found by that.
         verdict: the answer.
     Raises:
         ValueError: rows of a table do not fit its columns.
     """
-    parts = [f"# {_markdown_text(title)}", _markdown_text(lead), _markdown_text(verdict)]
+    notice = " ".join(lead.split()) or "The experiment says nothing of its data."
+    parts = [f"# {_markdown_text(title)}", _markdown_text(notice), _markdown_text(verdict)]
     for table in tables:
         notes = "\n".join(f"- {_markdown_text(note)}" for note in table.footnotes)
         parts += [f"## {_markdown_text(table.title)}", _markdown_text(table.caption), markdown_table(table), notes]

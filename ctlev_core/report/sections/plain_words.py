@@ -20,6 +20,12 @@ _MEANINGS = {
     "open": "This run shows neither a benefit nor a harm. More test recordings and more trainings make the interval "
     "narrower.",
 }
+_MEANINGS_INSTEAD = _MEANINGS | {
+    "good": "For this task, the synthetic frames are worth more than the recorded ones.",
+    "bad": "For this task, the synthetic frames are worth less than the recorded ones, whose place they took. Whether "
+    "they show their labels, and how far they are from recorded ones, is below.",
+}
+"""Where nothing was trained on both together."""
 
 
 def plain_words(
@@ -54,7 +60,9 @@ def plain_words(
     parts.append(("What was done", made))
     answer = verdict.answer
     if answer is not None:
-        parts += [("How sure is that?", _certainty(answer.low, answer.tone)), ("What it means", _MEANINGS[answer.tone])]
+        together = any(row["subject"] == with_recorded(SYNTHETIC) for row in trained)
+        meanings = _MEANINGS if together else _MEANINGS_INSTEAD
+        parts += [("How sure is that?", _certainty(answer.low, answer.tone)), ("What it means", meanings[answer.tone])]
     return parts
 
 

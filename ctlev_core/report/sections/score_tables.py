@@ -15,11 +15,12 @@ import pyarrow as pa
 
 from ctlev_core.report.page.display_names import metric_heading, metric_name, set_name, subject_name
 from ctlev_core.report.page.tables import Cell, Table
-from ctlev_core.report.sections.verdict import made_better
+from ctlev_core.report.sections.verdict import in_range, made_better
 from ctlev_core.scoring.score_info import find_score, lower_is_better
 from ctlev_core.scoring.subsets import DATASET
 from ctlev_core.statistics.bootstrap import score_text
 from ctlev_core.statistics.paired_differences import Difference, Trainings, paired_difference, read_trainings
+from ctlev_core.statistics.small_samples import satterthwaite, t_quantile, variance_of_mean
 from data_contracts.training_sets import (
     HELD_OUT,
     LABEL_CONSISTENT,
@@ -175,8 +176,7 @@ def baseline_tables(names: Sequence[str], metric: str, paired: PairedScores) -> 
     caption = (
         f"Differences in {metric_name(metric)} ({'lower' if lower_is_better(metric) else 'higher'} is better), sample "
         "by sample on the same held-out frames; in brackets the 95 % interval over test recordings and trainings. "
-        "Bold: the interval excludes 0. All generators were asked for the same labels; those that learn, learnt from "
-        "the same frames."
+        "Bold: the interval excludes 0."
     )
     return [Table("Beside the baselines", columns, body, caption=caption, bold=bold)]
 
@@ -335,12 +335,13 @@ def cell_text(rows: Sequence[Row]) -> str:
     """Mean over trainings with its 95 % interval; empty without rows.
 
     The interval joins that over recordings (its ends averaged over trainings, which share the test recordings) and the
-    spread of the mean over trainings, 1.96 standard errors, as independent: half widths add up in squares.
+    spread of the mean over trainings as independent: variances add up, and the quantile is that of t for the degrees of
+    freedom of their sum (Satterthwaite), of which few trainings have few.
     """
     if not rows:
         return ""
-    value, low, high = interval_over_trainings(rows)
-    return score_text(value, low, high)
+    score = in_range(Difference(*interval_over_trainings(rows)), rows[0]["metric"])
+    return score_text(score.value, score.low, score.high)
 
 
 def interval_over_trainings(rows: Sequence[Row]) -> tuple[float, float, float]:
@@ -352,5 +353,13 @@ def interval_over_trainings(rows: Sequence[Row]) -> tuple[float, float, float]:
     # An interval of a biased score need not hold its value: it then ends there.
     below = float(np.mean([max(row["value"] - row["low"], 0.0) for row in rows]))
     above = float(np.mean([max(row["high"] - row["value"], 0.0) for row in rows]))
-    spread = 1.96 * float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
-    return value, value - math.hypot(below, spread), value + math.hypot(above, spread)
+    of_trainings = variance_of_mean(values)
+    low, high = (_joined(half_width, of_trainings) for half_width in (below, above))
+    return value, value - low, value + high
+
+
+def _joined(half_width: float, of_trainings: tuple[float, float]) -> float:
+    """Half width over recordings and trainings; the former of many recordings, as its own quantile is wider for few."""
+    of_recordings = (half_width / t_quantile(math.inf)) ** 2, math.inf
+    quantile = t_quantile(satterthwaite([of_recordings, of_trainings]))
+    return quantile * math.sqrt(of_recordings[0] + of_trainings[0])

@@ -9,11 +9,12 @@ from ctlev_core.report.page.display_names import metric_name, set_name
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.score_tables import interval_over_trainings
 from data_contracts.manifest import Manifest
-from data_contracts.training_sets import RECORDED, LabelAgreement, TrainingSet
+from data_contracts.training_sets import RECORDED, SYNTHETIC, LabelAgreement, TrainingSet
 
 FEWEST_AMOUNTS = 2
 """Amounts of training that are worth a line."""
 PRE_TRAINED, RANDOM = "pre-trained weights", "random weights"
+_VARIED = ("num_steps", "random_init")
 _CAPTION = (
     "Each point is a fine-tuning of its own with so many steps; bars are 95 % intervals, over fine-tunings too where "
     "there are several. Both start from the same data; only the weights before the first step differ."
@@ -28,13 +29,16 @@ def base_model_figures(
 
     Args:
         rows: of the table `scores`.
-        options: of each generator that learnt, by its name: `num_steps`, and `random_init` where it has a base model.
+        options: all of each generator that learnt, by its name, with `random_init` where it has a base model. Those
+            that differ from the experiment's own in anything but this and `num_steps` are left out.
         metric: of the labels.
     """
     found: dict[str, dict[int, str]] = {PRE_TRAINED: {}, RANDOM: {}}
+    own = options.get(SYNTHETIC, {})
     for name, chosen in options.items():
-        if "random_init" in chosen:
-            found[RANDOM if chosen["random_init"] else PRE_TRAINED][chosen["num_steps"]] = name
+        alike = {one: value for one, value in chosen.items() if one not in _VARIED}
+        if "random_init" in chosen and alike == {one: value for one, value in own.items() if one not in _VARIED}:
+            found[RANDOM if chosen["random_init"] else PRE_TRAINED].setdefault(chosen["num_steps"], name)
     if min(map(len, found.values())) < FEWEST_AMOUNTS:
         return []
     distance = next(

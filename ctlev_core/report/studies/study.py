@@ -102,8 +102,8 @@ def study_plain(parts: Sequence[Part]) -> list[tuple[str, str]]:
             "What was done",
             "An event camera reports, pixel by pixel, when it gets brighter or darker. In each experiment a generator "
             "learnt from recorded event images and what is known of them, and made synthetic ones for other labels. In "
-            f"{compared} of {len(parts)} experiments models were then trained on recorded images, on synthetic ones "
-            "and on both, and tested on recorded images that nothing was trained on.",
+            f"{compared} of {len(parts)} experiments models were then trained on recorded images and with synthetic "
+            "ones, and tested on recorded images that nothing was trained on.",
         ),
         (
             "How sure is it?",

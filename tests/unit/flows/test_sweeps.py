@@ -37,7 +37,20 @@ def test_all_combinations_are_experiments_of_one_study():
     expected = {(n, s, d) for n in (9, 12) for s in ("ddim", "unipc") for d in ((0,), (0, 1))}
     assert len(study.experiments) == 8 and found == expected
     assert {one.seed for one in study.experiments.values()} == {3}
-    assert "num_synthetic_9-scheduler_ddim-downstream_seeds_0" in study.experiments
+    assert "num_synthetic_9-sampling_scheduler_ddim-downstream_seeds_0" in study.experiments
+
+
+def test_options_of_other_parts_have_other_names():
+    names = {
+        load_study("smoke", [f"{part}.options.num_steps=6,7"]).name
+        for part in ("generator", "downstream", "feature_extractor")
+    }
+    assert names == {f"smoke_{part}_num_steps_6_7" for part in ("generator", "downstream", "feature_extractor")}
+
+
+def test_the_last_word_on_an_option_counts():
+    assert load_study("smoke", ["seed=1,2", "seed=5"]).seed == 5
+    assert len(load_study("smoke", ["seed=5", "seed=1,2"]).experiments) == 2
 
 
 @pytest.mark.parametrize(

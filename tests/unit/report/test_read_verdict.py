@@ -51,12 +51,13 @@ def test_of_a_study_it_is_the_sentence_of_each_group(tmp_path):
     assert read_verdict(tmp_path).startswith("By 95 % intervals") and "More" not in read_verdict(tmp_path)
 
 
-def test_of_several_experiments_each_has_its_heading(tmp_path):
+@pytest.mark.parametrize("lead", ["Data.", "", "Data: mine.\n\nOf two paragraphs."])
+def test_of_several_experiments_each_has_its_heading(tmp_path, lead):
     words = "\n\n".join(
         f"2D pose ({name}): Less is better. Adding synthetic frames to the recorded ones {what}. More."
         for name, what in (("few 9", "helped: a difference of -0.5"), ("few 12", "changed nothing"))
     )
-    (tmp_path / "tables.md").write_text(render_markdown([], title="few", lead="Data.", verdict=words))
+    (tmp_path / "tables.md").write_text(render_markdown([], title="few", lead=lead, verdict=words))
     assert read_verdict(tmp_path).splitlines() == [
         "2D pose (few 9): Adding synthetic frames to the recorded ones helped: a difference of -0.5.",
         "2D pose (few 12): Adding synthetic frames to the recorded ones changed nothing.",

@@ -3,6 +3,7 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+from scipy import stats
 
 from ctlev_core.provenance.scores import paired_samples
 from ctlev_core.report.page.html import Curves
@@ -151,8 +152,15 @@ def test_subjects_have_a_table_of_their_own():
 def test_intervals_join_recordings_and_trainings():
     rows = [row("a", value, seed=seed, low=value - 0.3, high=value + 0.4) for seed, value in enumerate((5.0, 5.2, 5.4))]
     value, low, high = interval_over_trainings(rows)
-    spread = 1.96 * 0.2 / np.sqrt(3)
-    assert (value, low, high) == pytest.approx((5.2, 5.2 - np.hypot(0.3, spread), 5.2 + np.hypot(0.4, spread)))
+    # Satterthwaite: recordings, with the normal quantile in their half width, and three trainings of deviation 0.2.
+    for end, half in ((5.2 - low, 0.3), (high - 5.2, 0.4)):
+        of_recordings, of_trainings = (half / stats.norm.ppf(0.975)) ** 2, 0.2**2 / 3
+        freedom = (of_recordings + of_trainings) ** 2 / (of_trainings**2 / 2)
+        expected = stats.t.ppf(0.975, freedom) * np.sqrt(of_recordings + of_trainings)
+        assert end == pytest.approx(expected, rel=1e-9)
+    assert value == pytest.approx(5.2)
+    equal = [row("a", 5.0, seed=seed, low=4.7, high=5.4) for seed in range(3)]
+    assert interval_over_trainings(equal) == pytest.approx((5.0, 4.7, 5.4))
     assert cell_text(rows[:1]) == "5.000 [4.700, 5.400]"
     assert cell_text([row("a", 5.0)]) == "5.000" and cell_text([]) == ""
 

@@ -24,6 +24,7 @@ def rows_of(groups):
 
 def test_all_rows_and_each_class():
     assert rows_of(class_groups(["walk", "", "run", "walk"])) == {"all": [0, 1, 2, 3], "run": [2], "walk": [0, 3]}
+    assert rows_of(class_groups(["all", "cat"])) == {"all": [0, 1], "class all": [0], "cat": [1]}
 
 
 def test_subjects_apart_where_both_kinds_occur():

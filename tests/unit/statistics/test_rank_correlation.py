@@ -30,6 +30,13 @@ def test_the_same_order_is_one_and_equal_numbers_say_nothing():
     assert np.isnan(rank_correlation([1.0] * 6, range(6)).value)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_same_order_of_few_things_is_not_certain(sign):
+    few, many = (rank_correlation(range(count), sign * np.arange(count)) for count in (6, 40))
+    ends = [(sign * found.low, sign * found.high)[::sign] for found in (few, many)]
+    assert ends[0][1] == ends[1][1] == 1 and 0.5 < ends[0][0] < 0.8 < 0.9 < ends[1][0] < 1
+
+
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.8])
 def test_intervals_cover_the_rank_correlation_of_many(correlation):
     random = np.random.default_rng(1)

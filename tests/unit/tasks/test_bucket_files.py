@@ -2,7 +2,6 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import bucket_server
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from data_contracts.errors import DataError
 from data_contracts.experiment import Experiment
 from data_contracts.home_folder import home_folder
-from data_contracts.manifest import ManifestRef
 from data_contracts.published import StoredArtefact, Version, published_folder, read_latest, read_versions
 from data_contracts.regeneration import Gates
 from flows.command_line import PRESETS, load_preset
@@ -119,14 +117,14 @@ def experiments():
 
 
 def test_openings_of_machines_side_by_side_are_all_counted(machine, bucket, experiments):
-    frames, homes = ManifestRef(key="k", path=Path(), digest="d"), [machine("a"), machine("b")]
+    homes = [machine("a"), machine("b")]
     asked = [experiments(seed) for seed in range(6)]
     with ThreadPoolExecutor(6) as threads:
-        list(threads.map(lambda number: note_opening(homes[number % 2], frames, asked[number % 6]), range(12)))
-    assert note_opening(homes[0], frames, asked[0]) == 6
+        list(threads.map(lambda number: note_opening(homes[number % 2], "d", asked[number % 6]), range(12)))
+    assert note_opening(homes[0], "d", asked[0]) == 6
     ledger = [json.loads(text) for name, text in bucket_server.objects(bucket.url).items() if "test_sets/d/" in name]
     assert len({line["options"] for line in ledger}) == len(ledger) == 6
-    assert note_opening(homes[0], frames.model_copy(update={"digest": "e"}), asked[0]) == 1
+    assert note_opening(homes[0], "e", asked[0]) == 1
 
 
 def version(number):
