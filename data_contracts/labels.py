@@ -74,10 +74,12 @@ class ImageTrack:
         images: [N, H, W] uint8, grey.
         t_us: [N] int64, microseconds on the clock of events and labels; of an exposure the middle, of an event image
             the end of its window.
+        window_us: how long the window of an event image is; 0 = not known.
     """
 
     images: np.ndarray
     t_us: np.ndarray
+    window_us: int = 0
 
     def __len__(self) -> int:
         return len(self.t_us)

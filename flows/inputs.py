@@ -181,13 +181,26 @@ def _check_classes(experiment: Experiment) -> None:
             plugin.module.check_classes(names, plugin.options)
 
 
+def _check_labels_kept(experiment: Experiment) -> None:
+    """Raise `DataError` where frames would be made that show the class they are asked for, and none of its joints."""
+    predicts = set(plugins.load("downstream", experiment.downstream.name).PREDICTS) - {"classes"}
+    makers = {"generator": experiment.generator}
+    makers |= {f"baselines.{name}": baseline.generator for name, baseline in experiment.baselines.items()}
+    for where, choice in makers.items():
+        if predicts and getattr(plugins.load("generators", choice.name), "KEEPS_CLASSES_ALONE", False):
+            raise DataError(
+                f"{where}: {choice.name!r} makes frames of a class, whose {', '.join(sorted(predicts))} are those of "
+                f"another frame; it is for models of classes, not for {experiment.downstream.name!r}"
+            )
+
+
 def check_num_classes(experiment: Experiment) -> None:
     """Raise `DataError` where a classifier would have a single class to learn, as far as recordings name classes.
 
     Generators learn from one class as well, so that it is not asked of what is only sampled.
     """
     for choice in (experiment.downstream, experiment.feature_extractor):
-        if choice is None or not getattr(plugins.load("downstream", choice.name), "NEEDS_CLASSES", False):
+        if choice is None or "classes" not in plugins.load("downstream", choice.name).PREDICTS:
             continue
         dataset = plugins.load_options(experiment.dataset)
         recordings = dataset.module.list_recordings(dataset.options)
@@ -238,4 +251,4 @@ def _has_intensity(dataset: DatasetChoice) -> bool:
     return any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options))
 
 
-CHECKS = (_check_intensity, _check_labels, _check_counts, _check_classes, _check_base_models)
+CHECKS = (_check_intensity, _check_labels, _check_counts, _check_classes, _check_labels_kept, _check_base_models)

@@ -17,7 +17,7 @@ from data_contracts.manifest import Manifest, conditions_of, history_table, matc
 from tasks.stage import Output, stage
 
 
-@stage(version=1, schema=tables.TRAINING)
+@stage(version=2, schema=tables.TRAINING)
 def train_pixel_decoder(
     out: Output,
     checkpoint: Manifest,

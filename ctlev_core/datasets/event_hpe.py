@@ -184,7 +184,8 @@ def read_event_images(recording: Recording, options: Options) -> ImageTrack:
     if not images:
         raise DataError(f"Event-HPE {recording.recording_id}: no event image n with a pose n + 1")
     ends = (np.array(list(images), np.int64) + 1) * options.frame_period_us
-    return ImageTrack(files.read_event_images(list(images.values()), options.image_size), ends)
+    pictures = files.read_event_images(list(images.values()), options.image_size)
+    return ImageTrack(pictures, ends, options.frame_period_us)
 
 
 def read_intensity_frames(recording: Recording, options: Options) -> ImageTrack:

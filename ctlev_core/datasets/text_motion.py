@@ -33,7 +33,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import Labels, Part, Recording
 
-VERSION = 1
+VERSION = 2
 
 EXAMPLES = (
     "a person walks, then jumps twice",

@@ -29,8 +29,6 @@ from data_contracts.labels import History, Labels
 if TYPE_CHECKING:
     import torch
 
-NEEDS_CLASSES = True
-"""It learns to tell classes apart: one alone is an error before anything runs."""
 VERSION = 1
 NAME = "classifier"
 PREDICTS = ("classes",)

@@ -22,6 +22,8 @@ from data_contracts.errors import DataError
 from data_contracts.image_rows import Images, image_chunks
 from data_contracts.labels import Conditions, History
 
+KEEPS_CLASSES_ALONE = True
+"""Its frames are of the class that is asked for, and of no other label."""
 VERSION = 2
 FRAMES_NAME, CLASSES_NAME = f"frames{SUFFIX}", "classes.json"
 

@@ -132,12 +132,15 @@ def read_motions(rows: LabelledRows, recordings: Manifest, frames: Manifest, enc
     where = f"{rows.recordings.ref.path}: condition of body motions"
     tracks = by_recording(rows.recordings.attached(tables.LABELS))
     found: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+    moments_us = rows.labelled.t_us.copy()
     for name, members in _by_name(rows.recording_ids).items():
         track = labels_of(tracks[name])
         for row in members.tolist():
-            moment_us = int(rows.labelled.t_us[row])
-            found[row] = label_windows.motion_around(track, moment_us, reach_us, f"{where}, {name}")
-    motions = label_windows.body_motions([found[row] for row in range(len(found))], rows.labelled, rows.labels, where)
+            # A window may end a little after the last label, which is then the nearest.
+            moments_us[row] = np.clip(moments_us[row], track.t_us[0], track.t_us[-1])
+            found[row] = label_windows.motion_around(track, int(moments_us[row]), reach_us, f"{where}, {name}")
+    labelled = replace(rows.labelled, t_us=moments_us)
+    motions = label_windows.body_motions([found[row] for row in range(len(found))], labelled, rows.labels, where)
     # Simulated events are encoded as the real ones are, so they come from a sensor of the real one's size.
     plugin, size = plugins.load_options(encoding), sensor_size_of(recordings)
     scale, offset = scale_and_offset(lambda points: plugin.module.map_points(points, size, plugin.options))

@@ -72,7 +72,7 @@ def make_pairs(
                             bar.update(len(made))
                 unfinished.replace(path)
             images.append(np.load(path, mmap_mode="r", allow_pickle=False))
-    return TrainingPairs(values, images, conditions.images, places)
+    return TrainingPairs(values, images, conditions.images, places, conditions.made_by)
 
 
 def level_planes(frames: Images, work: Path) -> np.ndarray:

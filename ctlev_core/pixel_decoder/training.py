@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ctlev_core import plugins
 from ctlev_core.cpu_precision import computed_in
 from ctlev_core.diffusion.pretrained.loading import choose_device
 from ctlev_core.diffusion.training.loop import sample_rows
@@ -27,7 +28,9 @@ from ctlev_core.pixel_decoder.drawing import as_input, condition_planes, image_p
 from ctlev_core.pixel_decoder.network import TRAINED_NOISE, TRAINED_SPREAD, PixelNetwork
 from ctlev_core.pixel_decoder.options import PixelDecoderOptions
 from ctlev_core.pixel_decoder.value_classes import ValueClasses, fit_classes
+from ctlev_core.plugin_contracts import ConditionThatTurns
 from ctlev_core.progress import ProgressBar
+from data_contracts.config import ConditionChoice
 from data_contracts.errors import TrainingError
 from data_contracts.image_rows import Images, as_image_rows
 from data_contracts.labels import History
@@ -78,18 +81,27 @@ class TrainingPairs:
         images: one or more [N, H, W, 3] uint8, such as of several noise levels.
         conditions: [N, H, W, 3] uint8, or None.
         places: where values of frames lie, of a decoder that sees the frame before; None = values are [N, P, H, W].
+        made_by: the plug-in of the conditions, where known: colours that are directions turn with the image, and are
+            not mirrored.
     Raises:
         ValueError: numbers or sizes differ.
     """
 
     def __init__(
-        self, values: Images, images: Sequence[Images], conditions: Images | None, places: Places | None = None
+        self,
+        values: Images,
+        images: Sequence[Images],
+        conditions: Images | None,
+        places: Places | None = None,
+        made_by: ConditionChoice | None = None,
     ) -> None:
         shape = (len(values) if places is None else len(places.own), *values.shape[2:], 3)
         given = [*images, *([] if conditions is None else [conditions])]
         if not images or not len(values) or any(tuple(each.shape) != shape for each in given):
             raise ValueError(f"expected images and conditions of shape {shape}, got {[each.shape for each in given]}")
         self.values, self.images, self.conditions, self.places = values, images, conditions, places
+        plugin = None if made_by is None or conditions is None else plugins.load_options(made_by)
+        self._turning = plugin if plugin is not None and isinstance(plugin.module, ConditionThatTurns) else None
 
     def __len__(self) -> int:
         return len(self.images[0])
@@ -100,6 +112,8 @@ class TrainingPairs:
         told = [as_image_rows(array).digest() for array in arrays]
         if self.places is not None:
             told.append(hashlib.sha256(np.stack(self.places).astype(np.int64).tobytes()).hexdigest())
+        if self._turning is not None:
+            told.append(self._turning.name)
         return " ".join(told)
 
     def crops(self, rows: np.ndarray, crop_px: int, num_planes: int, rng: np.random.Generator) -> Crops:
@@ -109,7 +123,7 @@ class TrainingPairs:
         side = min(crop_px, height, width) // 2 * 2
         for row in rows.tolist():
             top, left = (int(rng.integers(0, length - side + 1)) for length in (height, width))
-            turns, mirrored = int(rng.integers(4)), bool(rng.integers(2))
+            turns, mirrored = int(rng.integers(4)), bool(rng.integers(2)) and self._turning is None
             chosen = self.images[int(rng.integers(len(self.images)))]
             window = (slice(None), slice(top, top + side), slice(left, left + side))
 
@@ -124,7 +138,13 @@ class TrainingPairs:
             values.append(values_of(row if self.places is None else int(self.places.own[row])))
             images.append(moved(image_planes(np.asarray(chosen[one]), num_planes)))
             if self.conditions is not None:
-                conditions.append(moved(condition_planes(np.asarray(self.conditions[one]))))
+                shown = np.asarray(self.conditions[one])
+                if self._turning is None:
+                    conditions.append(moved(condition_planes(shown)))
+                else:
+                    part = shown[:, window[1], window[2]]
+                    turned = self._turning.module.turn(part, np.array([turns]), self._turning.options)
+                    conditions.append(condition_planes(turned)[0])
             if self.places is not None:
                 before = int(self.places.previous[row])
                 hidden = before < 0 or rng.random() < HIDDEN_PREVIOUS

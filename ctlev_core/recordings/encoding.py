@@ -170,7 +170,8 @@ def _encode_images(source: RecordingSource, file: Path, plugin: Plugin, windows:
         )
     if len(source.parts) != 1:
         raise DataError(f"{name}: finished event images cannot be split in time")
-    images, t_us = load_array(file), np.asarray(load_array(Path(times_file(str(file)))))
+    images, times_us = load_array(file), np.atleast_2d(load_array(Path(times_file(str(file)))))
+    starts_us, t_us = times_us[0], times_us[-1]
     known = np.arange(len(images))
     if windows.labels == "interpolated":
         known = np.flatnonzero(is_between_labels(source.track, t_us))
@@ -185,7 +186,7 @@ def _encode_images(source: RecordingSource, file: Path, plugin: Plugin, windows:
         labels = _to_image(_label(source.track, times, times, windows), source.sensor_size, plugin, image_size)
         numbers = np.arange(first, first + len(rows))
         none, split = np.zeros(len(times), np.int64), source.parts[0].split
-        yield EncodedWindows(split, numbers, times, times, none, grey.astype(np.uint16), frames, labels)
+        yield EncodedWindows(split, numbers, starts_us[rows], times, none, grey.astype(np.uint16), frames, labels)
 
 
 def _is_labelled(track: Labels, t_start: np.ndarray, t_end: np.ndarray, windows: Windows) -> np.ndarray:

@@ -183,7 +183,10 @@ def _ingest_images(plugin: Plugin, recording: Recording, folder: Path, kind: str
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     save_compressed(path, track.images)
-    np.save(folder / times_file(name), track.t_us, allow_pickle=False)
+    times_us = track.t_us
+    if track.window_us:  # first and last microsecond of each window
+        times_us = np.stack([np.maximum(track.t_us - track.window_us + 1, 0), track.t_us])
+    np.save(folder / times_file(name), times_us, allow_pickle=False)
     if kind == "intensity":
         return {"intensity_file": name}
     _, height, width = track.images.shape

@@ -128,8 +128,14 @@ def check_distances(extractor: DownstreamChoice, distances: Sequence[MetricChoic
         PluginError: the extractor has no features, or a metric does not compare features.
         DataError: a file that a metric reads is missing.
     """
-    if not isinstance(plugins.load_options(extractor).module, FeatureExtractor):
+    plugin = plugins.load_options(extractor)
+    if not isinstance(plugin.module, FeatureExtractor):
         raise PluginError(f"feature_extractor: expected a model with features, got {extractor.name!r}, which has none")
+    if getattr(plugin.options, "binary", None) is not None:
+        raise PluginError(
+            f"feature_extractor: {extractor.name!r} with the option binary is a classifier for each class, which have "
+            "no features in common; leave binary out"
+        )
     for choice in distances:
         metric = plugins.load_options(choice)
         needed = metric.module.INPUT

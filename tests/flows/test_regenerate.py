@@ -161,7 +161,7 @@ def test_statistics_of_the_frames_can_be_gates(home, make_version):
     assert all(check.passed for check in checks)
     assert "realism" in {artefact.stage for artefact in version.scored_in}
     assert version.scores["synthetic against recorded, frames: active_pixel_share"] == checks[0].value
-    with pytest.raises(DataError, match="max_c2st: needs 40 frames"):
+    with pytest.raises(DataError, match="max_c2st: needs num_synthetic of 40 or more, got 3"):
         make_version(home, "gates.max_c2st=0.9")
 
 

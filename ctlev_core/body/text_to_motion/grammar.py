@@ -144,7 +144,11 @@ def _in_time(clauses: list[tuple[str, Clause]]) -> list[Action]:
 
 
 def _merge(clause: Clause, more: Clause) -> Clause:
-    clause.values.update(more.values)
+    for name, value in more.values.items():
+        if name in ("speed", "amplitude"):  # factors, of verbs as well
+            clause.values[name] = clause.values.get(name, 1.0) * value
+        elif clause.values.setdefault(name, value) != value:
+            raise DataError(f"{clause.verb!r} has two values of {name.removesuffix('_s')}; expected one")
     clause.limbs |= more.limbs
     clause.limb_kind = clause.limb_kind or more.limb_kind
     clause.directions |= more.directions
@@ -152,14 +156,24 @@ def _merge(clause: Clause, more: Clause) -> Clause:
     return clause
 
 
-def _action(clause: Clause) -> Action:
-    """The action of a clause, its details checked."""
-    word, verb = clause.word, clause.verb
-    assert word is not None  # `_join` keeps clauses with a verb alone
+def _check_limbs(clause: Clause, word: MotionWord) -> None:
+    verb = clause.verb
     if word.motion == "raise_arm" and clause.limb_kind != "arm":
         raise DataError(f"{verb!r} needs an arm, a hand, or both")
     if clause.limb_kind and clause.limb_kind != word.limb:
         raise DataError(f"{verb!r} does not know what to do with {clause.limb_kind}s")
+    if len(clause.limbs) > 1 or "both" in clause.limbs:
+        if word.keys_side and word.motion != "raise_arm":
+            raise DataError(f"{verb!r} is done with one {word.limb}; say left, right, or neither")
+    elif clause.limbs and word.motion == "punch":
+        raise DataError(f"{verb!r} is done with both arms in turn; say neither left nor right")
+
+
+def _action(clause: Clause) -> Action:
+    """The action of a clause, its details checked."""
+    word, verb = clause.word, clause.verb
+    assert word is not None  # `_join` keeps clauses with a verb alone
+    _check_limbs(clause, word)
     wrong = sorted(clause.directions - set(word.directions))
     if wrong:
         raise DataError(f"{verb!r} cannot go {wrong[0]!r}; possible: {', '.join(word.directions) or 'no direction'}")

@@ -141,6 +141,11 @@ def test_details_go_to_their_action():
         ("raises", "needs an arm"),
         ("\N{GREEK SMALL LETTER ALPHA} walks", "is neither a word nor a number"),
         ("kicks 80 times, then kicks 80 times", "more than the limit of 120 s"),
+        ("waves with both hands", "'wave' is done with one arm; say left, right, or neither"),
+        ("waves his hands", "'wave' is done with one arm"),
+        ("kicks with both legs", "'kick' is done with one leg"),
+        ("punches once with the left hand", "'punch' is done with both arms in turn"),
+        ("jumps once, then three times", "'jump' has two values of count"),
     ],
 )  # fmt: skip
 def test_what_is_not_understood_is_named_and_never_passed_over(sentence, message):

@@ -10,6 +10,7 @@ from ctlev_core.pixel_decoder.files import load_decoder, save_decoder
 from ctlev_core.pixel_decoder.options import PixelDecoderOptions
 from ctlev_core.pixel_decoder.pairs import level_planes
 from ctlev_core.pixel_decoder.training import TrainingPairs, train_pixel_decoder
+from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError
 
 SMALL = PixelDecoderOptions(
@@ -73,6 +74,27 @@ def test_counts_images_and_conditions_are_cut_and_turned_together(num_planes):
     np.testing.assert_allclose(255 - conditions.numpy()[:, [0, 2][:num_planes]] * 255, found, atol=1e-3)
     moved = pairs.crops(np.arange(6), 12, num_planes, np.random.default_rng(1))[0]
     assert (moved != found).any()
+
+
+def test_conditions_whose_colours_are_directions_turn_with_the_picture():
+    """A surface that moves to the right, over a ramp that gets brighter to the right: in a crop both still agree."""
+    side, flow_x, flow_y = 16, 1, 2
+    conditions = np.full((1, side, side, 3), (255, 255, 128), np.uint8)
+    frames = np.repeat((16 * np.arange(side, dtype=np.uint8))[None, None, :, None], side, axis=1).repeat(3, axis=3)
+    values = frames[..., :1].transpose(0, 3, 1, 2)
+    directions = set()
+    for known in (True, False):
+        made_by = ConditionChoice(name="moving_body") if known else None
+        pairs, agreed = TrainingPairs(values, [frames], conditions, made_by=made_by), []
+        for seed in range(24):
+            crop = pairs.crops(np.array([0]), side, 1, np.random.default_rng(seed))
+            ramp = crop.values[0, 0].astype(int)
+            right, down = np.sign(ramp[0, -1] - ramp[0, 0]), np.sign(ramp[-1, 0] - ramp[0, 0])
+            told = np.rint(255 * crop.conditions[0, [flow_x, flow_y], 0, 0].numpy()) - 128
+            agreed.append(tuple(np.sign(told * (np.abs(told) > 1))) == (right, down))
+            directions.add((right, down))
+        assert all(agreed) == known, "a picture turns as a picture"
+    assert directions == {(1, 0), (-1, 0), (0, 1), (0, -1)}
 
 
 def test_pairs_of_different_sizes_are_refused():
