@@ -170,6 +170,22 @@ def _check_intensity(experiment: Experiment) -> None:
                     )
 
 
+def _check_displacements(experiment: Experiment) -> None:
+    """Raise `PluginError` where it cannot be told where joints come from and go to: that is told by labels in 2D."""
+    for name, (condition, poses) in _conditions(experiment).items():
+        if plugins.load("conditions", condition.name).NEEDS != "displacement":
+            continue
+        if experiment.view == "new":
+            raise PluginError(
+                f"{name}: {condition.name!r} shows the motion that the labelled view sees, not view 'new'"
+            )
+        if poses is not None:
+            plugin = plugins.load_options(poses)
+            first = plugin.module.list_recordings(plugin.options)[0]
+            if plugin.module.read_labels(first, plugin.options).joints2d is None:
+                raise PluginError(f"{name}: {condition.name!r} needs joints2d, and dataset {poses.name!r} has none")
+
+
 def _check_classes(experiment: Experiment) -> None:
     """Raise `DataError` where a condition has nothing to show of a class that is to be sampled."""
     for condition, poses in _conditions(experiment).values():
@@ -251,4 +267,12 @@ def _has_intensity(dataset: DatasetChoice) -> bool:
     return any(recording.has_intensity for recording in plugin.module.list_recordings(plugin.options))
 
 
-CHECKS = (_check_intensity, _check_labels, _check_counts, _check_classes, _check_labels_kept, _check_base_models)
+CHECKS = (
+    _check_intensity,
+    _check_displacements,
+    _check_labels,
+    _check_counts,
+    _check_classes,
+    _check_labels_kept,
+    _check_base_models,
+)
