@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Collection, Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -59,6 +60,7 @@ def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Stu
         apply_override(values, override)
     parts, paths, groups, changes = _read_study(values, where)
     parts = _repeat(parts, where)
+    _check_changes(changes, parts, where)
     if swept := next((override for override in overrides if looks_like_sweep(override.partition("=")[2])), None):
         raise PluginError(f"--set {swept}: {where} is a study; several values are for presets of one experiment")
     given, others = _split(overrides, "paths.")
@@ -78,8 +80,7 @@ def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Stu
     values["experiments"] = {
         name: _part(deepcopy(part), paths, groups, f"{where}, experiments.{name}") for name, part in parts.items()
     }
-    for change in changes:
-        apply_override(values, change)
+    _change(values, changes, left_out)
     for override in others:
         if name := next((name for name in left_out if override.startswith(f"experiments.{name}.")), None):
             raise PluginError(f"--set {override}: {left_out[name]}")
@@ -111,13 +112,25 @@ def _read_study(
         )
     if not _are_texts(changes):
         raise PluginError(f"{where}: set must be a list of texts key=value, got {shortened(repr(changes), 200)}")
+    return parts, paths, groups, changes
+
+
+def _check_changes(changes: list[str], parts: Mapping[str, Any], where: str) -> None:
     starts = tuple(f"experiments.{name}." for name in ("*", *parts))
     if unknown := [change for change in changes if not change.startswith(starts)]:
         raise PluginError(
             f"{where}: set changes options of its experiments, as experiments.NAME.key=value with one of "
             f"{', '.join(parts)} or *; got {shortened(repr(unknown[0]), 200)}"
         )
-    return parts, paths, groups, changes
+
+
+def _change(values: dict[str, Any], changes: list[str], left_out: Collection[str]) -> None:
+    """Apply the changes of a preset in place, but those of what is left out, which is not pooled either."""
+    for change in changes:
+        if not change.startswith(tuple(f"experiments.{name}." for name in left_out)):
+            apply_override(values, change)
+    if left_out and isinstance(values.get("pooled"), dict):
+        values["pooled"] = {group: [n for n in names if n not in left_out] for group, names in values["pooled"].items()}
 
 
 def _split(overrides: list[str], start: str) -> tuple[list[str], list[str]]:

@@ -43,6 +43,40 @@ def test_other_changes_are_refused(tmp_path, changes):
         study(tmp_path, changes)
 
 
+LEFT_OUT = """
+name: mine
+paths: {extra: null}
+experiments:
+  one: {extends: smoke, name: one}
+  other: {extends: smoke, name: other, only_with: [extra]}
+  third: {extends: smoke, name: third}
+set: [experiments.other.num_synthetic=4, experiments.one.num_synthetic=5]
+pooled: {group: [one, other, third]}
+"""
+REPEATED = """
+name: mine
+experiments:
+  studio_{n}: {extends: smoke, name: "studio_{n}", for: {n: [1, 2]}}
+set: ["experiments.studio_1.num_synthetic=4"]
+"""
+
+
+def test_what_is_left_out_is_neither_changed_nor_pooled(tmp_path):
+    (tmp_path / "mine.yaml").write_text(LEFT_OUT)
+    found = load_study(str(tmp_path / "mine.yaml"), [])
+    assert list(found.experiments) == ["one", "third"] and found.pooled == {"group": ("one", "third")}
+    assert found.experiments["one"].num_synthetic == 5 and "other" in found.data_notice
+
+
+def test_a_change_names_an_experiment_as_it_is_called_in_the_end(tmp_path):
+    (tmp_path / "mine.yaml").write_text(REPEATED)
+    found = load_study(str(tmp_path / "mine.yaml"), []).experiments
+    assert [one.num_synthetic for one in found.values()] == [4, 8]
+    (tmp_path / "mine.yaml").write_text(REPEATED.replace("studio_1.num", "studio_{n}.num"))
+    with pytest.raises(PluginError, match=r"with one of studio_1, studio_2 or \*"):
+        load_study(str(tmp_path / "mine.yaml"), [])
+
+
 def test_a_study_extends_another(tmp_path):
     study(tmp_path, "[experiments.*.seed=4]")
     path = tmp_path / "more.yaml"
