@@ -33,7 +33,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events
 from data_contracts.labels import Labels, Part, Recording
 
-VERSION = 2
+VERSION = 3
 
 EXAMPLES = (
     "a person walks, then jumps twice",

@@ -279,7 +279,9 @@ def _repeat(action: Action, rng: np.random.Generator) -> list[Segment]:
     # Half a cartwheel is no cartwheel: what carries the body has its own measure.
     segment = Segment(word.motion, cycle_s, 0, 1, amplitude, mirrored, jump_scale=scale, jump_speed_m_s=speed)
     if motion.cyclic:
-        return [replace(segment, duration_s=count * cycle_s, end=count)]
+        # A cycle of punches has one of each arm; who says how many counts each.
+        cycles = count / 2 if word.motion == "punch" and action.count else count
+        return [replace(segment, duration_s=cycles * cycle_s, end=cycles)]
     return [segment] * count
 
 

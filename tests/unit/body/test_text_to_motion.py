@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import find_peaks
 
 from ctlev_core.body.layer import load_body, pose_vertices
 from ctlev_core.body.motion import keyframes
@@ -315,6 +316,18 @@ def test_counts_and_durations_are_kept():
     assert two > 1.6 * one
     slow, fast = (generate_motion(f"a person takes four steps {how}").time_s[-1] for how in ("slowly", "quickly"))
     assert slow > 1.5 * fast
+
+
+@pytest.mark.parametrize(("sentence", "count"), [("punches twice", 2), ("punches 5 times", 5), ("punches", 2)])
+def test_every_punch_counts(sentence, count):
+    motion = generate_motion(f"a person {sentence}", rate_hz=60, seed=0)
+    _, joints = posed(motion)
+    punches = 0
+    for side in ("left", "right"):
+        wrist, shoulder = (joints[:, SMPL_JOINTS.index(f"{side}_{name}")] for name in ("wrist", "shoulder"))
+        reach = np.linalg.norm(wrist - shoulder, axis=1)
+        punches += len(find_peaks(reach, height=0.45, prominence=0.1)[0])
+    assert punches == count
 
 
 def test_the_seed_decides_and_nothing_else_does():
