@@ -170,6 +170,12 @@ class BucketCache:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 file = path.open("a", encoding="utf-8")
                 fcntl.flock(file, fcntl.LOCK_EX)
+                while not os.fstat(
+                    file.fileno()
+                ).st_nlink:  # removed before it was locked, as that of a process that ended
+                    file.close()
+                    file = path.open("a", encoding="utf-8")
+                    fcntl.flock(file, fcntl.LOCK_EX)
                 _notes[key] = file, set()
             file, known = _notes[key]
             if name not in known:

@@ -40,6 +40,8 @@ R = TypeVar("R")
 KINDS = ("threads", "processes", "dask", "ray", "slurm")
 ALONE = {"CTLEV_WORKERS": "1", "CTLEV_RUNNER": "threads"}
 """Environment of a process that does our work: it starts none of its own."""
+ALIKE = ("OMP_NUM_THREADS", "CTLEV_STAGE_TIMEOUT_S", "CTLEV_STAGES_PER_GPU")
+"""Environment that is there as it is here, for it decides digits and limits."""
 CONNECT_TIMEOUT_S = 60
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """As mallopt names them."""
@@ -172,7 +174,10 @@ def reply_with(error: Exception) -> bytes:
         pickle.loads(reply)
         return reply
     except Exception:
-        return pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}")))
+        told = RuntimeError(f"{type(error).__name__}: {error}")
+        told.add_note(error.__notes__[-1])
+        told.passes = error.passes  # pyright: ignore[reportAttributeAccessIssue]
+        return pickle.dumps((False, told))
 
 
 def compute_there(environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
@@ -183,10 +188,11 @@ def compute_there(environment: dict[str, str], function: Callable[..., Any], arg
 
 def environment_there() -> dict[str, str]:
     """What `compute_there` sets."""
+    asked = ALONE | {name: os.environ[name] for name in ALIKE if os.environ.get(name)}
     if not os.environ.get("CTLEV_HOME"):
-        return ALONE
+        return asked
     home = home_folder()
-    return ALONE | {"CTLEV_HOME": bucket_url(home) or str(home)}
+    return asked | {"CTLEV_HOME": bucket_url(home) or str(home)}
 
 
 def use_memory_freely() -> None:

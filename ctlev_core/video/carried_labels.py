@@ -135,11 +135,29 @@ class CarriedLabels:
             if area := sum(label.mask["counts"][1::2]):
                 found |= {"segmentation": label.mask, "area": area}
         elif label.mask is not None:
-            inside = [one for one in label.mask if (one.max(axis=0) > 0).all() and (one.min(axis=0) < edge).all()]
+            inside = [cut for one in label.mask if len(cut := _cut_off(one, edge)) >= 3]
             if inside:
                 area = round(sum(map(_polygon_area, inside)), 3)
                 found |= {"segmentation": [_rounded(one.ravel()) for one in inside], "area": area}
         return found | {"iscrowd": int(label.is_crowd)} if found else None
+
+
+def _cut_off(polygon: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """The part of a polygon [N, 2] that lies in 0 to `edge` [2], [M, 2]; M = 0 where none does.
+
+    Source: Sutherland & Hodgman, Reentrant Polygon Clipping, CACM 17, 1974: one side after the other.
+    """
+    for axis, bound, sign in ((0, 0.0, 1), (1, 0.0, 1), (0, edge[0], -1), (1, edge[1], -1)):
+        distance = sign * (polygon[:, axis] - bound)
+        kept: list[np.ndarray] = []
+        for number, (point, inside) in enumerate(zip(polygon, distance, strict=True)):
+            before, outside = polygon[number - 1], distance[number - 1]
+            if (inside > 0) != (outside > 0):
+                kept.append(before + (point - before) * outside / (outside - inside))
+            if inside > 0:
+                kept.append(point)
+        polygon = np.array(kept, float).reshape(-1, 2)
+    return np.clip(polygon, 0, edge)
 
 
 def label_times(shown_us: Sequence[int], rate_hz: float | None) -> np.ndarray:

@@ -33,6 +33,7 @@ GAMMA = 2.2
 NMNIST_SIDE_PX = 34
 """Side of the sensor on which the path of N-MNIST was measured."""
 _LUMINANCE_BGR = np.array([[0.0722, 0.7152, 0.2126]], np.float32)
+_WITHOUT_COUNT = (".mkv", ".webm")
 _NOT_SHOWN = 0.01
 """A container may count so many frames more than it has; with fewer, the file was cut."""
 
@@ -136,7 +137,7 @@ class _Light:
         self._stored = shape
         if self._size is None:
             self._size = check_sensor_size((shape[1], shape[0]), str(self._path))
-        stored = _cover(stored, self._size)
+        # Light first: a pixel of the camera has the mean of the light that falls on it, not that of display levels.
         if stored.dtype == np.uint8:
             light = cv2.LUT(stored, self._of_bytes)
         elif stored.dtype == np.uint16:
@@ -145,7 +146,7 @@ class _Light:
             light = stored.astype(np.float32)
             if not np.isfinite(light).all() or light.min() < 0:
                 raise DataError(f"{self._path}: light must be finite and not negative, it is not in frame {number}")
-        return cv2.transform(light, _LUMINANCE_BGR)
+        return _cover(cv2.transform(light, _LUMINANCE_BGR), self._size)
 
 
 class _StoredFrames(Frames):
@@ -192,15 +193,28 @@ class _StoredFrames(Frames):
         """Times in s, and frames as they are stored, [H, W, 3]."""
 
 
+def _in_stretch(count: int, fps: float, options: FrameOptions) -> int:
+    """How many of the frames of a video, about, lie in the stretch that is asked for; 0 = nobody knows."""
+    if not options.start_s and options.stop_s is None:
+        return count
+    if not fps:
+        return 0
+    stop = count if options.stop_s is None else min(count, round(options.stop_s * fps) + 1)
+    return max(stop - math.ceil(options.start_s * fps), 0)
+
+
 class _VideoFile(_StoredFrames):
     def __init__(self, path: Path, options: FrameOptions) -> None:
         import cv2
 
         capture = _open(path)
-        expected = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        counted, stated_fps = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
         capture.release()
-        self.num_stored = int(expected) if math.isfinite(expected) and expected > 0 else 0
-        super().__init__(path, options, self.num_stored if options.stop_s is None else 0)
+        self._counted = int(counted) if math.isfinite(counted) and counted > 0 else 0
+        # Matroska has a duration alone, of which OpenCV makes a number by a rate that it guesses.
+        self.num_stored = 0 if path.suffix.lower() in _WITHOUT_COUNT else self._counted
+        fps = options.fps or (stated_fps if math.isfinite(stated_fps) and stated_fps > 0 else 0.0)
+        super().__init__(path, options, _in_stretch(self._counted, fps, options))
 
     def _read(self) -> Iterator[tuple[float, np.ndarray]]:
         import cv2
@@ -226,9 +240,12 @@ class _VideoFile(_StoredFrames):
                 count += 1
         finally:
             capture.release()
-        if count < self.expected - max(2, _NOT_SHOWN * self.expected):
+        seen = count
+        if has_times and math.isfinite(stated_fps) and stated_fps > 0:
+            seen = round(before_s * stated_fps) + 1  # rates vary: what counts is how far the frames reach
+        if seen < self._counted - max(2, _NOT_SHOWN * self._counted):
             raise DataError(
-                f"{self.path}: ends after frame {count} of {self.expected}; the file is cut or damaged. What is before "
+                f"{self.path}: ends after frame {seen} of {self._counted}; the file is cut or damaged. What is before "
                 f"can be read with an earlier stop"
             )
 
@@ -237,7 +254,8 @@ class _PictureFolder(_StoredFrames):
     def __init__(self, path: Path, options: FrameOptions) -> None:
         self._paths, self._times_s = list_folder(path, options.fps)
         self.names, self.num_stored = tuple(one.name for one in self._paths), len(self._paths)
-        super().__init__(path, options, len(self._paths))
+        last_s = math.inf if options.stop_s is None else options.stop_s
+        super().__init__(path, options, sum(options.start_s <= time_s <= last_s for time_s in self._times_s))
 
     def _read(self) -> Iterator[tuple[float, np.ndarray]]:
         for path, time_s in zip(self._paths, self._times_s, strict=True):
@@ -268,6 +286,9 @@ class _StillPicture(Frames):
     is_dense = True
 
     def __init__(self, path: Path, options: FrameOptions, max_displacement_px: float) -> None:
+        given = {"fps": options.fps, "start": options.start_s, "stop": options.stop_s}
+        if named := [name for name, value in given.items() if value] + ["slow_motion"] * (options.slow_motion != 1):
+            raise DataError(f"{path}: a still picture is seen in saccades of their own times; leave out {named[0]}")
         stored = read_picture(path)
         self._stored_size = stored.shape[1], stored.shape[0]
         self.names, self.num_stored = (path.name,), 1

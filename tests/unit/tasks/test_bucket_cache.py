@@ -1,10 +1,12 @@
 """The cache of a bucket stays below its limit, and keeps what is used and what the bucket does not have."""
 
+import fcntl
 import os
 import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import bucket_server
 import pytest
@@ -95,6 +97,24 @@ def test_what_another_process_found_stays_until_it_ends(store, monkeypatch):
     os.utime(store.folder("encode", key(0)) / "run.json", (then, then))
     add(store, 4, 0)
     assert here(store) == {3, 4}
+
+
+def test_notes_that_are_removed_before_they_are_locked_are_begun_again(store, monkeypatch):
+    """Another process may take them for those of one that has ended."""
+    add(store, 1, days=1)
+    end_of_the_process()
+    lock, removed = fcntl.flock, []
+
+    def flock(file, mode):
+        if not removed and "in_use" in str(getattr(file, "name", "")):
+            removed.append(file.name)
+            os.unlink(file.name)
+        return lock(file, mode)
+
+    monkeypatch.setattr(bucket_cache.fcntl, "flock", flock)
+    assert store.find("encode", key(1)) is not None and removed
+    monkeypatch.undo()
+    assert Path(removed[0]).read_text() == f"encode/{key(1)}\n"
 
 
 def test_what_the_bucket_does_not_have_stays_and_is_sent_again(store, monkeypatch):

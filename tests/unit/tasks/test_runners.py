@@ -1,8 +1,10 @@
 """Shards and stages on threads, processes, Dask and Ray: the same results, whoever computes."""
 
+import errno
 import importlib.util
 import json
 import os
+import pickle
 import shutil
 import sys
 import time
@@ -17,7 +19,7 @@ import pytest
 from data_contracts import tables
 from data_contracts.errors import DataError
 from tasks import runners
-from tasks.runners import WorkerError, asked_runner, is_elsewhere, num_jobs
+from tasks.runners import ALIKE, WorkerError, asked_runner, environment_there, is_elsewhere, num_jobs, reply_to
 from tasks.stage import planning, stage
 from tasks.store import Store
 from tasks.workers import MAX_GROUP, Workers, _groups, current_workers, is_spread, map_shards, together
@@ -180,6 +182,28 @@ def test_groups_cover_all_shards_once_and_end_small(num_shards, count, max_group
     assert [shard for group in groups for shard in group] == list(range(num_shards))
     sizes = [len(group) for group in groups]
     assert sizes == sorted(sizes, reverse=True) and sizes[0] <= max_group and sizes[-1] == 1
+
+
+def test_an_error_that_cannot_travel_still_says_whether_it_passes_and_where_it_was():
+    class OwnError(OSError):
+        """Nobody else knows it."""
+
+    def fail():
+        raise OwnError(errno.EIO, "at nfs")
+
+    done, error = pickle.loads(reply_to(fail, ()))
+    assert not done and str(error) == "OwnError: [Errno 5] at nfs" and error.passes
+    assert "in fail" in error.__notes__[-1]
+
+
+def test_what_decides_digits_and_limits_is_there_as_it_is_here(monkeypatch):
+    for name in ALIKE:
+        monkeypatch.delenv(name, raising=False)
+    assert not set(ALIKE) & environment_there().keys()
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setenv("CTLEV_STAGE_TIMEOUT_S", "60")
+    there = environment_there()
+    assert (there["OMP_NUM_THREADS"], there["CTLEV_STAGE_TIMEOUT_S"], there["CTLEV_WORKERS"]) == ("2", "60", "1")
 
 
 def test_shards_are_spread_where_there_are_several_of_both(monkeypatch):

@@ -1,5 +1,7 @@
 """Reading videos, folders and pictures: times, sizes, light, and what is wrong with them."""
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -122,6 +124,69 @@ def test_pictures_cover_the_sensor_and_are_cut_about_their_middle(tmp_path):
         _, light = next(iter(open_frames(folder, FrameOptions(size=size, fps=1))))
         assert light.shape == size[::-1]
         np.testing.assert_allclose(light, 1, atol=1e-6)
+
+
+def test_a_pixel_that_covers_several_has_the_mean_of_their_light(tmp_path):
+    """Not that of display levels: of black and white as much as of 8 bits as of floats, .5 and not .22."""
+    board = np.indices((48, 64)).sum(axis=0) % 2
+    for name, levels in (("bytes", (255 * board).astype(np.uint8)), ("words", (65535 * board).astype(np.uint16))):
+        (tmp_path / name).mkdir()
+        for row in ("1", "2"):
+            assert cv2.imwrite(str(tmp_path / name / f"{row}.png"), levels)
+        light = next(iter(open_frames(tmp_path / name, FrameOptions(size=(32, 24), fps=10))))[1]
+        np.testing.assert_allclose(light, 0.5, atol=1e-6)
+
+
+def element(name, content):
+    """An element of Matroska."""
+    return bytes.fromhex(name) + struct.pack(">Q", len(content) | 1 << 56) + content
+
+
+def number(value):
+    return value.to_bytes(8, "big")
+
+
+def test_a_video_of_a_varying_rate_is_whole_and_so_are_its_labels(tmp_path):
+    """OpenCV makes a number of frames of the duration and a rate that it guesses: 1,260 here, of 160."""
+    times_ms = [round(1000 * frame / 60) for frame in range(60)] + [1000 + 200 * frame for frame in range(100)]
+    clusters = b""
+    for row, time_ms in enumerate(times_ms):
+        picture = cv2.imencode(".jpg", np.full((24, 32, 3), row, np.uint8))[1].tobytes()
+        block = element("a3", b"\x81" + struct.pack(">h", 0) + b"\x80" + picture)
+        clusters += element("1f43b675", element("e7", number(time_ms)) + block)
+    size = element("e0", element("b0", number(32)) + element("ba", number(24)))
+    codec = b"".join(element(name, number(1)) for name in ("d7", "73c5", "83")) + element("86", b"V_MJPEG")
+    duration = element("4489", struct.pack(">d", times_ms[-1] + 200.0))
+    info = element("2ad7b1", number(1_000_000)) + duration + element("4d80", b"x") + element("5741", b"x")
+    versions = [("4286", 1), ("42f7", 1), ("42f2", 4), ("42f3", 8), ("4287", 4), ("4285", 2)]
+    head = b"".join(element(name, number(value)) for name, value in versions) + element("4282", b"matroska")
+    tracks = element("1654ae6b", element("ae", codec + size))
+    whole = element("1a45dfa3", head) + element("18538067", element("1549a966", info) + tracks + clusters)
+    (tmp_path / "a.mkv").write_bytes(whole)
+    frames = open_frames(tmp_path / "a.mkv", FrameOptions())
+    assert np.allclose([t_us for t_us, _ in frames], 1000 * np.array(times_ms), atol=1100)
+    assert frames.num_stored == 0 and frames.num_seen_to_end == len(times_ms)
+    (tmp_path / "cut.mkv").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataError, match="the file is cut or damaged"):
+        list(open_frames(tmp_path / "cut.mkv", FrameOptions()))
+
+
+@pytest.mark.parametrize(
+    ("start_s", "stop_s", "count"), [(0.0, None, 20), (0.2, None, 10), (0.0, 0.1, 6), (0.1, 0.2, 6)]
+)
+def test_how_many_frames_a_stretch_has_is_known_before(tmp_path, start_s, stop_s, count):
+    write_video(tmp_path / "a.avi", [10] * 20)
+    write_folder(tmp_path / "f", [10] * 20)
+    for name, rate in (("a.avi", {}), ("f", {"fps": 50.0})):
+        frames = open_frames(tmp_path / name, FrameOptions(start_s=start_s, stop_s=stop_s, **rate))
+        assert frames.expected == count == len(list(frames))
+
+
+@pytest.mark.parametrize("asked", [{"fps": 5.0}, {"slow_motion": 10.0}, {"start_s": 0.1}, {"stop_s": 0.1}])
+def test_a_still_picture_has_times_of_its_own(tmp_path, asked):
+    assert cv2.imwrite(str(tmp_path / "a.png"), picture(100))
+    with pytest.raises(DataError, match="seen in saccades of their own times; leave out"):
+        open_frames(tmp_path / "a.png", FrameOptions(**asked))
 
 
 def test_sixteen_bits_and_floats(tmp_path):

@@ -3,10 +3,12 @@
 import json
 
 import cv2
+import hypothesis
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 
-from ctlev_core.video.carried_labels import CarriedLabels, label_times, write_labels
+from ctlev_core.video.carried_labels import CarriedLabels, _cut_off, _polygon_area, label_times, write_labels
 from ctlev_core.video.coco_masks import read_runs, write_runs
 from ctlev_core.video.frames import FrameOptions, open_frames
 from ctlev_core.video.label_files import read_video_labels
@@ -192,6 +194,22 @@ def test_labels_of_a_still_picture_move_with_it(tmp_path):
         np.testing.assert_allclose(one["keypoints"][:2], one["bbox"][:2], atol=2e-3)
         places.add(tuple(one["bbox"][:2]))
     assert len(places) > 20
+
+
+POLYGONS = st.lists(st.tuples(st.integers(-40, 90), st.integers(-40, 90)), min_size=3, max_size=3, unique=True)
+
+
+@hypothesis.given(POLYGONS)
+def test_what_is_cut_off_a_polygon_is_what_pixels_lose(corners):
+    """A triangle, drawn ten times as large and cut by the picture's edge, has the area of what is left of it."""
+    edge, scale = np.array([50.0, 30.0]), 10
+    found = _cut_off(np.array(corners, float), edge)
+    canvas = np.zeros((30 * scale, 50 * scale), np.uint8)
+    cv2.fillPoly(canvas, [scale * np.array(corners, np.int32)], 1)
+    around = np.linalg.norm(np.diff(np.array([*corners, corners[0]]), axis=0), axis=1).sum()
+    area = _polygon_area(found) if len(found) >= 3 else 0.0
+    assert area == pytest.approx(canvas.sum() / scale**2, abs=around / scale + 1)
+    assert len(found) == 0 or ((found >= 0).all() and (found <= edge).all())
 
 
 def test_mot_challenge_counts_frames_from_one_and_has_rows_to_ignore(tmp_path):
