@@ -28,6 +28,9 @@ stepped, and noise does not depend on the frame rate.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
+
 import numpy as np
 
 from ctlev_core.events.decoding import event_chunks
@@ -149,7 +152,7 @@ class Sensor:
         return self._join(found)
 
     def push_between(
-        self, moving: np.ndarray, drawn: np.ndarray, drawn_us: np.ndarray, intensity: np.ndarray, time_us: int
+        self, moving: np.ndarray, drawn: Iterable[np.ndarray], drawn_us: np.ndarray, intensity: np.ndarray, time_us: int
     ) -> Events:
         """The events from the last frame pushed before to one more, of which some pixels are known in between too.
 
@@ -158,27 +161,28 @@ class Sensor:
 
         Args:
             moving: [K] int64 pixels, row by row of the frame, ascending.
-            drawn: [S, K] intensity of those pixels at the times in between.
+            drawn: S times [K], intensity of those pixels at the times in between; one after another, so that memory is
+                that of one.
             drawn_us: [S] int64, increasing, after the last frame and before `time_us`.
             intensity: [H, W] the frame.
             time_us: its time.
         Raises:
-            DataError: as `push`.
-            ValueError: this is the first frame, or there is a budget of events.
+            DataError: as `push`; but where a later one of `drawn` is wrong the pixels are beyond those before it.
+            ValueError: this is the first frame, there is a budget of events, or `drawn` are not as many as times.
         """
         if self.num_frames == 0 or self.max_events is not None:
             raise ValueError("sensor: push_between needs a frame before, and no max_events")
         times = np.append(drawn_us, np.int64(time_us))
-        if drawn.size == 0:
+        if len(drawn_us) == 0 or len(moving) == 0:
             return self.push(intensity[None], times[-1:])
         frame = self._like_the_last(
             _check_frames(intensity[None], times[-1:], self.sensor_size, self._last_t_us).reshape(-1)
         )
-        values = np.vstack([drawn, frame[moving]])
-        values = _check_frames(values[:, None], times, (len(moving), 1), self._last_t_us)[:, 0]
-        values = values.astype(frame.dtype, copy=False)
+        _check_times(times, self._last_t_us)
         before, begin_us, count = self._frame[moving], float(self._last_t_us - self._first_t_us), 0
-        for one, end_us in zip(values, (times - self._first_t_us).astype(np.float64).tolist(), strict=True):
+        for values, time in zip(itertools.chain(drawn, [frame[moving]]), times, strict=True):
+            one = _check_frames(np.asarray(values)[None, None], time[None], (len(moving), 1), None)[0, 0]
+            one, end_us = np.array(one, frame.dtype), float(time - self._first_t_us)
             count = self._advance_chosen(before, one, moving, begin_us, end_us, count)
             before, begin_us = one, end_us
         others = np.ones(len(frame), bool)
@@ -318,12 +322,7 @@ def _check_frames(intensity: np.ndarray, t_us: np.ndarray, sensor_size: SensorSi
         raise DataError(f"sensor: intensity must be [T, {shape[1]}, {shape[2]}] with T >= 1, got {intensity.shape}")
     if t_us.shape != (len(intensity),) or t_us.dtype != np.int64:
         raise DataError(f"sensor: t_us must be [{len(intensity)}] int64, got {t_us.shape} {t_us.dtype}")
-    late = t_us[1:] <= t_us[:-1]
-    if t_us[0] < 0 or late.any():
-        frame = int(np.argmax(late)) + 1 if late.any() else 0
-        raise DataError(f"sensor: frame times must increase from 0 or later, got t = {t_us[frame]} us at frame {frame}")
-    if last_us is not None and t_us[0] <= last_us:
-        raise DataError(f"sensor: frame times must increase, got t = {t_us[0]} us after the frame of {last_us} us")
+    _check_times(t_us, last_us)
     dtype = np.float32 if intensity.dtype == np.float32 else np.float64
     intensity = np.ascontiguousarray(intensity, dtype)
     bad = sensor_columns.first_bad(intensity.reshape(-1))
@@ -334,6 +333,15 @@ def _check_frames(intensity: np.ndarray, t_us: np.ndarray, sensor_size: SensorSi
             f"x = {x}, y = {y}"
         )
     return intensity
+
+
+def _check_times(t_us: np.ndarray, last_us: int | None) -> None:
+    late = t_us[1:] <= t_us[:-1]
+    if t_us[0] < 0 or late.any():
+        frame = int(np.argmax(late)) + 1 if late.any() else 0
+        raise DataError(f"sensor: frame times must increase from 0 or later, got t = {t_us[frame]} us at frame {frame}")
+    if last_us is not None and t_us[0] <= last_us:
+        raise DataError(f"sensor: frame times must increase, got t = {t_us[0]} us after the frame of {last_us} us")
 
 
 def _empty_columns(count: int, *, marks: bool) -> list[np.ndarray]:

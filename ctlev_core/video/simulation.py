@@ -86,9 +86,7 @@ class VideoSimulation:
         shares = np.arange(1, steps) / steps
         times = self.duration_us + np.rint(shares * span_us).astype(np.int64)
         self.num_drawn += steps
-        drawn = np.empty((steps - 1, len(between.moving)), np.float32)
-        for row, share in enumerate(shares.tolist()):
-            drawn[row] = between.at(share)
+        drawn = (between.at(share) for share in shares.tolist())
         return camera.push_between(between.moving, drawn, times, light, t_us)
 
 

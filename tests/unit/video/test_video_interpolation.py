@@ -1,11 +1,14 @@
 """What lies between two frames, and the events that come of it, beside a scene of which every frame is known."""
 
+import tracemalloc
+
+import cv2
 import numpy as np
 import pytest
 from moving_scene import SIZE, SPEED_PX_S, frames, light, share_found
 
 from ctlev_core.sensor.dvs_pixel import PRESETS, Sensor, join, simulate_events
-from ctlev_core.video.frames import FrameOptions, Frames
+from ctlev_core.video.frames import FrameOptions, Frames, open_frames
 from ctlev_core.video.interpolation import Fading, Flow, num_steps
 from ctlev_core.video.simulation import VideoSimulation
 from data_contracts.errors import DataError
@@ -140,6 +143,30 @@ def test_pixels_seen_between_are_checked():
         with pytest.raises(DataError, match=message):
             sensor.push_between(moving, drawn, drawn_us, last, 20)
     assert len(sensor.push_between(moving, np.array([[2.0, 0.1]]), times, frame, 20)) > 0
+    with pytest.raises(ValueError, match="argument"):
+        sensor.push_between(moving, np.ones((2, 2)), np.array([30], np.int64), frame, 40)
+
+
+def test_a_cut_takes_the_memory_of_one_frame(tmp_path):
+    """Between two frames that have nothing in common 200 are drawn, each forgotten before the next."""
+    rng = np.random.default_rng(0)
+    (tmp_path / "f").mkdir()
+    for name in "12":
+        levels = cv2.resize(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8), (320, 240))
+        assert cv2.imwrite(str(tmp_path / "f" / f"{name}.png"), levels)
+    frames = open_frames(tmp_path / "f", FrameOptions(fps=1))
+    simulation = VideoSimulation(frames, PRESETS["ideal"], max_displacement_px=0.2)
+    some = iter(simulation)
+    next(some)
+    tracemalloc.start()
+    try:
+        events = next(some)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert simulation.num_drawn > 100 and len(events) > 0
+    of_events = sum(getattr(events, name).nbytes for name in "txyp")
+    assert peak < 40 * 320 * 240 * 4 + 12 * of_events, "not that of all that was drawn"
 
 
 def test_a_simulation_counts_and_can_be_repeated():
