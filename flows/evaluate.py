@@ -60,7 +60,8 @@ def evaluate(
     compared: dict[str, list[BaselineFrames]] | None = None,
 ) -> Evaluation:
     """Train and score every training set and seed; what is not given is made first."""
-    check_num_classes(experiment)
+    if is_planning():  # which every run begins with; listing a large dataset takes a while
+        check_num_classes(experiment)
     if dataset is None:
         dataset = call_flow(prepare_dataset, experiment)
     if synthetic is None:

@@ -61,9 +61,9 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
             signal_file = output.with_suffix(SIGNAL_SUFFIX)
         if options.labels is not None:
             labels_file = output.with_suffix(LABELS_SUFFIX)
+        read = [given for given in (source, options.labels) if given is not None and given.exists()]
         for path in filter(None, (output, options.preview, signal_file, labels_file)):
             _check_free(path, overwrite=options.overwrite)
-            read = [given for given in (source, options.labels) if given is not None and given.exists()]
             if path.exists() and any(path.samefile(given) for given in read):
                 raise DataError(f"{path}: is what is read; choose another name to write to")
         from ctlev_core.events.files import write_event_chunks
