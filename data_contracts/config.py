@@ -135,10 +135,15 @@ class Windows(Frozen):
     labels: Literal["mean", "interpolated"] = Field(
         default="mean",
         json_schema_extra=ADDED_LATER,
-        description="label of a window that has none of its own: the mean of the positions in it and the last body, or "
-        "those nearest to it, as DHP19; or those at its end, between the labels before and after, without which, or "
-        "with a gap between them, there is no window",
+        description="label of a window that has none of its own: the mean of the positions in it and the body in its "
+        "middle, or those nearest to it, as DHP19; or those at its end, between the labels before and after, without "
+        "which, or with a gap between them, there is no window",
     )
+
+    @property
+    def end_at_labels(self) -> bool:
+        """Whether labels are those of the moment a window ends at, and not of its middle."""
+        return self.anchor == "labels" or self.labels == "interpolated"
 
     @model_validator(mode="after")
     def _labels_end_what_can_be_moved(self) -> Windows:

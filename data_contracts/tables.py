@@ -148,7 +148,7 @@ WINDOW_LABELS = TableSchema("window_labels", 2, None, LABELS.columns)
 """One row for each row of `windows`, where the authors also say how a window is labelled; else no rows."""
 FRAMES = TableSchema(
     "frames",
-    3,
+    4,
     "sample_id",
     (
         Column("sample_id", pa.string(), "the join key; row i of the array `frames` is row i of this table"),
@@ -158,6 +158,7 @@ FRAMES = TableSchema(
         _CLASS,
         Column("t_start_us", pa.int64(), "first event of the window", minimum=0),
         Column("t_end_us", pa.int64(), "last event of the window", minimum=0),
+        Column("t_us", pa.int64(), "the moment its labels are of: the middle of the window, or its end"),
         Column("num_events", pa.int64(), "events in the window", minimum=0),
         *_LABELS,
     ),

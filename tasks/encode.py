@@ -43,7 +43,7 @@ TABLE_ROWS = 1 << 13
 logger = logging.getLogger(__name__)
 
 
-@stage(version=6, schema=tables.FRAMES, optional=("held_out",), spreads=True)
+@stage(version=7, schema=tables.FRAMES, optional=("held_out",), spreads=True)
 def encode(
     out: Output,
     recordings: Manifest,
@@ -109,7 +109,9 @@ class _FrameTable:
 
     def append(self, source: RecordingSource, cut: EncodedWindows) -> None:
         """Rows of some windows of a recording."""
-        times = (array.tolist() for array in (cut.numbers, cut.t_start_us, cut.t_end_us, cut.num_events))
+        times = (
+            array.tolist() for array in (cut.numbers, cut.t_start_us, cut.t_end_us, cut.labels.t_us, cut.num_events)
+        )
         self._rows += [
             {
                 "sample_id": f"{source.recording_id}:{cut.split}:{number:05d}",
@@ -118,9 +120,10 @@ class _FrameTable:
                 "split": cut.split,
                 "t_start_us": start_us,
                 "t_end_us": end_us,
+                "t_us": label_us,
                 "num_events": count,
             }
-            for number, start_us, end_us, count in zip(*times, strict=True)
+            for number, start_us, end_us, label_us, count in zip(*times, strict=True)
         ]
         self._labels.append(cut.labels)
         if len(self._rows) >= TABLE_ROWS:

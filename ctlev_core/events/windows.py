@@ -88,7 +88,7 @@ def cut_at_labels(
 def window_around(t_us: np.ndarray, moment_us: int, duration_us: int, windows: Windows) -> tuple[int, int]:
     """The one window around a moment, as `cut` would make it if recordings started half a window before.
 
-    Where windows end at labels it ends at the moment, as those of `cut_at_labels` do.
+    Where labels are those of a window's end it ends at the moment, as those of `cut_at_labels` do.
 
     Args:
         t_us: [N] int64, times of events, non-decreasing.
@@ -99,14 +99,14 @@ def window_around(t_us: np.ndarray, moment_us: int, duration_us: int, windows: W
         Start and stop in events. With `count` as many events on either side, as far as there are so many; fewer in all
         only where the recording has fewer.
     """
-    if windows.anchor == "labels":
-        start, stop = np.searchsorted(t_us, [moment_us - windows.duration_us, moment_us], side="right").tolist()
+    span_us = windows.duration_us if windows.method == "duration" else duration_us
+    if windows.end_at_labels:
+        start, stop = np.searchsorted(t_us, [moment_us - span_us, moment_us], side="right").tolist()
         return (max(stop - windows.num_events, 0), stop) if windows.method == "count" else (start, stop)
     if windows.method == "count":
         middle = int(np.searchsorted(t_us, moment_us))
         start = min(max(middle - windows.num_events // 2, 0), max(len(t_us) - windows.num_events, 0))
         return start, min(start + windows.num_events, len(t_us))
-    span_us = windows.duration_us if windows.method == "duration" else duration_us
     start_us = moment_us - span_us // 2
     start, stop = np.searchsorted(t_us, [start_us, start_us + span_us])
     return int(start), int(stop)

@@ -21,9 +21,9 @@ def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarr
         t_end_us: [N] int64, last event of each window.
 
     Returns:
-        N rows at the windows' ends. A window between two labels takes the nearest one. A joint is visible when it is
-        visible in at least half of the rows averaged. Class, SMPL parameters and joints in 3D are those of the last
-        row in the window: rotations have no plain mean.
+        N rows at the middles of the windows. A window between two labels takes the nearest one. A joint is visible when
+        it is visible in at least half of the rows averaged. Class, SMPL parameters and joints in 3D are those of the
+        row nearest to the middle, where means of joints in 2D are too: rotations have no plain mean.
     Source: DHP19 labels a frame with the NaN-mean of the Vicon rows in its window
         (SensorsINI/DHP19, ExtractEventsToFramesAndMeanLabels.m); it has no visibility flags.
     """
@@ -31,11 +31,12 @@ def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarr
     first = np.searchsorted(labels.t_us, t_start_us, side="left")
     last = np.searchsorted(labels.t_us, t_end_us, side="right")
     empty = first >= last
-    nearest = _nearest(labels.t_us, (t_start_us + t_end_us) // 2)
+    middle_us = (t_start_us + t_end_us) // 2
+    nearest = _nearest(labels.t_us, middle_us)
     first, last = np.where(empty, nearest, first), np.where(empty, nearest + 1, last)
-    at_end = labels.take(last - 1)
+    found = replace(labels.take(nearest), t_us=middle_us)
     if labels.joints2d is None or labels.visible is None:
-        return replace(at_end, t_us=t_end_us)
+        return found
     joints = np.empty((len(first), *labels.joints2d.shape[1:]), np.float32)
     visible = np.empty((len(first), labels.visible.shape[1]), bool)
     with warnings.catch_warnings():
@@ -44,7 +45,7 @@ def labels_at_windows(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarr
             joints[row] = np.nanmean(labels.joints2d[start:stop].astype(np.float64), axis=0)
             visible[row] = labels.visible[start:stop].mean(axis=0) >= 0.5
     visible &= np.isfinite(joints).all(axis=-1)
-    return replace(at_end, t_us=t_end_us, joints2d=joints, visible=visible)
+    return replace(found, joints2d=joints, visible=visible)
 
 
 def has_label(labels: Labels, t_start_us: np.ndarray, t_end_us: np.ndarray) -> np.ndarray:

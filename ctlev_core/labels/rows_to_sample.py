@@ -80,7 +80,7 @@ def choose_rows_to_sample(
         DataError: there is nothing to choose from, or no body to see from a new side.
     """
     half_us = half_window_us(frames)
-    before_us, after_us = (2 * half_us, 0) if windows.anchor == "labels" else (half_us, half_us)
+    before_us, after_us = (2 * half_us, 0) if windows.end_at_labels else (half_us, half_us)
     moments = label_moments(poses)
     if moments.num_rows:
         if chosen is None:

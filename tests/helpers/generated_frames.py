@@ -114,7 +114,7 @@ def make_recorded(home: Path) -> tuple[ManifestRef, np.ndarray]:
     columns = {
         "sample_id": [f"r{row}" for row in range(4)], "recording_id": ["r"] * 4, "subject": ["s"] * 4,
         "split": ["train"] * 3 + ["test"], "class_name": ["walk"] * 4,
-        **{name: [1] * 4 for name in ("t_start_us", "t_end_us", "num_events")}, **label_columns(make_labels(4)),
+        **{name: [1] * 4 for name in ("t_start_us", "t_end_us", "t_us", "num_events")}, **label_columns(make_labels(4)),
     }  # fmt: skip
     return publish(home, "encode", "recorded", columns, tables.FRAMES, {}, frames=frames), frames
 

@@ -107,7 +107,8 @@ class Experiment:
         columns = {
             "sample_id": [f"frame{row}" for row in range(COUNT)], "recording_id": [f"r{row}" for row in range(COUNT)],
             "subject": ["someone"] * COUNT, "split": split, "class_name": CLASSES, "t_start_us": [0] * COUNT,
-            "t_end_us": [20_000] * COUNT, "num_events": [50] * COUNT, **label_columns(_labels()),
+            "t_end_us": [20_000] * COUNT, "t_us": [10_000] * COUNT, "num_events": [50] * COUNT,
+            **label_columns(_labels()),
         }  # fmt: skip
         arrays = {"frames": _pictures(0)}
         inputs = {"arguments": {"recordings": _input(self.recordings)}, "inputs": [self.recordings]}

@@ -223,6 +223,14 @@ def test_windows_at_labels_equal_a_slow_search(times, labels, bounds, method, si
         assert window_around(np.array(times), labels[row], 0, windows) == (start, stop)
 
 
+@pytest.mark.parametrize("method", ["whole", "dataset", "duration", "count"])
+def test_windows_around_a_moment_end_at_it_where_labels_are_those_of_the_end(method):
+    windows = Windows(method=method, duration_us=20, num_events=20, labels="interpolated")
+    assert windows.end_at_labels and not Windows(method=method).end_at_labels
+    assert window_around(np.arange(100), 60, 20, windows) == (41, 61)
+    assert window_around(np.arange(100), 60, 20, windows.model_copy(update={"labels": "mean"})) == (50, 70)
+
+
 def test_windows_at_labels_are_spread_and_need_labels():
     windows = Windows(anchor="labels", num_events=2, max_windows=2)
     _, rows = cut_at_labels([np.arange(20)], np.arange(3, 13), windows)

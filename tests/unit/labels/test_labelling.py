@@ -1,5 +1,7 @@
 """One label per window: against a plain loop, and at the edges."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -44,6 +46,22 @@ def test_class_only_track_labels_every_window():
     labels = Labels(("spot",), np.array([1000], np.int64))
     found = labels_at_windows(labels, np.array([0, 5000]), np.array([10, 6000]))
     assert found.class_names == ("spot", "spot") and found.joints2d is None
+
+
+def test_bodies_and_classes_are_those_of_the_middle_as_means_of_joints_are():
+    times = np.arange(0, 100, 10)
+    joints = np.repeat(times.astype(np.float32)[:, None, None], 2, axis=2)
+    labels = replace(
+        track(times, joints),
+        class_names=("walk",) * 5 + ("run",) * 5,
+        smpl_pose=np.repeat(times.astype(np.float32)[:, None], 72, axis=1),
+        smpl_betas=np.zeros((10, 10), np.float32),
+        smpl_transl=np.repeat(times.astype(np.float32)[:, None], 3, axis=1),
+    )
+    found = labels_at_windows(labels, np.array([10, 50]), np.array([70, 90]))
+    assert found.joints2d[:, 0, 0].tolist() == [40, 70]
+    assert found.smpl_pose[:, 0].tolist() == found.smpl_transl[:, 0].tolist() == found.t_us.tolist() == [40, 70]
+    assert found.class_names == ("walk", "run")
 
 
 @given(st.integers(1, 30), st.integers(1, 20), st.integers(0, 2**32 - 1))

@@ -50,7 +50,7 @@ def frame_set(folder, rows):
         "sample_id": [f"{name}:{split}:{row:05d}" for row, (name, _, split) in enumerate(rows)],
         "recording_id": list(recordings), "subject": list(subjects), "split": list(splits),
         "class_name": ["a"] * len(rows),
-        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), pa.array([1] * len(rows), pa.int64())),
+        **dict.fromkeys(("t_start_us", "t_end_us", "t_us", "num_events"), pa.array([1] * len(rows), pa.int64())),
         **label_columns(Labels(("a",) * len(rows), np.zeros(len(rows), np.int64))),
     }  # fmt: skip
     return read_manifest(write_manifest(folder, pa.table(columns), tables.FRAMES))

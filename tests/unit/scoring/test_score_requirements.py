@@ -157,7 +157,7 @@ def test_frames_that_are_there_already_are_looked_at_in_the_plan(tmp_path):
     check_frames(metrics, tmp_path / "planned")
     columns = {
         "sample_id": ["a"], "recording_id": ["r"], "subject": ["s"], "split": ["test"], "class_name": ["walk"],
-        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), pa.array([1], pa.int64())),
+        **dict.fromkeys(("t_start_us", "t_end_us", "t_us", "num_events"), pa.array([1], pa.int64())),
         **label_columns(Labels(("walk",), np.zeros(1, np.int64))),
     }  # fmt: skip
     write_manifest(tmp_path, pa.table(columns), tables.FRAMES)

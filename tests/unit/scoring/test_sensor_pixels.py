@@ -98,7 +98,7 @@ def frames_of(folder, names, labels):
     columns = {
         "sample_id": [f"{name}:test:{row:05d}" for row, name in enumerate(names)], "recording_id": names,
         "subject": [f"s {name}" for name in names], "split": ["test"] * count, "class_name": [""] * count,
-        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), pa.array([1] * count, pa.int64())),
+        **dict.fromkeys(("t_start_us", "t_end_us", "t_us", "num_events"), pa.array([1] * count, pa.int64())),
         **label_columns(labels),
     }  # fmt: skip
     return read_manifest(write_manifest(folder, pa.table(columns), tables.FRAMES))

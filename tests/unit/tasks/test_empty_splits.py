@@ -23,7 +23,7 @@ def frame_set(folder, split, count=3):
         "subject": ["s"] * count,
         "split": [split] * count,
         "class_name": ["a"] * count,
-        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), pa.array([1] * count, pa.int64())),
+        **dict.fromkeys(("t_start_us", "t_end_us", "t_us", "num_events"), pa.array([1] * count, pa.int64())),
         **label_columns(Labels(("a",) * count, np.zeros(count, np.int64))),
     }
     return read_manifest(write_manifest(folder, pa.table(columns), tables.FRAMES))

@@ -75,7 +75,7 @@ def write_frames(folder, polarity: bool, num_events: int | None = None) -> Manif
                 {
                     "sample_id": f"r{number}:{window}", "recording_id": f"r{number}", "subject": f"r{number}",
                     "split": "train", "class_name": "walk", "t_start_us": events.t[start],
-                    "t_end_us": events.t[stop - 1],
+                    "t_end_us": events.t[stop - 1], "t_us": events.t[stop - 1],
                     "num_events": NUM_EVENTS if num_events is None else num_events,
                 }
             )  # fmt: skip

@@ -259,7 +259,14 @@ def test_interpolated_labels_are_those_of_the_windows_end(frames_of):
     _, frames = frames_of(make_dataset(), windows)
     ends = np.array(frames.column("t_end_us"))
     assert len(frames) == 18, "all windows are between labels"
+    assert frames.labels.t_us.tolist() == frames.column("t_us") == frames.column("t_end_us")
     np.testing.assert_allclose(frames.labels.joints2d[:, 0, 0], 8 + ends / 500, rtol=1e-6)
+
+
+def test_mean_labels_are_those_of_the_windows_middle(frames_of):
+    _, frames = frames_of(make_dataset(), Windows(method="duration", duration_us=100))
+    middles = (np.array(frames.column("t_start_us")) + np.array(frames.column("t_end_us"))) // 2
+    assert frames.labels.t_us.tolist() == frames.column("t_us") == middles.tolist()
 
 
 def test_images_where_there_is_no_label_are_left_out(frames_of):

@@ -57,7 +57,7 @@ def inputs(home):
     labels = label_columns(Labels(("",) * count, np.zeros(count, np.int64)))
     same = {"subject": ["s"] * count, "class_name": [""] * count, **times, **labels}
     frames = {"sample_id": names, "recording_id": ["r"] * count, "split": splits, **same}
-    frames["num_events"] = pa.array([1] * count, pa.int64())
+    frames["num_events"] = frames["t_us"] = pa.array([1] * count, pa.int64())
     asked = {"sample_id": names, "source_id": names, "prompt": ["a moving human"] * count, **same}
     images = random.integers(0, 256, (2, count, SIDE, SIDE, 3), np.uint8)
     artefacts = home / "artefacts"

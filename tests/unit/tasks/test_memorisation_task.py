@@ -24,7 +24,7 @@ def write(folder, images, recordings, splits):
         "subject": list(recordings),
         "split": list(splits),
         "class_name": ["walk"] * count,
-        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), pa.array([1] * count, pa.int64())),
+        **dict.fromkeys(("t_start_us", "t_end_us", "t_us", "num_events"), pa.array([1] * count, pa.int64())),
         **label_columns(Labels(("walk",) * count, np.zeros(count, np.int64))),
     }
     return read_manifest(write_manifest(folder, pa.table(columns), tables.FRAMES))

@@ -23,7 +23,7 @@ def frame_set(folder, pictures, recordings, splits):
     columns = {
         "sample_id": [f"{name}:{row}" for row, name in enumerate(recordings)], "recording_id": recordings,
         "subject": recordings, "split": splits, "class_name": ["a"] * count,
-        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), pa.array([1] * count, pa.int64())),
+        **dict.fromkeys(("t_start_us", "t_end_us", "t_us", "num_events"), pa.array([1] * count, pa.int64())),
         **label_columns(Labels(("a",) * count, np.zeros(count, np.int64))),
     }  # fmt: skip
     return read_manifest(write_manifest(folder, pa.table(columns), tables.FRAMES))

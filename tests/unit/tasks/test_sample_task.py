@@ -56,7 +56,7 @@ def write_frames(folder, frames: np.ndarray) -> Manifest:
             "subject": ["s"] * count,
             "split": ["train"] * (count - 1) + ["test"],
             "class_name": ["walk"] * count,
-            **{name: pa.array([1] * count, pa.int64()) for name in ("t_start_us", "t_end_us", "num_events")},
+            **{name: pa.array([1] * count, pa.int64()) for name in ("t_start_us", "t_end_us", "t_us", "num_events")},
             **label_columns(Labels(("walk",) * count, np.arange(count))),
         }
     )

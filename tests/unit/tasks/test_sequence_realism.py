@@ -53,7 +53,7 @@ def recorded(folder, train, test, labelled=True, length=LENGTH):
         "sample_id": [f"{name}:{row}" for row, name in enumerate(names)], "recording_id": names,
         "subject": names, "split": split, "class_name": ["walk"] * len(names),
         "t_start_us": times(sum(counts), length), "t_end_us": times(sum(counts), length),
-        "num_events": [9] * len(names), **label_columns(labels),
+        "t_us": times(sum(counts), length), "num_events": [9] * len(names), **label_columns(labels),
     }  # fmt: skip
     return read_manifest(write_manifest(folder, pa.table(columns), tables.FRAMES))
 

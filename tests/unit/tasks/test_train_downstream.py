@@ -32,7 +32,7 @@ def frame_set(folder, rows):
         "subject": list(subjects),
         "split": list(splits),
         "class_name": list(classes),
-        **dict.fromkeys(("t_start_us", "t_end_us", "num_events"), whole),
+        **dict.fromkeys(("t_start_us", "t_end_us", "t_us", "num_events"), whole),
         **label_columns(labels),
     }
     return read_manifest(write_manifest(folder, pa.table(columns), tables.FRAMES))
