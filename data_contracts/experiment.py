@@ -66,6 +66,12 @@ class Baseline(Frozen):
     labels: LabelChoice | None = Field(
         None, description="which labels it is asked for, as `labels` of the experiment; None = as that"
     )
+    temporal_order: Literal[False] | None = Field(
+        None,
+        json_schema_extra=ADDED_LATER,
+        description="false = labels at random, where those of the experiment follow one another in time; its sampling "
+        "has noise 'independent'; None = as the experiment",
+    )
     part: str | None = Field(
         None,
         description="the dataset of a union that it learns from, and whose labels it is asked for; tested on all; "
@@ -302,17 +308,31 @@ class Experiment(Frozen):
 
     @model_validator(mode="after")
     def _stretches_are_asked_for(self) -> Experiment:
-        if self.temporal_order:
-            return self
-        if any(one.motion_layers is not None for one in (self, *self.baselines.values())):
-            raise ValueError("motion_layers make frames that follow one another: set temporal_order to true")
-        if any(one.sampling.get("noise") == "stretches" for one in (self, *self.baselines.values())):
-            raise ValueError(
-                "sampling.noise 'stretches' is for frames that follow one another: set temporal_order to true"
-            )
-        if self.stretch_length is not None:
+        for name, one in self.baselines.items():
+            if one.temporal_order is not None and not self.temporal_order:
+                raise ValueError(f"baselines.{name}.temporal_order: that of the experiment is false, leave it out")
+        for name in (None, *self.baselines):
+            one = self if name is None else self.baselines[name]
+            if self.in_temporal_order(name):
+                continue
+            where = "" if name is None else f"baselines.{name}."
+            if one.motion_layers is not None:
+                raise ValueError(
+                    f"{where}motion_layers make frames that follow one another: set temporal_order to true"
+                )
+            if one.sampling.get("noise") == "stretches":
+                raise ValueError(
+                    f"{where}sampling.noise 'stretches' is for frames that follow one another: set temporal_order to "
+                    "true, or noise to 'independent'"
+                )
+        if self.stretch_length is not None and not self.temporal_order:
             raise ValueError("stretch_length is of labels that follow one another: set temporal_order to true")
         return self
+
+    def in_temporal_order(self, baseline: str | None) -> bool:
+        """Whether the labels that a baseline, or the experiment's own generator, is asked for follow one another."""
+        own = None if baseline is None else self.baselines[baseline].temporal_order
+        return self.temporal_order if own is None else own
 
     @model_validator(mode="after")
     def _students_make_single_frames(self) -> Experiment:

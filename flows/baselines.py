@@ -62,7 +62,7 @@ def _make(experiment: Experiment, dataset: PreparedDataset, name: str, number: i
         dataset.frames,
         baseline.condition,
         part,
-        labels=experiment.labels_of(name),
+        baseline=name,
     )
     if isinstance(plugins.load("generators", baseline.generator.name), EventGenerator):
         synthetic = simulate(

@@ -160,18 +160,20 @@ def condition_asked_samples(
     condition: ConditionChoice,
     part: str | None = None,
     *,
-    labels: LabelChoice | None = None,
+    baseline: str | None = None,
 ) -> ManifestRef:
     """The conditions a generator is asked for; of the same labels for every condition of a `part`, or of all.
 
-    `labels` are those that the experiment asks for, unless they are given.
+    A `baseline` may ask for other labels than the experiment, or for such as do not follow one another in time.
     """
-    order, length = "in_time" if experiment.temporal_order else "random", stretch_length(experiment)
+    in_order = experiment.in_temporal_order(baseline)
+    order, length = ("in_time", stretch_length(experiment)) if in_order else ("random", None)
+    labels = experiment.labels if baseline is None else experiment.labels_of(baseline)
     return condition_samples(
         poses,
         recordings,
         frames,
-        choose_labels(experiment, poses, recordings, frames, labels or experiment.labels),
+        choose_labels(experiment, poses, recordings, frames, labels),
         condition=condition,
         encoding=experiment.encoding,
         windows=experiment.windows,

@@ -64,7 +64,14 @@ def test_covering_labels_are_the_farthest_poses_and_become_the_conditions(prepar
     # They are farther from one another than random ones are.
     random = read_manifest(condition_asked_samples(asked, recordings, recordings, frames, asked.condition))
     covering = read_manifest(
-        condition_asked_samples(asked, recordings, recordings, frames, asked.condition, labels="coverage")
+        condition_asked_samples(
+            experiment(baselines={"b": {"labels": "coverage"}}),
+            recordings,
+            recordings,
+            frames,
+            asked.condition,
+            baseline="b",
+        )
     )
     assert covering.column("source_id") == [f"{name}:{t}" for name, t in moments_of(table)]
     left = [

@@ -46,6 +46,41 @@ def plan(*overrides):
     return {row.key: row.stage for row in rows}
 
 
+def test_a_baseline_may_be_asked_for_labels_that_do_not_follow_one_another(monkeypatch, tmp_path):
+    monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
+    own = (*IN_TIME, "sampling.noise=stretches", "stretch_length=4", "sequence_length=4")
+    apart = "baselines={apart: {temporal_order: false, sampling: {noise: independent}}}"
+    experiment = smoke(*own, apart)
+    assert experiment.in_temporal_order(None) and not experiment.in_temporal_order("apart")
+    with_it, without = plan(*own, apart), plan(*own, "baselines={}")
+    stages = [with_it[key] for key in set(with_it) - set(without)]
+    assert stages.count("condition_samples") == 1 and "finetune" not in stages
+    in_time = "baselines={in_time: {sampling: {noise: independent}}}"
+    assert "condition_samples" not in [stage for key, stage in plan(*own, in_time).items() if key not in without]
+    # Keys of what was stored before there was a choice stay.
+    assert "temporal_order" not in smoke(*own, in_time).model_dump(mode="json")["baselines"]["in_time"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        ((*IN_TIME, "baselines={a: {temporal_order: true}}"), "baselines.a.temporal_order"),
+        (("temporal_order=false", "baselines={a: {temporal_order: false}}"), "that of the experiment is false"),
+        (
+            (*IN_TIME, "sampling.noise=stretches", "baselines={a: {temporal_order: false}}"),
+            "baselines.a.sampling.noise 'stretches' is for frames that follow one another",
+        ),
+        (
+            (*IN_TIME, "baselines={a: {temporal_order: false, motion_layers: {}}}"),
+            "baselines.a.motion_layers make frames that follow",
+        ),
+    ],
+)
+def test_labels_without_an_order_in_time_are_told_by_name(overrides, told):
+    with pytest.raises(PluginError, match=told):
+        smoke(*overrides)
+
+
 def test_only_its_stage_and_the_report_are_new(monkeypatch, tmp_path):
     monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
     assert "sequence_length" not in json.loads(smoke(*IN_TIME).model_dump_json())
