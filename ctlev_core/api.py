@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from ctlev_core.seeds import check_seed
 from data_contracts.config import Windows
-from data_contracts.events import Events
+from data_contracts.errors import DataError
+from data_contracts.events import Events, check_events
 from data_contracts.labels import Labels
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ def read_events(path: str | os.PathLike[str]) -> Events:
     """
     from ctlev_core.events.files import read_events_file
 
-    return read_events_file(Path(path))
+    return read_events_file(Path(path).expanduser())
 
 
 def read_frames(path: str | os.PathLike[str]) -> Iterator[CameraFrame]:
@@ -45,11 +47,11 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator[CameraFrame]:
     Returns:
         Each with `t` (us, as of the events), `exposure_us` and `pixels`, [H, W] or [H, W, 3] uint8.
     Raises:
-        DataError: no AEDAT 4 file, a cut or corrupt one, or not one stream of frames.
+        DataError: no AEDAT 4 file, a cut or corrupt one, or not one stream of frames; when the first is asked for.
     """
     from ctlev_core.events.camera_streams import read_camera_frames
 
-    return read_camera_frames(Path(path))
+    return read_camera_frames(Path(path).expanduser())
 
 
 def read_imu(path: str | os.PathLike[str]) -> ImuSamples:
@@ -63,7 +65,7 @@ def read_imu(path: str | os.PathLike[str]) -> ImuSamples:
     """
     from ctlev_core.events import camera_streams
 
-    return camera_streams.read_imu(Path(path))
+    return camera_streams.read_imu(Path(path).expanduser())
 
 
 def histogram(
@@ -85,6 +87,7 @@ def histogram(
     Returns:
         [N, C, H, W] uint16; channels (positive, negative), or one.
     Raises:
+        DataError: the events are not what `read_events` promises.
         ValueError: both kinds of windows were asked for, or a number is not positive.
     """
     from ctlev_core.encodings import event_histogram
@@ -92,6 +95,10 @@ def histogram(
 
     if num_events is not None and duration_us is not None:
         raise ValueError("histogram: give num_events or duration_us, not both")
+    for name, value in (("num_events", num_events), ("duration_us", duration_us)):
+        if value is not None and not 0 < value < 1 << 62:
+            raise ValueError(f"histogram: {name} must be above 0, got {value}")
+    check_events(events, "histogram")
     if num_events is None and duration_us is None:
         windows = np.array([[0, len(events)]], np.int64)
     elif num_events is not None:
@@ -109,13 +116,13 @@ def simulate(
 
     Args:
         frames: [T, H, W] linear intensity, white = 1; whole numbers are read as shares of 255.
-        times: [T] us, increasing; brightness changes linearly between frames.
+        times: [T] whole us, or NumPy's timedelta64, increasing; brightness changes linearly between frames.
         sensor: `ideal`, `noisy` or another key of `ctlev_core.sensor.options.PRESETS`, or the path of a YAML file.
         noise: factor on the sensor's faults; 0 = none.
-        seed: of the sensor's mismatch and of noise.
+        seed: of the sensor's mismatch and of noise, 0 or more.
     Raises:
-        DataError: shapes disagree, times do not increase, or an intensity is negative or not finite.
-        ValueError: an unknown sensor.
+        DataError: shapes disagree, times are not whole or do not increase, or an intensity is negative or not finite.
+        ValueError: an unknown sensor, or a seed or factor that cannot be.
     """
     from ctlev_core.sensor.choice import read_sensor
     from ctlev_core.sensor.dvs_pixel import simulate_events
@@ -123,8 +130,8 @@ def simulate(
     intensity = np.asarray(frames)
     if np.issubdtype(intensity.dtype, np.integer):
         intensity = intensity.astype(np.float32) / 255
-    options = read_sensor(str(sensor), noise)
-    return simulate_events(intensity, np.asarray(times).astype(np.int64), options, sensor_seed=seed, seed=seed)
+    options, seed = read_sensor(str(sensor), noise), check_seed(seed, "simulate")
+    return simulate_events(intensity, _whole_us(times, "simulate"), options, sensor_seed=seed, seed=seed)
 
 
 def simulate_video(
@@ -164,6 +171,7 @@ def simulate_video(
     from ctlev_core.video.simulation import VideoSimulation
 
     frames = open_frames(Path(path), FrameOptions(size=size, fps=fps, slow_motion=slow_motion))
+    seed = check_seed(seed, "simulate_video")
     simulation = VideoSimulation(frames, read_sensor(str(sensor), noise), seed=seed, marks=marks)
     chunks = list(simulation)
     assert simulation.size is not None
@@ -190,7 +198,7 @@ def normal_map(
         image_size: (width, height) px; the focal length is 1.5 times the shorter side.
         yaw_deg: turn of the camera around the body.
         pitch_deg: positive looks down.
-        distance_m: of the camera from the middle of the body.
+        distance_m: of the camera from the middle of the body, above 0.
         convention: one of `ctlev_core.render.normals.CONVENTIONS`.
     Returns:
         [H, W, 3] uint8, or [T, H, W, 3].
@@ -203,11 +211,16 @@ def normal_map(
     from ctlev_core.geometry.camera import orbit_rotation
     from ctlev_core.render.normals import render_normal_maps
 
+    if not np.isfinite([yaw_deg, pitch_deg, distance_m]).all() or distance_m <= 0:
+        told = f"{yaw_deg} degrees, {pitch_deg} degrees and {distance_m} m"
+        raise DataError(f"normal_map: yaw, pitch and a distance above 0 m must be finite, got {told}")
     if not isinstance(body, BodyModel):
         body = load_body(None if body is None else Path(body))
     angles = np.zeros(72) if pose is None else np.asarray(pose, np.float64)
     if angles.ndim not in (1, 2) or angles.shape[-1] != 72:
         raise ValueError(f"normal_map: pose must be [72] or [T, 72], got {angles.shape}")
+    if not angles.size:
+        return np.zeros((0, image_size[1], image_size[0], 3), np.uint8)
     rotations = matrix_from_axis_angle(angles.reshape(-1, 24, 3))
     shape = np.zeros(10) if betas is None else np.asarray(betas, np.float64)
     vertices, _ = pose_vertices(body, rotations, shape, np.zeros((len(rotations), 3)))
@@ -245,9 +258,11 @@ def skeleton_map(
     from ctlev_core.render.skeleton import draw_skeleton
 
     joints = _joints(joints2d, 2, "skeleton_map")
-    seen = _visible(joints, visible)
+    seen = _visible(joints, visible, "skeleton_map")
     rows = joints.reshape(-1, *joints.shape[-2:])
     known = joint_set or _joint_set(rows.shape[1])
+    if not len(rows):
+        return np.zeros((0, image_size[1], image_size[0], 3), np.uint8)
     images = [
         draw_skeleton(row, of_row, known, image_size, drawing)
         for row, of_row in zip(rows, seen.reshape(rows.shape[:2]), strict=True)
@@ -274,7 +289,7 @@ def mpjpe(
     target: npt.ArrayLike,
     *,
     visible: npt.ArrayLike | None = None,
-    alignment: Alignment = "pelvis",
+    alignment: Alignment | None = None,
     joint_set: str | None = None,
 ) -> float:
     """Mean distance between predicted and true joints: px in the image, mm in space (`ctlev_core.scoring.pose`).
@@ -283,18 +298,23 @@ def mpjpe(
         predicted: [N, J, 2] px or [N, J, 3] mm; one person may leave N out.
         target: the same; NaN = unknown, which does not count.
         visible: [N, J], in the image alone; None = all that are known.
-        alignment: in space, of each person before distances are taken: `pelvis`, `procrustes` or `none`.
+        alignment: in space alone, of each person before distances are taken: `pelvis`, `procrustes` or `none`; None =
+            `pelvis`.
         joint_set: as of `skeleton_map`; needed for `pelvis`.
     Raises:
-        ValueError: shapes differ, no joint counts, or a prediction is not finite.
+        ValueError: shapes differ, no joint counts, a prediction is not finite, or an option is not of these joints.
     """
     from ctlev_core.scoring.pose import compute_joint_errors_mm, compute_joint_errors_px
 
     size = np.shape(target)[-1:]
     if size == (3,):
+        if visible is not None:
+            raise ValueError("mpjpe: visible is of joints in the image; in space unknown ones are NaN")
         labels = _labels("joints3d", target, None, joint_set)
-        errors = compute_joint_errors_mm({"joints3d": _rows(predicted)}, labels, alignment)
+        errors = compute_joint_errors_mm({"joints3d": _rows(predicted)}, labels, alignment or "pelvis")
     else:
+        if alignment is not None:
+            raise ValueError(f"mpjpe: alignment is of joints in space, got {alignment!r} for joints in the image")
         labels = _labels("joints2d", target, visible, joint_set)
         errors = compute_joint_errors_px({"joints2d": _rows(predicted)}, labels)
     return float(np.nanmean(errors))
@@ -322,16 +342,17 @@ def pck(
         ValueError: shapes differ, no joint counts, or nobody has such a length.
     """
     from ctlev_core.metrics import pck2d
+    from ctlev_core.plugins import validate_options
 
     labels = _labels("joints2d", target, visible, joint_set)
-    options = pck2d.Options(threshold=threshold, normaliser=normaliser)
+    options = validate_options(pck2d.Options, {"threshold": threshold, "normaliser": normaliser}, "pck")
     (score,) = pck2d.compute({"joints2d": _rows(predicted)}, labels, options).values()
     return score
 
 
 def _labels(name: str, joints: npt.ArrayLike, visible: npt.ArrayLike | None, joint_set: str | None) -> Labels:
-    rows = _rows(_joints(joints, 2 if name == "joints2d" else 3, "target"))
-    seen = _visible(rows, None if visible is None else np.reshape(np.asarray(visible, bool), rows.shape[:2]))
+    found = _joints(joints, 2 if name == "joints2d" else 3, "target")
+    seen, rows = np.atleast_2d(_visible(found, visible, "target")), _rows(found)
     given: dict[str, Any] = {name: rows} | ({"visible": seen} if name == "joints2d" else {})
     known = joint_set or JOINT_SETS_BY_COUNT.get(rows.shape[1], "")
     return Labels(("",) * len(rows), np.zeros(len(rows), np.int64), joint_set=known, **given)
@@ -349,9 +370,27 @@ def _rows(joints: npt.ArrayLike) -> np.ndarray:
     return found if found.ndim == 3 else found[None]
 
 
-def _visible(joints: np.ndarray, visible: npt.ArrayLike | None) -> np.ndarray:
+def _visible(joints: np.ndarray, visible: npt.ArrayLike | None, where: str) -> np.ndarray:
     known = np.asarray(np.isfinite(joints).all(axis=-1))
-    return known if visible is None else known & np.asarray(visible, bool)
+    if visible is None:
+        return known
+    given = np.asarray(visible, bool)
+    if given.shape != known.shape:
+        raise ValueError(f"{where}: visible must be {list(known.shape)}, as the joints are, got {list(given.shape)}")
+    return known & given
+
+
+def _whole_us(times: npt.ArrayLike, where: str) -> np.ndarray:
+    """Times as int64 us; raises `DataError` where they are anything else than whole numbers or time differences."""
+    given = np.asarray(times)
+    if given.dtype.kind == "m":
+        return given.astype("timedelta64[us]").astype(np.int64)
+    is_whole = given.dtype.kind in "iuf" and bool((np.abs(given.astype(np.float64)) < 1 << 62).all())
+    if not is_whole or (given.dtype.kind == "f" and (given != np.rint(given)).any()):
+        raise DataError(
+            f"{where}: times must be whole microseconds, got {given.dtype} {given.reshape(-1)[:3].tolist()}"
+        )
+    return given.astype(np.int64)
 
 
 def _joint_set(count: int) -> str:
@@ -361,5 +400,6 @@ def _joint_set(count: int) -> str:
 
 
 __all__: Sequence[str] = [
-    "frechet", "histogram", "mpjpe", "normal_map", "pck", "read_events", "simulate", "skeleton_map",
+    "frechet", "histogram", "mpjpe", "normal_map", "pck", "read_events", "read_frames", "read_imu", "simulate",
+    "simulate_video", "skeleton_map",
 ]  # fmt: skip

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+import operator
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
+
+
+def check_seed(seed: int, where: str) -> int:
+    """The seed; raises `ValueError` where it is no whole number of 0 or more."""
+    try:
+        whole = -1 if isinstance(seed, bool) else operator.index(seed)
+    except TypeError:
+        whole = -1
+    if whole < 0:
+        raise ValueError(f"{where}: seed must be a whole number of 0 or more, got {seed!r}")
+    return whole
 
 
 def sample_seeds(seed: int, count: int) -> list[int]:

@@ -22,7 +22,7 @@ from ctlev_core.pixel_decoder.options import DECODER_FOLDER
 from ctlev_core.plugins import validate_options
 from ctlev_core.provenance.records import Record, read_provenance
 from ctlev_core.provenance.scores import GENERATOR_STAGES
-from ctlev_core.seeds import sample_seeds
+from ctlev_core.seeds import check_seed, sample_seeds
 from data_contracts.config import EncodingChoice
 from data_contracts.errors import DataError
 from data_contracts.home_folder import home_folder
@@ -86,7 +86,7 @@ class TrainedGenerator:
             prompts: texts, such as "A photo of cat"; one text serves all images.
             images: [N, H, W, 3] uint8 condition images, such as those of `skeleton_map` and `normal_map`, or one
                 [H, W, 3]; for generators that are asked by pictures.
-            seed: row i has the i-th seed that follows from it.
+            seed: 0 or more; row i has the i-th seed that follows from it.
             lengths: rows of each stretch whose frames follow one another in time, in order, for a generator with motion
                 layers or the option `noise="stretches"`; None = each frame is made by itself.
             options: the generator's `SampleOptions`, such as `num_inference_steps`, in place of those the run had;
@@ -94,11 +94,11 @@ class TrainedGenerator:
         Returns:
             [N, H, W, 3] uint8.
         Raises:
-            ValueError: nothing was asked for, numbers differ, or the generator takes something else.
+            ValueError: nothing was asked for, numbers differ, the seed is none, or the generator takes something else.
             PluginError: an unknown or wrong option.
             DataError: the checkpoint is broken.
         """
-        asked = _conditions(prompts, images)
+        asked, seed = _conditions(prompts, images), check_seed(seed, "sample")
         module: Any = plugins.load("generators", self.name)
         defaults = dict(self.defaults)
         if "scheduler" in options:
@@ -153,9 +153,9 @@ def load_generator(place: str | os.PathLike[str], home: str | os.PathLike[str] |
     Raises:
         DataError: there is no such run or folder, or it holds no generator.
     """
-    path = Path(place)
+    path = Path(place).expanduser()
     if path.is_dir():
-        return _of_folder(path)
+        return _of_folder(path.absolute())
     state = home_folder(home)
     report = state / "reports" / str(place)
     if not (report / "provenance.json").is_file():
@@ -234,9 +234,12 @@ def _conditions(prompts: str | Sequence[str] | None, images: npt.ArrayLike | Non
     count = None if pictures is None else len(pictures)
     if prompts is None and count is None:
         raise ValueError("sample: expected prompts, or images to be conditioned on")
-    texts = (
-        [PROMPT if prompts is None else prompts] * (count or 1) if isinstance(prompts, str | None) else list(prompts)
-    )
+    if isinstance(prompts, str | None):
+        texts = [PROMPT if prompts is None else prompts] * (1 if count is None else count)
+    else:
+        texts = list(prompts)
+    if not texts:
+        raise ValueError("sample: nothing was asked for, got no prompt and no image")
     if count is not None and len(texts) != count:
         raise ValueError(f"sample: {len(texts)} prompts for {count} images")
     return Conditions(tuple(texts), pictures)

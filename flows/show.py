@@ -55,7 +55,9 @@ def find_page(name: str | None, home: Path) -> tuple[Path | None, str]:
         return (by_age[-1], "") if by_age else (None, f"{home}: holds no report yet; `ctlev run` makes one")
     if name in pages:
         return pages[name], ""
-    for path in (Path(name), Path(name).with_name(f"{Path(name).name}.html"), Path(name) / PAGE):
+    for path in (
+        () if not Path(name).name else (Path(name), Path(name).with_name(f"{Path(name).name}.html"), Path(name) / PAGE)
+    ):
         if path.is_file():
             return path.absolute(), ""
     if len(name) >= 6 and set(name) <= set("0123456789abcdef"):

@@ -54,18 +54,9 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
         Exit status: 0 written, 2 wrong input; then nothing is left at `output`.
     """
     started = time.perf_counter()
-    signal_file = labels_file = None
     try:
         name = find_writer(output, options.format)
-        if options.marks and not getattr(plugins.load("formats", name), "HOLDS_SIGNAL", False):
-            signal_file = output.with_suffix(SIGNAL_SUFFIX)
-        if options.labels is not None:
-            labels_file = output.with_suffix(LABELS_SUFFIX)
-        read = [given for given in (source, options.labels) if given is not None and given.exists()]
-        for path in filter(None, (output, options.preview, signal_file, labels_file)):
-            _check_free(path, overwrite=options.overwrite)
-            if path.exists() and any(path.samefile(given) for given in read):
-                raise DataError(f"{path}: is what is read; choose another name to write to")
+        signal_file, labels_file, stale = _files_beside(source, output, name, options)
         from ctlev_core.events.files import write_event_chunks
         from ctlev_core.sensor.choice import read_sensor
         from ctlev_core.video.carried_labels import label_times, write_labels
@@ -96,6 +87,8 @@ def simulate_file(source: Path, output: Path, frames: FrameOptions, options: Sim
             if labels_file is not None and labels is not None and simulation.size is not None:
                 seen = simulation.frames, simulation.size
                 write_labels(partial[labels_file], labels, *seen, output.name, options.label_rate_hz)
+        for path in stale:
+            path.unlink()
         if preview is not None and options.preview is not None:
             preview.write(options.preview)
     except (DataError, PluginError, ValueError, OSError) as error:
@@ -164,6 +157,35 @@ def _watch_signal(chunks: Iterable[Events], signal: list[np.ndarray]) -> Iterato
         assert chunk.signal is not None
         signal.append(chunk.signal)
         yield chunk
+
+
+def _files_beside(
+    source: Path, output: Path, name: str, options: SimulateOptions
+) -> tuple[Path | None, Path | None, list[Path]]:
+    """The files of marks and of labels, None where none is written, and those there that are of earlier events.
+
+    Raises:
+        DataError: a file that is written, or goes, is there already, or is what is read.
+        ValueError: a rate of labels, and no labels.
+    """
+    signal_file = labels_file = None
+    if options.marks and not getattr(plugins.load("formats", name), "HOLDS_SIGNAL", False):
+        signal_file = output.with_suffix(SIGNAL_SUFFIX)
+    if options.labels is not None:
+        labels_file = output.with_suffix(LABELS_SUFFIX)
+    elif options.label_rate_hz is not None:
+        raise ValueError("--label-rate is of labels, and none are given: name their file with --labels")
+    read = [given for given in (source, options.labels) if given is not None and given.exists()]
+    for path in filter(None, (output, options.preview, signal_file, labels_file)):
+        _check_free(path, overwrite=options.overwrite)
+        if path.exists() and any(path.samefile(given) for given in read):
+            raise DataError(f"{path}: is what is read; choose another name to write to")
+    beside = [output.with_suffix(suffix) for suffix in (SIGNAL_SUFFIX, LABELS_SUFFIX)]
+    stale = [path for path in beside if path.is_file() and path not in (signal_file, labels_file)]
+    stale = [path for path in stale if not any(path.samefile(given) for given in read)]
+    for path in stale:
+        _check_free(path, overwrite=options.overwrite)
+    return signal_file, labels_file, stale
 
 
 def _check_free(path: Path, *, overwrite: bool) -> None:

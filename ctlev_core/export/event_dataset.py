@@ -87,6 +87,7 @@ class EventDataset(Dataset[Sample]):
     Raises:
         DataError: no such folder, a damaged one, no such split, an unknown class, or conditions that are not in
             the store any more.
+        ValueError: a class is named twice in `class_names`.
     """
 
     def __init__(
@@ -99,7 +100,7 @@ class EventDataset(Dataset[Sample]):
         class_names: Sequence[str] | None = None,
         transform: Callable[[Sample], Any] | None = None,
     ) -> None:
-        self.place = place.path if isinstance(place, ManifestRef) else Path(place).expanduser()
+        self.place = place.path if isinstance(place, ManifestRef) else Path(place).expanduser().absolute()
         if not isinstance(place, ManifestRef) and (self.place / MANIFEST_FILE).is_file():
             place = _reference(self.place)
         if isinstance(place, ManifestRef):
@@ -249,6 +250,8 @@ def _class_names(table: pa.Table, given: Sequence[str] | None, place: Path) -> t
     found = sorted(set(table["class_name"].to_pylist()) - {""})
     if given is None:
         return tuple(found)
+    if isinstance(given, str) or len(set(given)) < len(given):
+        raise ValueError(f"class_names must be different names, got {given!r}")
     unknown = [name for name in found if name not in given]
     if unknown:
         raise DataError(f"{place}: class {unknown[0]!r} is not one of the given class_names {list(given)}")

@@ -6,6 +6,7 @@ dataset[0]["image"]                                             # [16, 3, H, W]
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -33,6 +34,7 @@ class EventSequences(Dataset[Sample]):
 
     Raises:
         DataError: no images follow one another, or never so many.
+        TypeError: `length` or `step` is no whole number.
         ValueError: `length` or `step` is below 1, or the dataset has a transform.
     """
 
@@ -45,6 +47,7 @@ class EventSequences(Dataset[Sample]):
         transform: Callable[[Sample], Any] | None = None,
     ) -> None:
         step = length if step is None else step
+        length, step = operator.index(length), operator.index(step)
         if length < 1 or step < 1:
             raise ValueError(f"length and step must be 1 or more, got {length} and {step}")
         if dataset.transform is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from ctlev_core.sensor.options import PRESETS, SensorOptions, read_preset
@@ -32,10 +33,10 @@ def read_sensor(preset: str, noise: float = 1.0) -> SensorOptions:
         preset: a key of `PRESETS`, or the path of a YAML file as `read_preset` takes it.
         noise: factor on mismatch of thresholds, leak, shot noise and the number of hot pixels; 0 = none of them.
     Raises:
-        ValueError: an unknown preset, or a factor below 0.
+        ValueError: an unknown preset, or a factor that is below 0 or not finite.
         DataError: as `read_preset`.
     """
-    if not noise >= 0:
+    if not (math.isfinite(noise) and noise >= 0):
         raise ValueError(f"sensor: noise must be a factor of 0 or more, got {noise}")
     files = sensor_preset_files(check_sensor_preset(preset))
     options = read_preset(files[0]) if files else PRESETS[preset]

@@ -66,6 +66,8 @@ class FrameOptions:
         if not self.start_s >= 0 or (self.stop_s is not None and not self.stop_s > self.start_s):
             raise ValueError(f"start and stop must be ascending seconds from 0, got {self.start_s} and {self.stop_s}")
         if self.size is not None:
+            if not all(isinstance(side, int | np.integer) for side in self.size):
+                raise ValueError(f"size must be two whole numbers of px, got {self.size}")
             try:
                 check_sensor_size(self.size, "size")
             except DataError as error:

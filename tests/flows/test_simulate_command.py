@@ -235,6 +235,17 @@ def test_wrong_labels_leave_nothing(video, tmp_path, monkeypatch):
     monkeypatch.setattr("ctlev_core.video.label_files.check_frames", lambda *_: None)
     status, _, errors = invoke(video, tmp_path / "a.raw", "--labels", tmp_path / "in.csv", "--marks")
     assert status == 2 and "in.csv: labels of frame 12, expected frames 0 to 11" in errors
-    status, _, errors = invoke(video, tmp_path / "a.parquet", "--label-rate", 0)
+    status, _, errors = invoke(video, tmp_path / "a.parquet", "--labels", tmp_path / "in.csv", "--label-rate", 0)
     assert status == 2 and "label_rate_hz must be above 0" in errors
     assert [path.name for path in tmp_path.iterdir()] == ["in.csv"]
+
+
+def test_what_lies_beside_older_events_goes_with_them(video, tmp_path):
+    output, marks = tmp_path / "a.raw", tmp_path / "a.signal.npy"
+    assert invoke(video, output, "--marks")[0] == 0 and marks.exists()
+    assert invoke(video, output, "--overwrite")[0] == 0 and not marks.exists()
+    np.save(marks, np.ones(3, bool))
+    status, _, errors = invoke(video, tmp_path / "a.parquet")
+    assert status == 2 and "a.signal.npy: is there already" in errors and marks.exists()
+    status, _, errors = invoke(video, tmp_path / "b.raw", "--label-rate", 5)
+    assert status == 2 and "--label-rate is of labels, and none are given" in errors
