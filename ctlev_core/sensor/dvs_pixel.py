@@ -350,6 +350,6 @@ def _empty_columns(count: int, *, marks: bool) -> list[np.ndarray]:
 
 
 def _enlarged(column: np.ndarray, needed: int) -> np.ndarray:
-    larger = np.empty(max(needed, 2 * len(column)), column.dtype)
+    larger = np.empty(max(needed + 1, 2 * len(column)), column.dtype)
     larger[: len(column)] = column
     return larger

@@ -9,16 +9,28 @@ That is followed exactly, also between frames: crossings are roots of this expre
 the last moment at which its light began or ceased to change. While light stands still, the knot stays where it is, and
 a pixel is not looked at before something can happen (`due_us`): a still pixel costs two comparisons a frame.
 
-The two large functions are inlined because a call that hands on an array costs as much as a pixel takes.
+Pixels that have something to do are advanced in groups, stage by stage: light, curve, thresholds within reach, times of
+crossing, events, state. So the processor computes several pixels at once and guesses at few branches. A call that hands
+on an array costs as much as a pixel takes, so it is made once a group.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numba
 import numpy as np
+
+from ctlev_core.sensor.crossings import NOISE, find_crossing, find_turn, follow_pixel, share_arrived, solve_crossings
+from ctlev_core.sensor.pixel_math import (
+    draw_exponential,
+    draw_uniform,
+    log_response,
+    mix,
+    one_minus_exp,
+    shot_noise_rate,
+    time_constant_us,
+)
 
 
 class PixelState(NamedTuple):
@@ -57,14 +69,14 @@ class PixelTraits(NamedTuple):
     """Per us."""
 
 
-NOISE = 2
-"""Added to the polarity of an event that is noise."""
-
 BLOCK = 16
 """Pixels that are looked at together, whether any of them has something to do."""
 
-HALF_ROOT_BITS = 0x3FE6A09E667F3BCD
-"""sqrt(1 / 2) in IEEE 754 double precision."""
+GROUP = 512
+"""Pixels that have something to do and are advanced together."""
+
+MOST_CROSSINGS = 8
+"""Of one pixel in one interval; one with more is followed by itself."""
 
 
 class Physics(NamedTuple):
@@ -82,11 +94,11 @@ def start(intensity, traits, physics, starts_settled, seed, state):
     """The state of all pixels at the first frame, [P] intensity."""
     for i in range(len(intensity)):
         on, off = traits.threshold_on[i], traits.threshold_off[i]
-        random, share = _uniform(_mix(seed ^ _mix(np.uint64(i))))
-        state.random[i], state.allowance[i] = _exponential(random)
+        random, share = draw_uniform(mix(seed ^ mix(np.uint64(i))))
+        state.random[i], state.allowance[i] = draw_exponential(random)
         # A pixel that has been running for long may be anywhere between its two thresholds.
         state.difference[i] = share * (on + off) - off if starts_settled else 0.0
-        state.signal[i] = _log_response(np.float64(intensity[i]), physics.log_floor)
+        state.signal[i] = log_response(np.float64(intensity[i]), physics.log_floor)
         state.knot_us[i] = state.lag[i] = 0.0
         state.sent_us[i] = state.due_us[i] = -np.inf
         # Where a pixel starts part of the way to a threshold, nobody knows what took it there: half of it counts as the
@@ -96,9 +108,7 @@ def start(intensity, traits, physics, starts_settled, seed, state):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def advance(  # noqa: C901 calls that hand on arrays are slow here
-    before, after, begin_us, end_us, traits, physics, state, pixel, exact_us, pixels, polarity, count
-):
+def advance(before, after, begin_us, end_us, traits, physics, state, pixel, exact_us, pixels, polarity, count):
     """All pixels, from `pixel` on, from one frame to the next.
 
     Args:
@@ -119,8 +129,8 @@ def advance(  # noqa: C901 calls that hand on arrays are slow here
         was no room: that pixel was left as it is, and wants so many rows at least.
     """
     due_us = state.due_us
-    marks = len(state.reference_us) > 0
-    responses = np.empty(BLOCK)
+    group, crossings = _new_group(), _new_crossings()
+    number = 0
     for first in range(pixel - pixel % BLOCK, len(after), BLOCK):
         last = min(first + BLOCK, len(after))
         # Sums and minima, because the processor takes those of several pixels at once.
@@ -129,30 +139,19 @@ def advance(  # noqa: C901 calls that hand on arrays are slow here
             change += abs(np.float64(after[i]) - np.float64(before[i]))
         for i in range(first, last):
             soonest_us = min(soonest_us, due_us[i])
-        if change == 0.0 and end_us < soonest_us:
-            continue
-        for i in range(first, last):
-            responses[i - first] = _log_response(np.float64(after[i]), physics.log_floor)
-        for i in range(max(first, pixel), last):
-            light_before, light = np.float64(before[i]), np.float64(after[i])
-            if light_before == light and end_us < due_us[i]:
-                continue
-            since_us = state.reference_us[i] if marks else 0.0
-            (knot_us, signal, lag, difference, allowance, sent_us, random, due, since_us), end = _advance_pixel(
-                light_before, light, responses[i - first], begin_us, end_us,
-                traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_noise_rate[i],
-                traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i],
-                state.allowance[i], state.sent_us[i], state.random[i], since_us, exact_us, polarity, count,
-            )  # fmt: skip
-            if end > len(exact_us):
-                return i, count, end
-            state.knot_us[i], state.signal[i], state.lag[i], state.difference[i] = knot_us, signal, lag, difference
-            state.allowance[i], state.sent_us[i], state.random[i], due_us[i] = allowance, sent_us, random, due
-            if marks:
-                state.reference_us[i] = since_us
-            for row in range(count, end):
-                pixels[row] = i
-            count = end
+        if change != 0.0 or end_us >= soonest_us:
+            for i in range(max(first, pixel), last):
+                group.pixel[number] = i
+                group.light_before[number] = before[i]
+                group.light[number] = after[i]
+                number += after[i] != before[i] or end_us >= due_us[i]
+        if number > 0 and (number > GROUP - BLOCK or last == len(after)):
+            end = _advance_group(
+                group, crossings, number, begin_us, end_us, traits, physics, state, exact_us, pixels, polarity, count
+            )
+            if end >= len(exact_us):
+                return group.pixel[0], count, end
+            count, number = end, 0
     return len(after), count, count
 
 
@@ -163,195 +162,304 @@ def advance_chosen(
     """As `advance`, of the pixels `chosen` [K] alone.
 
     `before` and `after` [K] are their intensities, and `number` is which of them to begin with. Returns as `advance`;
-    the first is K when all is done. Its step stands here once more: shared through an inlined function, `advance` took
-    2.5 times as long.
+    the first is K when all is done.
     """
-    marks = len(state.reference_us) > 0
+    group, crossings = _new_group(), _new_crossings()
+    filled, first = 0, number
     for k in range(number, len(chosen)):
-        i = chosen[k]
-        light_before, light = np.float64(before[k]), np.float64(after[k])
-        if light_before == light and end_us < state.due_us[i]:
-            continue
-        since_us = state.reference_us[i] if marks else 0.0
-        (knot_us, signal, lag, difference, allowance, sent_us, random, due, since_us), end = _advance_pixel(
-            light_before, light, _log_response(light, physics.log_floor), begin_us, end_us,
-            traits.threshold_on[i], traits.threshold_off[i], traits.leak[i], traits.shot_noise_rate[i],
-            traits.hot_rate[i], physics, state.knot_us[i], state.signal[i], state.lag[i], state.difference[i],
-            state.allowance[i], state.sent_us[i], state.random[i], since_us, exact_us, polarity, count,
-        )  # fmt: skip
-        if end > len(exact_us):
-            return k, count, end
-        state.knot_us[i], state.signal[i], state.lag[i], state.difference[i] = knot_us, signal, lag, difference
-        state.allowance[i], state.sent_us[i], state.random[i], state.due_us[i] = allowance, sent_us, random, due
-        if marks:
-            state.reference_us[i] = since_us
-        for row in range(count, end):
-            pixels[row] = i
-        count = end
+        group.pixel[filled] = chosen[k]
+        group.light_before[filled] = before[k]
+        group.light[filled] = after[k]
+        filled += after[k] != before[k] or end_us >= state.due_us[chosen[k]]
+        if filled == GROUP or (filled > 0 and k == len(chosen) - 1):
+            end = _advance_group(
+                group, crossings, filled, begin_us, end_us, traits, physics, state, exact_us, pixels, polarity, count
+            )
+            if end >= len(exact_us):
+                return first, count, end
+            count, filled, first = end, 0, k + 1
     return len(chosen), count, count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _advance_pixel(
-    light_before, light, response, begin_us, end_us, on, off, leak, shot, hot, physics, knot_us, signal, lag,
-    difference, allowance, sent_us, random, since_us, exact_us, polarity, count,
-):  # fmt: skip
-    """One pixel from one frame to the next: its new `PixelState`, and the rows filled."""
-    still_us = begin_us - knot_us
-    is_still = light == light_before
-    if is_still:
-        rate = hot + _shot_noise_rate(light, shot, physics)
-        s, s_end, slope, gain, lag_us = still_us, end_us - knot_us, leak, -lag, _lag_us(light, physics)
+class Group(NamedTuple):
+    """Pixels that are looked at together, [GROUP] each, because the processor computes several at once."""
+
+    pixel: np.ndarray
+    """uint64."""
+    light_before: np.ndarray
+    light: np.ndarray
+    response: np.ndarray
+    """To the light at the end."""
+    lag_us: np.ndarray
+    """Time constant of the low-pass; 0 = none."""
+    arrived: np.ndarray
+    """1 - exp(-s / lag_us) at the end."""
+    end: np.ndarray
+    """s at the end."""
+    slope: np.ndarray
+    gain: np.ndarray
+    rate: np.ndarray
+    """Noise events a us."""
+    lag: np.ndarray
+    difference: np.ndarray
+    allowance: np.ndarray
+    sent_us: np.ndarray
+    random: np.ndarray
+    reference_us: np.ndarray
+    busy: np.ndarray
+    """uint64: numbers of those of which something may happen."""
+
+
+class Crossings(NamedTuple):
+    """Thresholds that are crossed by the pixels of a group, [GROUP * MOST_CROSSINGS] each.
+
+    What is crossed downwards is turned over, so that all rise.
+    """
+
+    owner: np.ndarray
+    """uint64, number in the group."""
+    step: np.ndarray
+    """The threshold; negative = OFF; 0 = this pixel is to be followed by itself."""
+    slope: np.ndarray
+    """In units of the time constant."""
+    gain: np.ndarray
+    target: np.ndarray
+    latest: np.ndarray
+    """End of the interval, in time constants,"""
+    curve: np.ndarray
+    """and how far the difference comes by then."""
+    at: np.ndarray
+    """When, in time constants; NaN = not found."""
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _new_group():
+    # Rows a power of two apart would share few places in the cache. Indices without a sign are not asked for it.
+    numbers = np.zeros((14, GROUP + 24))
+    lists = np.empty((2, GROUP), np.uint64)
+    return Group(
+        lists[0], numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7],
+        numbers[8], numbers[9], numbers[10], numbers[11], numbers[12], np.empty(GROUP, np.uint64), numbers[13],
+        lists[1],
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _new_crossings():
+    numbers = np.empty((7, GROUP * MOST_CROSSINGS + 40))
+    return Crossings(
+        np.empty(GROUP * MOST_CROSSINGS, np.uint64), numbers[0], numbers[1], numbers[2], numbers[3], numbers[4],
+        numbers[5], numbers[6],
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _advance_group(
+    group, crossings, number, begin_us, end_us, traits, physics, state, exact_us, pixels, polarity, count
+):
+    """The first `number` pixels of a group from one frame to the next; returns the rows needed.
+
+    Where these are more than there are, no pixel has changed.
+    """
+    _lights(group, number, end_us - begin_us, physics)
+    num_busy = _curves(group, number, begin_us, end_us, traits, physics, state)
+    found = _list_crossings(group, crossings, num_busy, traits, physics, state)
+    if physics.cutoff_dark_hz > 0.0:
+        solve_crossings(
+            crossings.slope, crossings.gain, crossings.target, crossings.latest, crossings.curve, crossings.at, found
+        )
+    end = _events(group, crossings, found, begin_us, traits, physics, state, exact_us, pixels, polarity, count)
+    if end < len(exact_us):
+        _settle(group, number, num_busy, end_us, traits, state)
+    return end
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lights(group, number, span_us, physics):
+    """What depends on light alone."""
+    light_before, light = group.light_before, group.light
+    response, lag_us, arrived = group.response, group.lag_us, group.arrived
+    for k in range(number):
+        response[k] = log_response(light[k], physics.log_floor)
+    if physics.cutoff_dark_hz > 0.0:
+        for k in range(number):
+            lag_us[k] = time_constant_us(0.5 * (light_before[k] + light[k]), physics)
+        for k in range(number):
+            arrived[k] = one_minus_exp(span_us / lag_us[k])
     else:
-        if still_us > 0.0:
-            settled = lag * _arrived(still_us, _lag_us(light_before, physics), lag)
-            difference += leak * still_us - settled
-            lag -= settled
-            allowance -= (hot + _shot_noise_rate(light_before, shot, physics)) * still_us
-        middle = 0.5 * (light_before + light)
-        rate = hot + _shot_noise_rate(middle, shot, physics)
-        signal_before, signal = signal, response
-        s_end, lag_us = end_us - begin_us, _lag_us(middle, physics)
-        ramp = (signal - signal_before) / s_end
-        knot_us, s, slope, gain = begin_us, 0.0, ramp + leak, -(lag + ramp * lag_us)
-    arrived = _arrived(s_end, lag_us, gain)
-    end = count
-    highest = difference + max(slope * s_end, 0.0) + max(gain, 0.0)
-    lowest = difference + min(slope * s_end, 0.0) + min(gain, 0.0)
-    may_cross = highest >= on or lowest <= -off
-    if may_cross or rate * s_end >= allowance:
-        difference, allowance, sent_us, random, since_us, end = _follow(
-            knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, may_cross,
-            physics.refractory_us, sent_us, random, leak, since_us, exact_us, polarity, count,
-        )  # fmt: skip
-    # When it is due is worked out once it stands still.
-    due_us = -np.inf
-    if is_still:
-        due_us = _due_us(knot_us, difference, lag, leak, on, off, allowance, rate)
-    else:
-        knot_us = end_us
-        lag += gain * arrived
-        difference += slope * s_end + gain * arrived
-        allowance -= rate * s_end
-    return (knot_us, signal, lag, difference, allowance, sent_us, random, due_us, since_us), end
+        lag_us[:number] = 0.0
+        arrived[:number] = 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _follow(
-    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, seeks, refractory_us,
-    sent_us, random, leak, since_us, exact_us, polarity, count,
-):  # fmt: skip
-    """Events of one pixel from s to s_end after its knot; writes as far as there is room, then counts on.
-
-    `arrived` is 1 - exp(-s_end / lag_us); `seeks` says whether a threshold is within reach. Thresholds that are crossed
-    are taken off the `difference` at the knot.
-    """
-    curve_end = slope * s_end + gain * arrived
-    turn, curve_turn, rises_first, rises_last = s_end, curve_end, slope > 0.0, slope > 0.0
-    if seeks and gain != 0.0:
-        turn, curve_turn, rises_first, rises_last = _turn(slope, gain, lag_us, arrived, s_end, curve_end)
-    crossing_at, rises = np.inf, False
-    while True:
-        if seeks:
-            crossing_at, rises = _seek(
-                difference, slope, gain, lag_us, on, off, s, turn, curve_turn, rises_first, s_end, curve_end, rises_last
-            )
-            seeks = False
-        noise_at = max(allowance / rate, s) if rate * s_end >= allowance else np.inf
-        at = min(crossing_at, noise_at)
-        # Far too little room: what is missing is not counted to its end.
-        if at > s_end or count > 2 * len(exact_us):
-            return difference, allowance, sent_us, random, since_us, count
-        is_on, is_noise = rises, True
-        if noise_at < crossing_at:
-            random, choice = _uniform(random)
-            random, more = _exponential(random)
-            is_on = choice * rate < 0.5 * (rate + hot)
-            allowance += more
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _curves(group, number, begin_us, end_us, traits, physics, state):
+    """The way of each difference, and how many pixels are busy: those of which something may happen."""
+    num_busy = 0
+    has_lag = physics.cutoff_dark_hz > 0.0
+    for k in range(number):
+        i = group.pixel[k]
+        light_before, light, lag_us = group.light_before[k], group.light[k], group.lag_us[k]
+        on, off, leak = traits.threshold_on[i], traits.threshold_off[i], traits.leak[i]
+        hot, shot = traits.hot_rate[i], traits.shot_noise_rate[i]
+        difference, lag, allowance = state.difference[i], state.lag[i], state.allowance[i]
+        still_us = begin_us - state.knot_us[i]
+        is_still = light == light_before
+        if is_still:
+            s_end, slope, gain = end_us - state.knot_us[i], leak, -lag
+            group.arrived[k] = share_arrived(s_end, lag_us, gain)
         else:
-            difference -= on if rises else -off
-            seeks = True
-            # The rest of the way was light's.
-            is_noise = rises and leak * (knot_us + at - since_us) > 0.5 * on
-            since_us = knot_us + at
-        s = at
-        if knot_us + at - sent_us >= refractory_us:
-            sent_us = knot_us + at
-            if count < len(exact_us):
-                exact_us[count] = sent_us
-                polarity[count] = is_on + NOISE * is_noise
-            count += 1
+            if still_us > 0.0:
+                settled = lag * share_arrived(still_us, time_constant_us(light_before, physics), lag)
+                difference += leak * still_us - settled
+                lag -= settled
+                allowance -= (hot + shot_noise_rate(light_before, shot, physics)) * still_us
+            ramp = (group.response[k] - state.signal[i]) / (end_us - begin_us)
+            s_end, slope, gain = end_us - begin_us, ramp + leak, -(lag + ramp * lag_us)
+        rate = hot + shot_noise_rate(0.5 * (light_before + light), shot, physics)
+        arrived = group.arrived[k]
+        group.end[k], group.slope[k], group.gain[k], group.rate[k] = s_end, slope, gain, rate
+        group.lag[k], group.difference[k], group.allowance[k] = lag, difference, allowance
+        highest = difference + max(slope * s_end, 0.0) + max(gain, 0.0)
+        lowest = difference + min(slope * s_end, 0.0) + min(gain, 0.0)
+        may_cross = (highest >= on) | (lowest <= -off)
+        rises, turns = _direction(slope, gain, lag_us, arrived, has_lag)
+        crosses = (slope * s_end + gain * arrived >= (on if rises else -off) - difference) == rises
+        # Without branches, which no processor would foresee.
+        group.busy[num_busy] = k
+        num_busy += (may_cross & (crosses | turns | is_still)) | (rate * s_end >= allowance)
+    return num_busy
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _seek(
-    difference, slope, gain, lag_us, on, off, s, turn, curve_turn, rises_first, s_end, curve_end, rises_last
-):  # fmt: skip
-    """When from s on the difference reaches a threshold, and whether it rises to it; inf = not before s_end."""
-    if s < turn:
-        target = (on if rises_first else -off) - difference
-        if (curve_turn >= target) == rises_first:
-            return _crossing(target, slope, gain, lag_us, s, turn, rises_first), rises_first
-    if s >= turn or turn < s_end:
-        target = (on if rises_last else -off) - difference
-        if (curve_end >= target) == rises_last:
-            return _crossing(target, slope, gain, lag_us, max(s, turn), s_end, rises_last), rises_last
-    return np.inf, False
+def _direction(slope, gain, lag_us, arrived, has_lag):
+    """Whether the difference rises at first, and whether it turns round later."""
+    if not has_lag:
+        return slope > 0.0, False
+    rises = slope * lag_us + gain > 0.0
+    return rises, rises != (slope * lag_us + gain * (1.0 - arrived) > 0.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _turn(slope, gain, lag_us, arrived, s_end, curve_end):
-    """Where line and exponential pull apart, the difference may turn round once; s_end = it does not.
+def _list_crossings(group, crossings, num_busy, traits, physics, state):
+    """What each busy pixel crosses, where that is all that happens to it; the others are to be followed one by one.
 
-    Returns when, how far the curve has come by then, and whether it rises before and after.
+    Returns how many entries of `crossings` there are.
     """
-    rises_first, rises_last = slope * lag_us + gain > 0.0, slope * lag_us + gain * (1.0 - arrived) > 0.0
-    if rises_first == rises_last:
-        return s_end, curve_end, rises_first, rises_last
-    turn = min(max(-lag_us * math.log(-slope * lag_us / gain), 0.0), s_end)
-    return turn, slope * turn - gain * math.expm1(-turn / lag_us), rises_first, rises_last
+    found = 0
+    has_lag = physics.cutoff_dark_hz > 0.0
+    for number in range(num_busy):
+        k = group.busy[number]
+        i = group.pixel[k]
+        slope, gain, lag_us, s_end = group.slope[k], group.gain[k], group.lag_us[k], group.end[k]
+        arrived, rest = group.arrived[k], group.difference[k]
+        group.sent_us[k], group.random[k] = state.sent_us[i], state.random[i]
+        if len(state.reference_us) > 0:
+            group.reference_us[k] = state.reference_us[i]
+        rises, turns = _direction(slope, gain, lag_us, arrived, has_lag)
+        step = traits.threshold_on[i] if rises else -traits.threshold_off[i]
+        sign = 1.0 if rises else -1.0
+        curve_end = slope * s_end + gain * arrived
+        begin = found
+        moves_without_noise = group.light[k] != group.light_before[k] and group.rate[k] * s_end < group.allowance[k]
+        if turns and moves_without_noise:
+            _, curve_turn, _, rises_last = find_turn(slope, gain, lag_us, arrived, s_end, curve_end)
+            last_step = traits.threshold_on[i] if rises_last else -traits.threshold_off[i]
+            if ((curve_turn >= step - rest) != rises) and ((curve_end >= last_step - rest) != rises_last):
+                continue  # it turns round before a threshold, and does not reach the other
+        if not turns and moves_without_noise:
+            while found < begin + MOST_CROSSINGS and (curve_end >= step - rest) == rises:
+                crossings.owner[found], crossings.step[found] = k, step
+                if has_lag:
+                    crossings.slope[found], crossings.gain[found] = sign * (slope * lag_us), sign * gain
+                    crossings.target[found], crossings.latest[found] = sign * (step - rest), s_end / lag_us
+                    crossings.curve[found] = sign * curve_end
+                else:
+                    crossings.at[found] = (step - rest) / slope
+                rest -= step
+                found += 1
+        if found == begin or found == begin + MOST_CROSSINGS:
+            crossings.owner[begin], crossings.step[begin] = k, 0.0
+            crossings.slope[begin], crossings.gain[begin] = 1.0, 0.0
+            crossings.target[begin], crossings.latest[begin], crossings.curve[begin] = 0.0, 1.0, 1.0
+            found = begin + 1
+    return found
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _crossing(target, slope, gain, lag_us, low, high, rises):
-    """Where slope s + gain (1 - exp(-s / lag_us)), monotonic from low to high, reaches `target`.
+def _events(group, crossings, found, begin_us, traits, physics, state, exact_us, pixels, polarity, count):
+    """Write the events of a group in the order of its pixels; returns the rows needed.
 
-    Halley's method in a bracket, from the root of the parabola that osculates at `low`.
+    The last row is for what there is no room for.
     """
-    if gain == 0.0:
-        return min(max(target / slope, low), high)
-    # In units of the time constant after `low`: a x + b (1 - exp(-x)) = c.
-    less_one = math.expm1(-low / lag_us)
-    a, b, c = slope * lag_us, gain * (1.0 + less_one), target - slope * low + gain * less_one
-    x_low, x_high = 0.0, (high - low) / lag_us
-    root = (a + b) * (a + b) - 2.0 * b * c
-    x = 2.0 * c / (a + b + math.copysign(math.sqrt(root), a + b)) if root >= 0.0 and a + b != 0.0 else -1.0
-    if not 0.0 <= x <= x_high:
-        x = 0.5 * x_high
-    for _ in range(100):
-        less_one = math.expm1(-x)
-        excess = a * x - b * less_one - c
-        if (excess >= 0.0) == rises:
-            x_high = x
+    room = len(exact_us) - 1
+    has_lag = physics.cutoff_dark_hz > 0.0
+    marks = len(state.reference_us) > 0
+    before, at = np.uint64(GROUP), 0.0
+    for n in range(found):
+        k, step, next_at = crossings.owner[n], crossings.step[n], crossings.at[n]
+        i = group.pixel[k]
+        if step == 0.0:
+            still_us = begin_us - state.knot_us[i] if group.light[k] == group.light_before[k] else 0.0
+            sent_us, reference_us, end = group.sent_us[k], group.reference_us[k], count
+            group.difference[k], group.allowance[k], sent_us, group.random[k], reference_us, end = follow_pixel(
+                begin_us - still_us, still_us, group.end[k], group.slope[k], group.gain[k], group.lag_us[k],
+                group.arrived[k], traits.threshold_on[i], traits.threshold_off[i], group.difference[k],
+                group.allowance[k], group.rate[k], traits.hot_rate[i], True, physics.refractory_us, sent_us,
+                group.random[k], traits.leak[i], reference_us, exact_us, polarity, count,
+            )  # fmt: skip
+            group.sent_us[k], group.reference_us[k] = sent_us, reference_us
+            for row in range(count, min(end, room)):
+                pixels[row] = i
+            count = end
+            continue
+        at = at if k == before else 0.0
+        if has_lag:
+            next_at *= group.lag_us[k]
+            if not next_at >= 0.0:
+                next_at = find_crossing(
+                    step - group.difference[k], group.slope[k], group.gain[k], group.lag_us[k], at, group.end[k],
+                    step > 0.0,
+                )  # fmt: skip
+        at, before = min(max(next_at, at), group.end[k]), k
+        group.difference[k] -= step
+        moment_us = begin_us + at
+        is_noise = False
+        if marks:
+            is_noise = step > 0.0 and traits.leak[i] * (moment_us - group.reference_us[k]) > 0.5 * step
+            group.reference_us[k] = moment_us
+        is_sent = moment_us - group.sent_us[k] >= physics.refractory_us
+        group.sent_us[k] = moment_us if is_sent else group.sent_us[k]
+        row = min(count, room)
+        exact_us[row], pixels[row], polarity[row] = moment_us, i, (step > 0.0) + NOISE * is_noise
+        count += is_sent
+    return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _settle(group, number, num_busy, end_us, traits, state):
+    """The state of the pixels of a group at the end of the interval."""
+    for k in range(number):
+        i = group.pixel[k]
+        if group.light[k] == group.light_before[k]:
+            state.difference[i], state.allowance[i] = group.difference[k], group.allowance[k]
+            state.due_us[i] = _due_us(
+                state.knot_us[i], group.difference[k], group.lag[k], traits.leak[i], traits.threshold_on[i],
+                traits.threshold_off[i], group.allowance[k], group.rate[k],
+            )  # fmt: skip
         else:
-            x_low = x
-        pull = b * (1.0 + less_one)
-        velocity = a + pull
-        divisor = velocity * velocity + 0.5 * excess * pull
-        x_new = x - excess * velocity / divisor if divisor != 0.0 else x_low
-        if not x_low <= x_new <= x_high:
-            x_new = 0.5 * (x_low + x_high)
-        moved, x = abs(x_new - x), x_new
-        # Each step cubes the relative error.
-        if moved <= 1e-7 * x:
-            break
-    return low + x * lag_us
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _arrived(s, lag_us, gain):
-    """1 - exp(-s / lag_us), where there is anything to multiply it by."""
-    return -math.expm1(-s / lag_us) if gain != 0.0 else 0.0
+            # When it is due is worked out once it stands still.
+            state.due_us[i] = -np.inf
+            s_end, bend = group.end[k], group.gain[k] * group.arrived[k]
+            state.knot_us[i], state.signal[i] = end_us, group.response[k]
+            state.lag[i] = group.lag[k] + bend
+            state.difference[i] = group.difference[k] + (group.slope[k] * s_end + bend)
+            state.allowance[i] = group.allowance[k] - group.rate[k] * s_end
+    for n in range(num_busy):
+        k = group.busy[n]
+        i = group.pixel[k]
+        state.sent_us[i], state.random[i] = group.sent_us[k], group.random[k]
+        if len(state.reference_us) > 0:
+            state.reference_us[i] = group.reference_us[k]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -363,59 +471,3 @@ def _due_us(knot_us, difference, lag, leak, on, off, allowance, rate):
     leaks_at = (on - highest) / leak if leak > 0.0 else np.inf
     noise_at = allowance / rate if rate > 0.0 else np.inf
     return knot_us + min(leaks_at, noise_at)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _shot_noise_rate(light, shot, physics):
-    """Shot noise events a us under this light."""
-    return shot * (1.0 - (1.0 - physics.shot_noise_rate_bright) * min(light, 1.0))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _lag_us(light, physics):
-    """Time constant of the photoreceptor under this light; 0 = there is no low-pass."""
-    if physics.cutoff_dark_hz <= 0.0:
-        return 0.0
-    cutoff_hz = physics.cutoff_dark_hz + (physics.cutoff_bright_hz - physics.cutoff_dark_hz) * min(light, 1.0)
-    return 1e6 / (2.0 * math.pi * cutoff_hz)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _log_response(light, log_floor):
-    """Log above the floor, its tangent below: finite at zero, without a kink.
-
-    The logarithm is worked out here, to an ulp or two, because the library's does one number at a time, and a loop
-    over this one takes several: log(2^k m) = k log(2) + 2 artanh((m - 1) / (m + 1)) with m in [0.71, 1.41].
-    """
-    above = np.float64(max(light, log_floor))
-    bits = np.int64(above.view(np.int64))
-    exponent = (bits - HALF_ROOT_BITS) >> 52
-    mantissa = np.int64(bits - (exponent << 52)).view(np.float64)
-    z = (mantissa - 1.0) / (mantissa + 1.0)
-    w = z * z
-    series = 1 / 19 + w * (1 / 21 + w * (1 / 23))
-    series = 1 / 13 + w * (1 / 15 + w * (1 / 17 + w * series))
-    series = 1 / 7 + w * (1 / 9 + w * (1 / 11 + w * series))
-    series = w * (1 / 3 + w * (1 / 5 + w * series))
-    return exponent * math.log(2.0) + (2.0 * z + 2.0 * z * series) + min(light - log_floor, 0.0) / log_floor
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _mix(value):
-    """The finaliser of splitmix64: every bit of the result depends on every bit of the value."""
-    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return value ^ (value >> np.uint64(31))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _uniform(random):
-    """The next state of a generator, and a number in [0, 1)."""
-    random = random + np.uint64(0x9E3779B97F4A7C15)
-    return random, (_mix(random) >> np.uint64(11)) * (1.0 / (1 << 53))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _exponential(random):
-    random, uniform = _uniform(random)
-    return random, -math.log1p(-uniform)

@@ -1,5 +1,6 @@
 """The DVS pixel against closed forms, its promises about chunks and budgets, hard cases, and its noise's statistics."""
 
+import dataclasses
 import itertools
 import math
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from ctlev_core.sensor.dvs_pixel import (
     PRESETS,
     EventBudgetError,
+    PixelMaps,
     Sensor,
     SensorOptions,
     join,
@@ -18,6 +20,7 @@ from ctlev_core.sensor.dvs_pixel import (
     sample_pixel_maps,
     simulate_events,
 )
+from ctlev_core.sensor.pixel_math import one_minus_exp
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 
@@ -154,6 +157,45 @@ def test_any_chunks_give_the_same_events(seed, cuts, is_float32):
 
 def make_sensor(options, max_events=None):
     return Sensor((4, 3), options, sensor_seed=1, seed=2, max_events=max_events)
+
+
+@pytest.mark.parametrize("cutoff_dark_hz", [None, 20.0])
+def test_a_pixel_sends_the_same_whatever_others_do(cutoff_dark_hz):
+    """Pixels are advanced in groups: some still, some with one crossing, with many, or with a turn between frames."""
+    options = SensorOptions(
+        threshold_sigma=0.03, cutoff_dark_hz=cutoff_dark_hz, refractory_us=700, leak_rate_hz=5.0, starts_settled=False
+    )
+    intensity, t_us = flicker(11, height=40, width=61)  # a group of 512 pixels ends within a row
+    rng = np.random.default_rng(0)
+    intensity[12] = intensity[11]
+    intensity[20, rng.random((40, 61)) < 0.05] *= 1e5
+    maps = sample_pixel_maps((61, 40), options, 3)
+    events, exact_us = Sensor((61, 40), options, sensor_seed=3, seed=4, maps=maps).push_exact(intensity, t_us)
+    assert len(events) > 100_000
+    for y, x in rng.integers(0, (40, 61), (60, 2)):
+        own = PixelMaps(*(getattr(maps, field.name)[y : y + 1, x : x + 1] for field in dataclasses.fields(maps)))
+        alone = Sensor((1, 1), options, sensor_seed=3, seed=4, maps=own)
+        expected, expected_us = alone.push_exact(np.ascontiguousarray(intensity[:, y : y + 1, x : x + 1]), t_us)
+        here = (events.x == x) & (events.y == y)
+        np.testing.assert_array_equal(exact_us[here], expected_us)
+        np.testing.assert_array_equal(events.p[here], expected.p)
+
+
+def test_events_of_one_microsecond_are_in_raster_order():
+    """Also where one pixel of a group is followed by itself and the others together."""
+    intensity, _ = flicker(12, num_frames=24, height=20, width=30)
+    options = SensorOptions(cutoff_dark_hz=1e5, cutoff_bright_hz=2e5, starts_settled=False)
+    events = simulate(intensity, np.arange(24) * 3, options)
+    pixel = events.y.astype(int) * 30 + events.x
+    together = (events.t[1:] == events.t[:-1]) & (events.t[1:] % 3 != 0)  # intervals end at multiples of 3
+    assert together.sum() > 500
+    assert (np.diff(pixel)[together] >= 0).all()
+
+
+def test_the_exponential_of_the_low_pass_is_that_of_the_library():
+    x = np.concatenate([[0.0], np.geomspace(1e-300, 1e300, 4001), np.linspace(0.3, 0.4, 1001), np.arange(1, 70)])
+    found = np.array([one_minus_exp(value) for value in x])
+    np.testing.assert_allclose(found, -np.expm1(-x), rtol=4.5e-16, atol=0)
 
 
 def test_a_chunk_may_end_in_the_middle_of_a_crossing():
