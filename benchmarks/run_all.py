@@ -1,7 +1,7 @@
 """Every benchmark of this folder, one after the other, and one page of what they found.
 
     pip install -c constraints.txt -e '.[bench]'
-    python benchmarks/run_all.py                    # about an hour on an idle machine; writes benchmarks/RESULTS.md
+    python benchmarks/run_all.py                    # two hours on an idle machine; writes benchmarks/RESULTS.md
     python benchmarks/run_all.py training metrics   # these anew, the others as they were last found
 
 What each printed is kept in `build/benchmarks`. Lines that say whether a target was met are shown first; the page says
@@ -47,6 +47,7 @@ ALL = (
     Benchmark("downstream"),
     Benchmark("training"),
     Benchmark("training_compiled", ("--set", "compile_networks=true"), script="training"),
+    Benchmark("time_to_loss"),
     Benchmark("sampling"),
     Benchmark("arrays"),
     Benchmark("operations"),

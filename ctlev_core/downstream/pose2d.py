@@ -23,8 +23,8 @@ from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.supervised.augmentation import draw_flips, draw_shifts
 from ctlev_core.supervised.frame_sequences import ages_in, find_sequences, find_training_sequences
 from ctlev_core.supervised.image_shifts import shift_images
-from ctlev_core.supervised.options import SupervisedOptions
-from data_contracts.config import ADDED_LATER, RUN_SETTING, cache_material
+from ctlev_core.supervised.options import SequenceOptions
+from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels, check_labels
@@ -37,7 +37,7 @@ NAME = "pose2d"
 PREDICTS = ("joints2d",)
 
 
-class Options(SupervisedOptions):
+class Options(SequenceOptions):
     """Network, loss, decoding and training budget."""
 
     width: float = Field(default=1.0, gt=0, description="factor on the channel counts; 1 = DHP19, 218,592 parameters")
@@ -68,13 +68,6 @@ class Options(SupervisedOptions):
     )
     shift_px: int = Field(
         default=0, ge=0, description="move training images by up to so many px in x and y; black moves in"
-    )
-    sequence_length: int = Field(
-        default=1,
-        ge=1,
-        json_schema_extra=ADDED_LATER,
-        description="frames of a recording, one after another, that a recurrent unit looks back over; batch_size then "
-        "counts sequences; 1 = no such unit",
     )
 
 
@@ -167,7 +160,7 @@ def train_sequences(
     def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
         import torch
 
-        chosen, lengths = sequences.ending_at(rows)
+        chosen, lengths = sequences.ending_at(rows, single=len(rows) > options.batch_size)
         images, points, seen = _grey(frames[chosen]), joints2d[chosen], visible[chosen]
         if generator is not None:
             sequence = np.repeat(np.arange(len(rows)), lengths)

@@ -26,8 +26,8 @@ from ctlev_core.geometry.joint_sets import joint_indices
 from ctlev_core.networks.resnet_files import ARCHITECTURES, check_batch, check_resnet_folder
 from ctlev_core.supervised.augmentation import BodySamples, mirror_half, shift
 from ctlev_core.supervised.frame_sequences import find_sequences, find_training_sequences
-from ctlev_core.supervised.options import SupervisedOptions
-from data_contracts.config import ADDED_LATER, RUN_SETTING, cache_material
+from ctlev_core.supervised.options import SequenceOptions
+from data_contracts.config import RUN_SETTING, cache_material
 from data_contracts.errors import DataError
 from data_contracts.image_rows import Images
 from data_contracts.labels import History, Labels, check_labels
@@ -44,7 +44,7 @@ SKELETON = ("joints", "joint_shapedirs")
 """What joints are made of: those at rest [24, 3] m and how shape moves them [24, 3, 10]."""
 
 
-class Options(SupervisedOptions):
+class Options(SequenceOptions):
     """Network, loss weights and training budget."""
 
     architecture: Literal["resnet10-quarter", "resnet10-half", "resnet18", "resnet34", "resnet50"] = Field(
@@ -77,13 +77,6 @@ class Options(SupervisedOptions):
     flip: bool = Field(default=True, description="mirror half of the training images together with their bodies")
     shift_px: int = Field(
         default=0, ge=0, description="move training images by up to so many px in x and y; black moves in"
-    )
-    sequence_length: int = Field(
-        default=1,
-        ge=1,
-        json_schema_extra=ADDED_LATER,
-        description="frames of a recording, one after another, that a recurrent unit looks back over; batch_size then "
-        "counts sequences; 1 = no such unit; Event-HPE: 8",
     )
 
 
@@ -169,7 +162,7 @@ def train_sequences(
     body = _skeleton(options.body).to(device)
 
     def compute_loss(rows: np.ndarray, generator: np.random.Generator | None) -> torch.Tensor:
-        chosen, lengths = sequences.ending_at(rows)
+        chosen, lengths = sequences.ending_at(rows, single=len(rows) > options.batch_size)
         batch = BodySamples(*(array[chosen] for array in data))
         if generator is not None:
             sequence = np.repeat(np.arange(len(rows)), lengths)

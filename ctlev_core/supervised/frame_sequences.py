@@ -32,15 +32,16 @@ class FrameSequences:
     starts: np.ndarray
     length: int
 
-    def ending_at(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def ending_at(self, rows: np.ndarray, *, single: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """The sequences of some rows.
 
         Args:
             rows: [S] last rows, in any order.
+            single: each row is a sequence by itself.
         Returns:
             Rows [M] of the sequences, one sequence after the other, and the lengths [S] of the sequences.
         """
-        lengths = np.minimum(rows - self.starts[rows] + 1, self.length)
+        lengths = np.minimum(rows - self.starts[rows] + 1, 1 if single else self.length)
         return np.repeat(rows - lengths + 1, lengths) + ages_in(lengths), lengths
 
 

@@ -95,7 +95,7 @@ def train_model(
     with bar, deterministic(next(model.parameters()).device):
         while run.state.step < options.num_steps and not run.is_over():
             step = run.state.step
-            batch = rows.batch(options.batch_size, seed, step)
+            batch = rows.batch(options.batch_size_at(step), seed, step)
             run.update(compute_loss(batch, np.random.default_rng([seed, _STREAM_STEP, step])))
             if len(rows.held_back) and (run.is_at(options.validation_every) or run.state.step == options.num_steps):
                 run.validate(compute_loss, rows.held_back)

@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from data_contracts.config import RUN_SETTING, Frozen
+from data_contracts.config import ADDED_LATER, RUN_SETTING, Frozen
 
 
 class SupervisedOptions(Frozen):
@@ -51,8 +51,37 @@ class SupervisedOptions(Frozen):
         default="auto", description="torch device; auto = CUDA where present", json_schema_extra=RUN_SETTING
     )
 
+    def batch_size_at(self, step: int) -> int:
+        """Rows of a step's batch."""
+        return self.batch_size
+
     @model_validator(mode="after")
     def _patience_needs_rows_held_back(self) -> Self:
         if self.patience and not self.validation_share:
             raise ValueError("patience needs a validation_share above 0: without rows held back nothing can get better")
         return self
+
+
+class SequenceOptions(SupervisedOptions):
+    """Of models that can look at several frames of a recording, one after another."""
+
+    sequence_length: int = Field(
+        default=1,
+        ge=1,
+        json_schema_extra=ADDED_LATER,
+        description="frames of a recording, one after another, that a recurrent unit looks back over; batch_size then "
+        "counts sequences; 1 = no such unit; Event-HPE: 8",
+    )
+    single_frame_share: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        json_schema_extra=ADDED_LATER,
+        description="share of the steps, the first ones, that learn from single frames before sequences are looked at; "
+        "a batch then has sequence_length times as many, which are less alike than those of sequences",
+    )
+
+    def batch_size_at(self, step: int) -> int:
+        """Rows of a step's batch: more than `batch_size` are single frames."""
+        is_single = step < round(self.single_frame_share * self.num_steps)
+        return self.batch_size * (self.sequence_length if is_single else 1)

@@ -29,7 +29,7 @@ SEED = 5
 @pytest.fixture(scope="module")
 def benchmarks():
     """The modules, which import one another by their bare names."""
-    names = ("interleaved", "diffusers_loop", "training", "sampling", "gpu")
+    names = ("interleaved", "diffusers_loop", "training", "sampling", "gpu", "time_to_loss")
     threads = torch.get_num_threads()
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(BENCHMARKS))
@@ -240,3 +240,21 @@ def test_networks_alone_cost_what_their_layers_do(benchmarks, base_model_folder,
     one, two = networks.batch(1), networks.batch(2)
     assert isinstance(two, Batch) and len(two.latents) == len(two.conditions) == 2
     assert networks.count_flops(two) == pytest.approx(2 * networks.count_flops(one), rel=0.05)
+
+
+@pytest.mark.parametrize("route", ["controlnet", "text"])
+def test_time_to_loss_compares_the_same_loss(benchmarks, monkeypatch, base_model_folder, route):
+    """Both loops start from the same loss, which no training changes, and end with finite ones."""
+    module = benchmarks.time_to_loss
+    monkeypatch.setattr(
+        module, "load", lambda route: load_base_model(base_model_folder, with_controlnet=route == "controlnet")
+    )
+    rows = module.Rows(*make_data(4, with_images=route == "controlnet"))
+    untrained = module.loss_of(module.load(route), rows)
+    options = benchmarks.training.make_options(2, "float32")
+    runs = [
+        module.run_example(route, rows, rows, 1e-3, 4),
+        module.run_ours("ours", route, rows, rows, options, "unet" if route == "text" else "both", 3),
+    ]
+    assert module.loss_of(module.load(route), rows) == untrained
+    assert all(np.isfinite(run.loss) and run.loss != untrained and run.seconds > 0 for run in runs)

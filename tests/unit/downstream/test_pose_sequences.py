@@ -10,6 +10,7 @@ from safetensors.torch import load_file, save_file
 from ctlev_core.downstream import pose2d
 from ctlev_core.geometry.joint_sets import JOINT_SETS
 from ctlev_core.supervised.batches import TrainingRows
+from ctlev_core.supervised.frame_sequences import FrameSequences
 from data_contracts.config import cache_material
 from data_contracts.labels import Labels
 
@@ -236,3 +237,53 @@ def test_what_only_the_past_shows_is_learnt(tmp_path):
         errors_px[length] = np.linalg.norm(found - target.joints2d, axis=-1)[:, 0]
     assert errors_px[4][still].mean() < 0.5 * errors_px[1][still].mean()
     assert errors_px[4][~still].mean() < 1.2 * errors_px[1][~still].mean()
+
+
+def test_the_first_steps_may_learn_from_single_frames(tmp_path, monkeypatch):
+    """As many frames a batch as sequences would have, and no past; afterwards sequences as ever."""
+    seen, ending_at = [], FrameSequences.ending_at
+
+    def note(sequences, rows, **further):
+        chosen, lengths = ending_at(sequences, rows, **further)
+        seen.append(lengths.tolist())
+        return chosen, lengths
+
+    monkeypatch.setattr(FrameSequences, "ending_at", note)
+    train(tmp_path, ["a"] * 24, count=24, single_frame_share=0.5)
+    assert len(seen) == 8
+    assert all(lengths == [1] * 4 * LENGTH for lengths in seen[:4])
+    assert all(len(lengths) == 4 and max(lengths) == LENGTH for lengths in seen[4:])
+
+
+def test_single_frames_first_are_what_a_network_of_single_frames_learns_from(tmp_path):
+    """Until sequences come, the rest of the network is trained as without a recurrent unit would see it."""
+    both = pose2d.Options(**{**TINY, "single_frame_share": 0.5, "num_steps": 8})
+    single = pose2d.Options(**{**TINY, "sequence_length": 1, "batch_size": 4 * LENGTH})
+    rows = TrainingRows((np.arange(50),), 1.0, np.zeros(0, np.int64))
+    for step in range(4):
+        batches = [rows.batch(options.batch_size_at(step), 0, step) for options in (both, single)]
+        np.testing.assert_array_equal(*batches)
+    assert [both.batch_size_at(step) for step in range(8)] == [4 * LENGTH] * 4 + [4] * 4
+
+
+def test_a_run_interrupted_among_single_frames_ends_in_the_same_model(tmp_path, monkeypatch):
+    names = ["a"] * 10
+    whole = weights(train(tmp_path / "whole", names, single_frame_share=0.6))
+    stopped = tmp_path / "stopped"
+    batch = TrainingRows.batch
+
+    def stop(rows, size, seed, step):
+        if step == 3:
+            raise KeyboardInterrupt
+        return batch(rows, size, seed, step)
+
+    monkeypatch.setattr(TrainingRows, "batch", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(stopped, names, single_frame_share=0.6)
+    monkeypatch.undo()
+    assert weights(train(stopped, names, single_frame_share=0.6)) == whole
+
+
+def test_without_single_frames_nothing_has_another_key():
+    assert "single_frame_share" not in cache_material(pose2d.Options(**TINY))
+    assert cache_material(pose2d.Options(**TINY, single_frame_share=0.5))["single_frame_share"] == 0.5
