@@ -261,8 +261,8 @@ def test_single_frames_first_are_what_a_network_of_single_frames_learns_from(tmp
     single = pose2d.Options(**{**TINY, "sequence_length": 1, "batch_size": 4 * LENGTH})
     rows = TrainingRows((np.arange(50),), 1.0, np.zeros(0, np.int64))
     for step in range(4):
-        batches = [rows.batch(options.batch_size_at(step), 0, step) for options in (both, single)]
-        np.testing.assert_array_equal(*batches)
+        first, second = (rows.batch(options.batch_size_at(step), 0, step) for options in (both, single))
+        np.testing.assert_array_equal(first, second)
     assert [both.batch_size_at(step) for step in range(8)] == [4 * LENGTH] * 4 + [4] * 4
 
 
