@@ -9,28 +9,19 @@ That is followed exactly, also between frames: crossings are roots of this expre
 the last moment at which its light began or ceased to change. While light stands still, the knot stays where it is, and
 a pixel is not looked at before something can happen (`due_us`): a still pixel costs two comparisons a frame.
 
-Pixels that have something to do are advanced in groups, stage by stage: light, curve, thresholds within reach, times of
-crossing, events, state. So the processor computes several pixels at once and guesses at few branches. A call that hands
-on an array costs as much as a pixel takes, so it is made once a group.
+Pixels that have something to do are advanced in groups, stage by stage: light, curves, thresholds within reach, times
+of crossings, events, state. So loops are vectorised, and few branches are mispredicted. A call that hands on an array
+costs as much as a pixel takes; it is made once a group. All is in one file because Numba's cache of a function does not
+notice that a function of another file, which it calls, has changed.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba
 import numpy as np
-
-from ctlev_core.sensor.crossings import NOISE, find_crossing, find_turn, follow_pixel, share_arrived, solve_crossings
-from ctlev_core.sensor.pixel_math import (
-    draw_exponential,
-    draw_uniform,
-    log_response,
-    mix,
-    one_minus_exp,
-    shot_noise_rate,
-    time_constant_us,
-)
 
 
 class PixelState(NamedTuple):
@@ -72,6 +63,12 @@ class PixelTraits(NamedTuple):
 BLOCK = 16
 """Pixels that are looked at together, whether any of them has something to do."""
 
+NOISE = 2
+"""Added to the polarity of an event that is noise."""
+
+HALF_ROOT_BITS = 0x3FE6A09E667F3BCD
+"""sqrt(1 / 2) in IEEE 754 double precision."""
+
 GROUP = 512
 """Pixels that have something to do and are advanced together."""
 
@@ -94,11 +91,11 @@ def start(intensity, traits, physics, starts_settled, seed, state):
     """The state of all pixels at the first frame, [P] intensity."""
     for i in range(len(intensity)):
         on, off = traits.threshold_on[i], traits.threshold_off[i]
-        random, share = draw_uniform(mix(seed ^ mix(np.uint64(i))))
-        state.random[i], state.allowance[i] = draw_exponential(random)
+        random, share = _draw_uniform(_mix(seed ^ _mix(np.uint64(i))))
+        state.random[i], state.allowance[i] = _draw_exponential(random)
         # A pixel that has been running for long may be anywhere between its two thresholds.
         state.difference[i] = share * (on + off) - off if starts_settled else 0.0
-        state.signal[i] = log_response(np.float64(intensity[i]), physics.log_floor)
+        state.signal[i] = _log_response(np.float64(intensity[i]), physics.log_floor)
         state.knot_us[i] = state.lag[i] = 0.0
         state.sent_us[i] = state.due_us[i] = -np.inf
         # Where a pixel starts part of the way to a threshold, nobody knows what took it there: half of it counts as the
@@ -181,8 +178,11 @@ def advance_chosen(
     return len(chosen), count, count
 
 
+# Groups of pixels -----------------------------------------------------------------------------------------------------
+
+
 class Group(NamedTuple):
-    """Pixels that are looked at together, [GROUP] each, because the processor computes several at once."""
+    """Pixels that are advanced together, [GROUP] each, float64 where nothing else is said."""
 
     pixel: np.ndarray
     """uint64."""
@@ -234,7 +234,7 @@ class Crossings(NamedTuple):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _new_group():
-    # Rows a power of two apart would share few places in the cache. Indices without a sign are not asked for it.
+    # Rows a power of two apart would compete for the same cache lines. Unsigned indices need no check for negatives.
     numbers = np.zeros((14, GROUP + 24))
     lists = np.empty((2, GROUP), np.uint64)
     return Group(
@@ -265,7 +265,7 @@ def _advance_group(
     num_busy = _curves(group, number, begin_us, end_us, traits, physics, state)
     found = _list_crossings(group, crossings, num_busy, traits, physics, state)
     if physics.cutoff_dark_hz > 0.0:
-        solve_crossings(
+        _solve_crossings(
             crossings.slope, crossings.gain, crossings.target, crossings.latest, crossings.curve, crossings.at, found
         )
     end = _events(group, crossings, found, begin_us, traits, physics, state, exact_us, pixels, polarity, count)
@@ -280,12 +280,12 @@ def _lights(group, number, span_us, physics):
     light_before, light = group.light_before, group.light
     response, lag_us, arrived = group.response, group.lag_us, group.arrived
     for k in range(number):
-        response[k] = log_response(light[k], physics.log_floor)
+        response[k] = _log_response(light[k], physics.log_floor)
     if physics.cutoff_dark_hz > 0.0:
         for k in range(number):
-            lag_us[k] = time_constant_us(0.5 * (light_before[k] + light[k]), physics)
+            lag_us[k] = _time_constant_us(0.5 * (light_before[k] + light[k]), physics)
         for k in range(number):
-            arrived[k] = one_minus_exp(span_us / lag_us[k])
+            arrived[k] = _one_minus_exp(span_us / lag_us[k])
     else:
         lag_us[:number] = 0.0
         arrived[:number] = 0.0
@@ -306,16 +306,16 @@ def _curves(group, number, begin_us, end_us, traits, physics, state):
         is_still = light == light_before
         if is_still:
             s_end, slope, gain = end_us - state.knot_us[i], leak, -lag
-            group.arrived[k] = share_arrived(s_end, lag_us, gain)
+            group.arrived[k] = _share_arrived(s_end, lag_us, gain)
         else:
             if still_us > 0.0:
-                settled = lag * share_arrived(still_us, time_constant_us(light_before, physics), lag)
+                settled = lag * _share_arrived(still_us, _time_constant_us(light_before, physics), lag)
                 difference += leak * still_us - settled
                 lag -= settled
-                allowance -= (hot + shot_noise_rate(light_before, shot, physics)) * still_us
+                allowance -= (hot + _shot_noise_rate(light_before, shot, physics)) * still_us
             ramp = (group.response[k] - state.signal[i]) / (end_us - begin_us)
             s_end, slope, gain = end_us - begin_us, ramp + leak, -(lag + ramp * lag_us)
-        rate = hot + shot_noise_rate(0.5 * (light_before + light), shot, physics)
+        rate = hot + _shot_noise_rate(0.5 * (light_before + light), shot, physics)
         arrived = group.arrived[k]
         group.end[k], group.slope[k], group.gain[k], group.rate[k] = s_end, slope, gain, rate
         group.lag[k], group.difference[k], group.allowance[k] = lag, difference, allowance
@@ -324,7 +324,7 @@ def _curves(group, number, begin_us, end_us, traits, physics, state):
         may_cross = (highest >= on) | (lowest <= -off)
         rises, turns = _direction(slope, gain, lag_us, arrived, has_lag)
         crosses = (slope * s_end + gain * arrived >= (on if rises else -off) - difference) == rises
-        # Without branches, which no processor would foresee.
+        # Without a branch, which would be mispredicted half of the time.
         group.busy[num_busy] = k
         num_busy += (may_cross & (crosses | turns | is_still)) | (rate * s_end >= allowance)
     return num_busy
@@ -362,7 +362,7 @@ def _list_crossings(group, crossings, num_busy, traits, physics, state):
         begin = found
         moves_without_noise = group.light[k] != group.light_before[k] and group.rate[k] * s_end < group.allowance[k]
         if turns and moves_without_noise:
-            _, curve_turn, _, rises_last = find_turn(slope, gain, lag_us, arrived, s_end, curve_end)
+            _, curve_turn, _, rises_last = _find_turn(slope, gain, lag_us, arrived, s_end, curve_end)
             last_step = traits.threshold_on[i] if rises_last else -traits.threshold_off[i]
             if ((curve_turn >= step - rest) != rises) and ((curve_end >= last_step - rest) != rises_last):
                 continue  # it turns round before a threshold, and does not reach the other
@@ -401,7 +401,7 @@ def _events(group, crossings, found, begin_us, traits, physics, state, exact_us,
         if step == 0.0:
             still_us = begin_us - state.knot_us[i] if group.light[k] == group.light_before[k] else 0.0
             sent_us, reference_us, end = group.sent_us[k], group.reference_us[k], count
-            group.difference[k], group.allowance[k], sent_us, group.random[k], reference_us, end = follow_pixel(
+            group.difference[k], group.allowance[k], sent_us, group.random[k], reference_us, end = _follow_pixel(
                 begin_us - still_us, still_us, group.end[k], group.slope[k], group.gain[k], group.lag_us[k],
                 group.arrived[k], traits.threshold_on[i], traits.threshold_off[i], group.difference[k],
                 group.allowance[k], group.rate[k], traits.hot_rate[i], True, physics.refractory_us, sent_us,
@@ -416,7 +416,7 @@ def _events(group, crossings, found, begin_us, traits, physics, state, exact_us,
         if has_lag:
             next_at *= group.lag_us[k]
             if not next_at >= 0.0:
-                next_at = find_crossing(
+                next_at = _find_crossing(
                     step - group.difference[k], group.slope[k], group.gain[k], group.lag_us[k], at, group.end[k],
                     step > 0.0,
                 )  # fmt: skip
@@ -471,3 +471,234 @@ def _due_us(knot_us, difference, lag, leak, on, off, allowance, rate):
     leaks_at = (on - highest) / leak if leak > 0.0 else np.inf
     noise_at = allowance / rate if rate > 0.0 else np.inf
     return knot_us + min(leaks_at, noise_at)
+
+
+# Crossings ------------------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _solve_crossings(slope, gain, target, latest, curve, at, number):
+    """When slope x + gain (1 - exp(-x)), rising to `curve` from 0 to `latest`, reaches `target`."""
+    for n in range(number):
+        a, b, c, end = slope[n], gain[n], target[n], latest[n]
+        # From v x / (1 + w x), which leaves 0 as steeply and arrives at the same place.
+        velocity = a + b
+        x = c / (velocity - (velocity / curve[n] - 1.0 / end) * c)
+        x = x if 0.0 <= x <= end else 0.5 * end
+        low, high, x, moved = _halley(a, b, c, 0.0, end, x)
+        low, high, x, moved = _halley(a, b, c, low, high, x)
+        low, high, x, moved = _halley(a, b, c, low, high, x)
+        # Each step cubes the relative error.
+        at[n] = x if moved <= 1e-7 * x else np.nan
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _halley(a, b, c, low, high, x):
+    """A step of Halley's method in a bracket."""
+    share = _one_minus_exp(x)
+    excess = a * x + b * share - c
+    high = x if excess >= 0.0 else high
+    low = low if excess >= 0.0 else x
+    pull = b * (1.0 - share)
+    velocity = a + pull
+    x_new = x - excess * velocity / (velocity * velocity + 0.5 * excess * pull)
+    x_new = x_new if low <= x_new <= high else 0.5 * (low + high)
+    return low, high, x_new, abs(x_new - x)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _find_crossing(target, slope, gain, lag_us, low, high, rises):
+    """Where slope s + gain (1 - exp(-s / lag_us)), monotonic from low to high, reaches `target`.
+
+    Halley's method in a bracket, from the root of the parabola that osculates at `low`.
+    """
+    if gain == 0.0:
+        return min(max(target / slope, low), high)
+    # In units of the time constant after `low`: a x + b (1 - exp(-x)) = c.
+    less_one = math.expm1(-low / lag_us)
+    a, b, c = slope * lag_us, gain * (1.0 + less_one), target - slope * low + gain * less_one
+    x_low, x_high = 0.0, (high - low) / lag_us
+    root = (a + b) * (a + b) - 2.0 * b * c
+    x = 2.0 * c / (a + b + math.copysign(math.sqrt(root), a + b)) if root >= 0.0 and a + b != 0.0 else -1.0
+    if not 0.0 <= x <= x_high:
+        x = 0.5 * x_high
+    for _ in range(100):
+        less_one = math.expm1(-x)
+        excess = a * x - b * less_one - c
+        if (excess >= 0.0) == rises:
+            x_high = x
+        else:
+            x_low = x
+        pull = b * (1.0 + less_one)
+        velocity = a + pull
+        divisor = velocity * velocity + 0.5 * excess * pull
+        x_new = x - excess * velocity / divisor if divisor != 0.0 else x_low
+        if not x_low <= x_new <= x_high:
+            x_new = 0.5 * (x_low + x_high)
+        moved, x = abs(x_new - x), x_new
+        # Each step cubes the relative error.
+        if moved <= 1e-7 * x:
+            break
+    return low + x * lag_us
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _find_turn(slope, gain, lag_us, arrived, s_end, curve_end):
+    """Where line and exponential pull apart, the difference may turn round once; s_end = it does not.
+
+    Returns when, how far the curve has come by then, and whether it rises before and after.
+    """
+    rises_first, rises_last = slope * lag_us + gain > 0.0, slope * lag_us + gain * (1.0 - arrived) > 0.0
+    if rises_first == rises_last:
+        return s_end, curve_end, rises_first, rises_last
+    turn = min(max(-lag_us * math.log(-slope * lag_us / gain), 0.0), s_end)
+    return turn, slope * turn - gain * math.expm1(-turn / lag_us), rises_first, rises_last
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _next_crossing(
+    difference, slope, gain, lag_us, on, off, s, turn, curve_turn, rises_first, s_end, curve_end, rises_last
+):  # fmt: skip
+    """When from s on the difference reaches a threshold, and whether it rises to it; inf = not before s_end."""
+    if s < turn:
+        target = (on if rises_first else -off) - difference
+        if (curve_turn >= target) == rises_first:
+            return _find_crossing(target, slope, gain, lag_us, s, turn, rises_first), rises_first
+    if s >= turn or turn < s_end:
+        target = (on if rises_last else -off) - difference
+        if (curve_end >= target) == rises_last:
+            return _find_crossing(target, slope, gain, lag_us, max(s, turn), s_end, rises_last), rises_last
+    return np.inf, False
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _share_arrived(s, lag_us, gain):
+    """1 - exp(-s / lag_us), where there is anything to multiply it by."""
+    return -math.expm1(-s / lag_us) if gain != 0.0 else 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _follow_pixel(
+    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, seeks, refractory_us,
+    sent_us, random, leak, since_us, exact_us, polarity, count,
+):  # fmt: skip
+    """Events of one pixel from s to s_end after its knot; writes as far as there is room, then counts on.
+
+    `arrived` is 1 - exp(-s_end / lag_us); `seeks` says whether a threshold is within reach. Thresholds that are crossed
+    are taken off the `difference` at the knot.
+    """
+    curve_end = slope * s_end + gain * arrived
+    turn, curve_turn, rises_first, rises_last = s_end, curve_end, slope > 0.0, slope > 0.0
+    if seeks and gain != 0.0:
+        turn, curve_turn, rises_first, rises_last = _find_turn(slope, gain, lag_us, arrived, s_end, curve_end)
+    crossing_at, rises = np.inf, False
+    while True:
+        if seeks:
+            crossing_at, rises = _next_crossing(
+                difference, slope, gain, lag_us, on, off, s, turn, curve_turn, rises_first, s_end, curve_end, rises_last
+            )
+            seeks = False
+        noise_at = max(allowance / rate, s) if rate * s_end >= allowance else np.inf
+        at = min(crossing_at, noise_at)
+        # Far too little room: what is missing is not counted to its end.
+        if at > s_end or count > 2 * len(exact_us):
+            return difference, allowance, sent_us, random, since_us, count
+        is_on, is_noise = rises, True
+        if noise_at < crossing_at:
+            random, choice = _draw_uniform(random)
+            random, more = _draw_exponential(random)
+            is_on = choice * rate < 0.5 * (rate + hot)
+            allowance += more
+        else:
+            difference -= on if rises else -off
+            seeks = True
+            # The rest of the way was light's.
+            is_noise = rises and leak * (knot_us + at - since_us) > 0.5 * on
+            since_us = knot_us + at
+        s = at
+        if knot_us + at - sent_us >= refractory_us:
+            sent_us = knot_us + at
+            if count < len(exact_us):
+                exact_us[count] = sent_us
+                polarity[count] = is_on + NOISE * is_noise
+            count += 1
+
+
+# Light and random numbers ---------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _log_response(light, log_floor):
+    """Log above the floor, its tangent below: finite at zero, without a kink.
+
+    The logarithm is worked out here, to an ulp or two, because the library's does one number at a time, and a loop
+    over this one takes several: log(2^k m) = k log(2) + 2 artanh((m - 1) / (m + 1)) with m in [0.71, 1.41].
+    """
+    above = np.float64(max(light, log_floor))
+    bits = np.int64(above.view(np.int64))
+    exponent = (bits - HALF_ROOT_BITS) >> 52
+    mantissa = np.int64(bits - (exponent << 52)).view(np.float64)
+    z = (mantissa - 1.0) / (mantissa + 1.0)
+    w = z * z
+    series = 1 / 19 + w * (1 / 21 + w * (1 / 23))
+    series = 1 / 13 + w * (1 / 15 + w * (1 / 17 + w * series))
+    series = 1 / 7 + w * (1 / 9 + w * (1 / 11 + w * series))
+    series = w * (1 / 3 + w * (1 / 5 + w * series))
+    return exponent * math.log(2.0) + (2.0 * z + 2.0 * z * series) + min(light - log_floor, 0.0) / log_floor
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _time_constant_us(light, physics):
+    """Time constant of the photoreceptor under this light; 0 = there is no low-pass."""
+    if physics.cutoff_dark_hz <= 0.0:
+        return 0.0
+    cutoff_hz = physics.cutoff_dark_hz + (physics.cutoff_bright_hz - physics.cutoff_dark_hz) * min(light, 1.0)
+    return 1e6 / (2.0 * math.pi * cutoff_hz)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _shot_noise_rate(light, shot, physics):
+    """Shot noise events a us under this light."""
+    return shot * (1.0 - (1.0 - physics.shot_noise_rate_bright) * min(light, 1.0))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _one_minus_exp(x):
+    """1 - exp(-x) of x >= 0, to an ulp or two; several at once, where the library's takes one number at a time.
+
+    exp(-x) = 2^-k exp(r) with |r| <= log(2) / 2, and exp(r) - 1 by its series.
+    """
+    x = np.float64(min(x, 64.0))
+    shifted = np.float64(x * 1.4426950408889634 + 6755399441055744.0)
+    k = shifted - 6755399441055744.0
+    r = (k * 0.6931471803691238 - x) + k * 1.9082149292705877e-10
+    r2 = r * r
+    r4 = r2 * r2
+    low = 1.0 / 2 + r * (1.0 / 6) + r2 * (1.0 / 24 + r * (1.0 / 120))
+    middle = 1.0 / 720 + r * (1.0 / 5040) + r2 * (1.0 / 40320 + r * (1.0 / 362880))
+    high = 1.0 / 3628800 + r * (1.0 / 39916800) + r2 * (1.0 / 479001600 + r * (1.0 / 6227020800))
+    series = r + r2 * (low + r4 * (middle + r4 * high))
+    power = np.int64((np.int64(1023) << 52) - (shifted.view(np.int64) << 52)).view(np.float64)
+    return (1.0 - power) - power * series
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mix(value):
+    """The finaliser of splitmix64: every bit of the result depends on every bit of the value."""
+    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return value ^ (value >> np.uint64(31))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _draw_uniform(random):
+    """The next state of a generator, and a number in [0, 1)."""
+    random = random + np.uint64(0x9E3779B97F4A7C15)
+    return random, (_mix(random) >> np.uint64(11)) * (1.0 / (1 << 53))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _draw_exponential(random):
+    """The next state of a generator, and a number of the exponential distribution of mean 1."""
+    random, uniform = _draw_uniform(random)
+    return random, -math.log1p(-uniform)

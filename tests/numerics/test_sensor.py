@@ -20,7 +20,7 @@ from ctlev_core.sensor.dvs_pixel import (
     sample_pixel_maps,
     simulate_events,
 )
-from ctlev_core.sensor.pixel_math import one_minus_exp
+from ctlev_core.sensor.kernels import _one_minus_exp
 from data_contracts.errors import DataError
 from data_contracts.events import check_events
 
@@ -194,7 +194,7 @@ def test_events_of_one_microsecond_are_in_raster_order():
 
 def test_the_exponential_of_the_low_pass_is_that_of_the_library():
     x = np.concatenate([[0.0], np.geomspace(1e-300, 1e300, 4001), np.linspace(0.3, 0.4, 1001), np.arange(1, 70)])
-    found = np.array([one_minus_exp(value) for value in x])
+    found = np.array([_one_minus_exp(value) for value in x])
     np.testing.assert_allclose(found, -np.expm1(-x), rtol=4.5e-16, atol=0)
 
 
