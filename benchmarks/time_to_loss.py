@@ -5,10 +5,10 @@
 
 Frames are those of the presets `pose` (route controlnet) and `objects` (route text). Every seventh recording is held
 back for the loss, which is the plain denoising loss of both loops, at the same noise and time steps. The example
-(`diffusers_loop.py`) is trained for `--steps` batches at the learning rate that its documentation names, 1e-5, and, since
-that alone would flatter us, at three others, of which the best counts. Ours are runs of growing length with the options
-of the preset; the shortest that ends below the example counts, since the learning rate falls towards a run's end. Then
-single options are changed, most of them to what the example does.
+(`diffusers_loop.py`) is trained for `--steps` batches at the learning rate that its documentation names, 1e-5, and,
+since that alone would flatter us, at three others, of which the best counts. Ours are runs of growing length with the
+options of the preset; the shortest that ends below the example counts, since the learning rate falls towards a run's
+end. Then single options are changed, most of them to what the example does.
 
 Times are CPU seconds of one thread, with latents and embeddings, without validation; set OMP_NUM_THREADS=1.
 """
