@@ -165,6 +165,9 @@ def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: s
                 lines.append(f"unknown option {option!r}{hint}; known: {', '.join(known)}")
             elif problem["type"] == "path_type":
                 lines.append(f"option {option!r} must be a path, got {_show(problem['input'])}; --set ...{option}=PATH")
+            elif problem["type"] == "value_error" and isinstance(problem["input"], Mapping):
+                # Options that do not go together: the message names them, and all of them would bury it.
+                lines.append((f"option {option!r}: " if option else "") + problem["msg"].removeprefix("Value error, "))
             else:
                 lines.append(
                     f"option {option!r}: {problem['msg'].lower()[:300]}, got {_show(problem['input'])}{_hint(problem)}"

@@ -332,6 +332,16 @@ def test_wrong_studies_are_refused(tmp_path, content, message):
         load_study(str(path), [])
 
 
+def test_experiments_that_do_not_go_together_are_named_and_not_printed(tmp_path):
+    path = tmp_path / "study.yaml"
+    experiments = {place: {"extends": "smoke", "name": place} for place in ("a", "b")}
+    path.write_text(json.dumps({"name": "s", "experiments": experiments, "pooled": {"both": ["a", "c"]}}))
+    with pytest.raises(PluginError) as raised:
+        load_study(str(path), [])
+    assert "pooled" in str(raised.value) and "option ''" not in str(raised.value)
+    assert len(str(raised.value)) < 300 and "got {" not in str(raised.value)
+
+
 SPEED = {
     "experiment": "a",
     "reference": {"options": {"scheduler": "ddpm"}, "steps": [12]},
