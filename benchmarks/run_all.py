@@ -5,7 +5,8 @@
     python benchmarks/run_all.py training metrics   # these anew, the others as they were last found
 
 What each printed is kept in `build/benchmarks`. Lines that say whether a target was met are shown first; the page says
-which benchmarks failed, and which were not run because they need a GPU that is not there.
+which benchmarks failed, and which were not run because they need a GPU that is not there. What is not run anew stays on
+the page as it is, also what was written by hand.
 """
 
 from __future__ import annotations
@@ -103,7 +104,8 @@ def main() -> int:
         outcome = run(benchmark)
         failed += outcome.status != 0
         (KEPT / f"{benchmark.name}.json").write_text(json.dumps(asdict(outcome), indent=1))
-        RESULTS.write_text(render([_kept(one.name) for one in ALL]), encoding="utf-8")
+        page = RESULTS.read_text(encoding="utf-8") if RESULTS.exists() else ""
+        RESULTS.write_text(render([_kept(one.name) for one in ALL], page), encoding="utf-8")
     print(f"wrote {RESULTS}")
     return failed
 
@@ -135,24 +137,38 @@ def run(benchmark: Benchmark) -> Outcome:
     )
 
 
-def render(outcomes: list[Outcome | None]) -> str:
-    """The page, from what is known of each benchmark in the order of `ALL`."""
-    found = [outcome for outcome in outcomes if outcome is not None]
-    missing = [benchmark.name for benchmark, outcome in zip(ALL, outcomes, strict=True) if outcome is None]
+def render(outcomes: list[Outcome | None], page: str = "") -> str:
+    """The page, from what is known of each benchmark in the order of `ALL`, and of the others from an earlier page."""
+    before = _sections(page)
+    sections, missing = [], []
+    for benchmark, outcome in zip(ALL, outcomes, strict=True):
+        section = before.pop(benchmark.name, None)
+        section = section if outcome is None else _section(outcome)
+        if section is None:
+            missing.append(f"`{benchmark.name}`")
+        else:
+            sections.append(section)
     parts = ["# Benchmarks", "Made by `python benchmarks/run_all.py`; ratios are within one run, on the machine named."]
     if missing:
-        parts.append(f"Not run here: {', '.join(f'`{name}`' for name in missing)}.")
-    for outcome in found:
-        ended = "" if outcome.status == 0 else f" **It ended with status {outcome.status}.**"
-        parts.append(f"## {outcome.name}")
-        parts.append(
-            f"`{outcome.command}`, {outcome.date}, commit {outcome.commit}, {outcome.seconds / 60:.1f} min.{ended}\n\n"
-            f"{outcome.machine}"
-        )
-        parts.append("\n".join(f"- {line}" for line in outcome.judged) or "It judges no target.")
-        fenced = f"```\n{outcome.output}\n```"
-        parts.append(f"<details><summary>All it printed</summary>\n\n{fenced}\n\n</details>")
-    return "\n\n".join(parts) + "\n"
+        parts.append(f"Not run here: {', '.join(missing)}.")
+    return "\n\n".join([*parts, *sections, *before.values()]) + "\n"
+
+
+def _section(outcome: Outcome) -> str:
+    ended = "" if outcome.status == 0 else f" **It ended with status {outcome.status}.**"
+    judged = "\n".join(f"- {line}" for line in outcome.judged) or "It judges no target."
+    return (
+        f"## {outcome.name}\n\n"
+        f"`{outcome.command}`, {outcome.date}, commit {outcome.commit}, {outcome.seconds / 60:.1f} min.{ended}\n\n"
+        f"{outcome.machine}\n\n{judged}\n\n"
+        f"<details><summary>All it printed</summary>\n\n```\n{outcome.output}\n```\n\n</details>"
+    )
+
+
+def _sections(page: str) -> dict[str, str]:
+    """The sections of a page by their names."""
+    parts = re.split(r"^## ", page, flags=re.MULTILINE)[1:]
+    return {part.partition("\n")[0].strip(): f"## {part.rstrip()}" for part in parts}
 
 
 def _kept(name: str) -> Outcome | None:

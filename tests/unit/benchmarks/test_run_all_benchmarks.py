@@ -37,6 +37,22 @@ def test_what_ran_and_what_did_not(run_all, monkeypatch, tmp_path):
     assert "- solving" not in page and "solving\n```" in page
 
 
+def test_what_is_not_run_anew_stays_on_the_page(run_all, monkeypatch, tmp_path):
+    """In a fresh clone, where nothing of earlier runs is kept, and with a section that somebody wrote."""
+    (tmp_path / "quick.py").write_text("print('2.0x, wanted 1.5x: met')")
+    (tmp_path / "RESULTS.md").write_text(
+        "# Benchmarks\n\nMade by hand.\n\n## quick\n\nold\n\n## slow\n\nas it was\n\n## robustness\n\nby hand\n"
+    )
+    monkeypatch.setattr(run_all, "HERE", tmp_path)
+    monkeypatch.setattr(run_all, "ALL", tuple(map(run_all.Benchmark, ("slow", "quick", "never"))))
+    monkeypatch.setattr(sys, "argv", ["run_all.py", "quick"])
+    assert run_all.main() == 0
+    page = (tmp_path / "RESULTS.md").read_text()
+    assert "old" not in page and "- 2.0x, wanted 1.5x: met\n" in page and "Not run here: `never`." in page
+    order = [page.index(text) for text in ("## slow\n\nas it was\n", "## quick\n", "## robustness\n\nby hand\n")]
+    assert order == sorted(order)
+
+
 def test_unknown_names_are_refused():
     found = subprocess.run(
         [sys.executable, str(BENCHMARKS / "run_all.py"), "trainig"], capture_output=True, text=True, check=False
