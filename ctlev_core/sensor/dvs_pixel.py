@@ -243,16 +243,15 @@ class Sensor:
         exact_us, pixels, polarity = (column[:count] for column in self._rows)
         span_us = time_us - self._last_t_us
         if span_us <= 4 * count + 4096:
-            position = sensor_columns.stamp_positions(exact_us, begin_us, np.empty(span_us + 2, np.int64))
+            order = sensor_columns.order_of_stamps(exact_us, begin_us, np.empty(span_us + 2, np.int64))
         else:
-            position = np.empty(count, np.int64)
-            position[np.argsort(np.floor(exact_us - begin_us + 0.5), kind="stable")] = np.arange(count)
+            order = np.argsort(np.floor(exact_us - begin_us + 0.5), kind="stable")
         columns = _empty_columns(count, marks=self.marks)
         sensor_columns.write_columns(
-            exact_us, pixels, polarity, position, begin_us, self._last_t_us, self.sensor_size[0], *columns[:5]
+            exact_us, pixels, polarity, order, begin_us, self._last_t_us, self.sensor_size[0], *columns[:5]
         )
         if self.marks:
-            columns[5][position] = polarity < kernels.NOISE
+            columns[5][:] = polarity[order] < kernels.NOISE
         self._frame, self._last_t_us = frame.copy(), time_us
         self.num_frames += 1
         return columns

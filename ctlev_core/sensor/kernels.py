@@ -192,6 +192,8 @@ class Group(NamedTuple):
     """To the light at the end."""
     lag_us: np.ndarray
     """Time constant of the low-pass; 0 = none."""
+    latest: np.ndarray
+    """The interval in time constants."""
     arrived: np.ndarray
     """1 - exp(-s / lag_us) at the end."""
     end: np.ndarray
@@ -235,12 +237,12 @@ class Crossings(NamedTuple):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _new_group():
     # Rows a power of two apart would compete for the same cache lines. Unsigned indices need no check for negatives.
-    numbers = np.zeros((14, GROUP + 24))
+    numbers = np.zeros((15, GROUP + 24))
     lists = np.empty((2, GROUP), np.uint64)
     return Group(
         lists[0], numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7],
-        numbers[8], numbers[9], numbers[10], numbers[11], numbers[12], np.empty(GROUP, np.uint64), numbers[13],
-        lists[1],
+        numbers[8], numbers[9], numbers[10], numbers[11], numbers[12], numbers[13], np.empty(GROUP, np.uint64),
+        numbers[14], lists[1],
     )  # fmt: skip
 
 
@@ -278,14 +280,16 @@ def _advance_group(
 def _lights(group, number, span_us, physics):
     """What depends on light alone."""
     light_before, light = group.light_before, group.light
-    response, lag_us, arrived = group.response, group.lag_us, group.arrived
+    response, lag_us, latest, arrived = group.response, group.lag_us, group.latest, group.arrived
     for k in range(number):
         response[k] = _log_response(light[k], physics.log_floor)
     if physics.cutoff_dark_hz > 0.0:
         for k in range(number):
             lag_us[k] = _time_constant_us(0.5 * (light_before[k] + light[k]), physics)
         for k in range(number):
-            arrived[k] = _one_minus_exp(span_us / lag_us[k])
+            latest[k] = span_us / lag_us[k]
+        for k in range(number):
+            arrived[k] = _one_minus_exp(latest[k])
     else:
         lag_us[:number] = 0.0
         arrived[:number] = 0.0
@@ -371,7 +375,7 @@ def _list_crossings(group, crossings, num_busy, traits, physics, state):
                 crossings.owner[found], crossings.step[found] = k, step
                 if has_lag:
                     crossings.slope[found], crossings.gain[found] = sign * (slope * lag_us), sign * gain
-                    crossings.target[found], crossings.latest[found] = sign * (step - rest), s_end / lag_us
+                    crossings.target[found], crossings.latest[found] = sign * (step - rest), group.latest[k]
                     crossings.curve[found] = sign * curve_end
                 else:
                     crossings.at[found] = (step - rest) / slope
