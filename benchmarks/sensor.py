@@ -30,9 +30,9 @@ from ctlev_core.sensor.dvs_pixel import PRESETS, PixelMaps, Sensor, SensorOption
 
 IDEAL = PRESETS["ideal"].model_copy(update={"log_floor": 1e-4})
 STEPS_US = (20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
-SPEED_WANTED, FRAMES_WANTED = 5.0, 4.0
-RATE_WANTED = 250.0
-"""Frames a second of the scene in which everything moves, low-pass and noise on."""
+SPEED_WANTED, FRAMES_WANTED = 10.0, 4.0
+REAL_TIME_WANTED = 250.0, 5.0
+"""Frames a second, and times v2e's speed, of the scene in which everything moves, low-pass and noise on."""
 STOP_US = 1_000_000
 PIXELS = 48
 
@@ -306,10 +306,12 @@ def print_speeds(num_frames: int, rounds: int) -> list[str]:
             if its < SPEED_WANTED * mine:
                 missed.append(f"{scene}{kind}: {its / mine:.1f} x v2e's speed, wanted {SPEED_WANTED:g} x")
             if (scene, kind) == ("all moves", ", low-pass"):
-                verdict = "met" if 1 / mine >= RATE_WANTED else "missed"
-                print(f"  real time: {1 / mine:.0f} frames a second, wanted {RATE_WANTED:g}: {verdict}")
-                if 1 / mine < RATE_WANTED:
-                    missed.append(f"{1 / mine:.0f} frames a second, wanted {RATE_WANTED:g}")
+                rate, ratio = REAL_TIME_WANTED
+                told = f"{1 / mine:.0f} frames a second, wanted {rate:g}, at {its / mine:.1f} x v2e, wanted {ratio:g} x"
+                is_met = 1 / mine >= rate and its >= ratio * mine
+                print(f"  real time: {told}: {'met' if is_met else 'missed'}")
+                if not is_met:
+                    missed.append(told)
     return missed
 
 

@@ -404,14 +404,14 @@ def _events(group, crossings, found, begin_us, traits, physics, state, exact_us,
         i = group.pixel[k]
         if step == 0.0:
             still_us = begin_us - state.knot_us[i] if group.light[k] == group.light_before[k] else 0.0
-            sent_us, reference_us, end = group.sent_us[k], group.reference_us[k], count
-            group.difference[k], group.allowance[k], sent_us, group.random[k], reference_us, end = _follow_pixel(
+            (
+                group.difference[k], group.allowance[k], group.sent_us[k], group.random[k], group.reference_us[k], end
+            ) = _follow_pixel(
                 begin_us - still_us, still_us, group.end[k], group.slope[k], group.gain[k], group.lag_us[k],
                 group.arrived[k], traits.threshold_on[i], traits.threshold_off[i], group.difference[k],
-                group.allowance[k], group.rate[k], traits.hot_rate[i], True, physics.refractory_us, sent_us,
-                group.random[k], traits.leak[i], reference_us, exact_us, polarity, count,
+                group.allowance[k], group.rate[k], traits.hot_rate[i], physics.refractory_us, group.sent_us[k],
+                group.random[k], traits.leak[i], group.reference_us[k], exact_us, polarity, count,
             )  # fmt: skip
-            group.sent_us[k], group.reference_us[k] = sent_us, reference_us
             for row in range(count, min(end, room)):
                 pixels[row] = i
             count = end
@@ -583,19 +583,18 @@ def _share_arrived(s, lag_us, gain):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _follow_pixel(
-    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, seeks, refractory_us,
+    knot_us, s, s_end, slope, gain, lag_us, arrived, on, off, difference, allowance, rate, hot, refractory_us,
     sent_us, random, leak, since_us, exact_us, polarity, count,
 ):  # fmt: skip
     """Events of one pixel from s to s_end after its knot; writes as far as there is room, then counts on.
 
-    `arrived` is 1 - exp(-s_end / lag_us); `seeks` says whether a threshold is within reach. Thresholds that are crossed
-    are taken off the `difference` at the knot.
+    `arrived` is 1 - exp(-s_end / lag_us). Thresholds that are crossed are taken off the `difference` at the knot.
     """
     curve_end = slope * s_end + gain * arrived
     turn, curve_turn, rises_first, rises_last = s_end, curve_end, slope > 0.0, slope > 0.0
-    if seeks and gain != 0.0:
+    if gain != 0.0:
         turn, curve_turn, rises_first, rises_last = _find_turn(slope, gain, lag_us, arrived, s_end, curve_end)
-    crossing_at, rises = np.inf, False
+    crossing_at, rises, seeks = np.inf, False, True
     while True:
         if seeks:
             crossing_at, rises = _next_crossing(

@@ -150,7 +150,10 @@ def test_the_model_says_how_far_it_looks_back(model):
     assert json.loads((model / "config.json").read_text())["options"]["sequence_length"] == LENGTH
 
 
-@pytest.mark.parametrize("changes", [{}, {"channels_last": True, "precision": "bfloat16", "flip": True, "shift_px": 2}])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"single_frame_share": 0.9}, {"channels_last": True, "precision": "bfloat16", "flip": True, "shift_px": 2}],
+)
 def test_an_interrupted_run_ends_in_the_same_model(tmp_path, monkeypatch, changes):
     recordings, batch = ["a"] * 6 + ["b"] * 4, TrainingRows.batch
     whole = train(tmp_path / "whole", recordings, **changes)
@@ -264,24 +267,6 @@ def test_single_frames_first_are_what_a_network_of_single_frames_learns_from(tmp
         first, second = (rows.batch(options.batch_size_at(step), 0, step) for options in (both, single))
         np.testing.assert_array_equal(first, second)
     assert [both.batch_size_at(step) for step in range(8)] == [4 * LENGTH] * 4 + [4] * 4
-
-
-def test_a_run_interrupted_among_single_frames_ends_in_the_same_model(tmp_path, monkeypatch):
-    names = ["a"] * 10
-    whole = weights(train(tmp_path / "whole", names, single_frame_share=0.6))
-    stopped = tmp_path / "stopped"
-    batch = TrainingRows.batch
-
-    def stop(rows, size, seed, step):
-        if step == 3:
-            raise KeyboardInterrupt
-        return batch(rows, size, seed, step)
-
-    monkeypatch.setattr(TrainingRows, "batch", stop)
-    with pytest.raises(KeyboardInterrupt):
-        train(stopped, names, single_frame_share=0.6)
-    monkeypatch.undo()
-    assert weights(train(stopped, names, single_frame_share=0.6)) == whole
 
 
 def test_without_single_frames_nothing_has_another_key():
