@@ -29,7 +29,7 @@ from data_contracts.labels import History, Labels
 if TYPE_CHECKING:
     import torch
 
-VERSION = 1
+VERSION = 2
 NAME = "classifier"
 PREDICTS = ("classes",)
 
@@ -96,7 +96,7 @@ def train(
         frames: [N, H, W, 3] uint8.
         labels: N rows with class names, at least two different ones.
         options: see `Options`.
-        seed: of the initial weights, the order of the samples and the augmentation.
+        seed: of the initial weights, the order of the samples, the augmentation and dropout.
         out: model folder.
         work: folder of the resumable state.
         parts: rows of each training set, in order; empty = one set.

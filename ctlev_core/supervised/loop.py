@@ -29,7 +29,7 @@ from data_contracts.labels import History
 CHECKPOINT_NAME = "training.pt"
 MAX_NON_FINITE = 10
 # Of the random streams of one seed; the others are those of `ctlev_core.supervised.batches`.
-_STREAM_STEP = 1
+_STREAM_STEP, _STREAM_LAYERS = 1, 3
 
 LossFunction = Callable[[np.ndarray, np.random.Generator | None], torch.Tensor]
 """Rows [B] of the training set and the random stream of this step -> scalar loss with a graph.
@@ -74,7 +74,7 @@ def train_model(
         compute_loss: the loss of given rows; it must draw random numbers from the generator it is given only.
         rows: what to learn from, and what to judge by which weights are best.
         options: budget and step sizes.
-        seed: of the order of the rows and of the augmentation.
+        seed: of the order of the rows, of the augmentation and of what layers draw, such as dropout.
         work: folder of the resumable state. A checkpoint of another run is ignored and overwritten.
         run_digest: identity of data, options and seed; the rows' own is added to it.
         description: of the progress bar.
@@ -92,9 +92,11 @@ def train_model(
     model.train()
     saved = time.monotonic()
     bar = ProgressBar(total=options.num_steps, initial=run.state.step, desc=description, unit="step")
-    with bar, deterministic(next(model.parameters()).device):
+    with bar, deterministic(next(model.parameters()).device), torch.random.fork_rng(devices=[]):
         while run.state.step < options.num_steps and not run.is_over():
             step = run.state.step
+            # Layers such as dropout draw from torch's own stream.
+            torch.manual_seed(int(np.random.SeedSequence([seed, _STREAM_LAYERS, step]).generate_state(1)[0]))
             batch = rows.batch(options.batch_size_at(step), seed, step)
             run.update(compute_loss(batch, np.random.default_rng([seed, _STREAM_STEP, step])))
             if len(rows.held_back) and (run.is_at(options.validation_every) or run.state.step == options.num_steps):

@@ -159,6 +159,37 @@ def test_a_killed_run_ends_as_if_nothing_had_been(tmp_path, stop):
     assert expected.record["skipped_steps"] >= 2
 
 
+def test_dropout_is_drawn_from_the_seed_also_where_a_run_goes_on(tmp_path):
+    """And leaves torch's global stream, which other code may have advanced, as it was."""
+    options = {"num_steps": 12, "checkpoint_every_s": 0}
+
+    def with_dropout():
+        return models.build_seeded(
+            lambda: torch.nn.Sequential(torch.nn.Linear(1, 8), torch.nn.Dropout(), torch.nn.Linear(8, 1)), 0
+        )
+
+    def killed_at(model, stop):
+        calls = iter(range(100))
+
+        def compute_loss(rows, generator):
+            if next(calls) == stop:
+                raise Killed
+            return squared_error(model)(rows, generator)
+
+        return compute_loss
+
+    whole, _ = train(tmp_path / "whole", options, model=with_dropout())
+    torch.rand(5)
+    before = torch.get_rng_state()
+    model = with_dropout()
+    with pytest.raises(Killed):
+        train(tmp_path / "parts", options, model=model, compute_loss=killed_at(model, 7))
+    again, _ = train(tmp_path / "parts", options, model=with_dropout())
+    assert same(again, whole) and torch.equal(torch.get_rng_state(), before)
+    other, _ = train(tmp_path / "other", options, model=with_dropout(), seed=1)
+    assert not same(other, whole)
+
+
 def test_state_of_other_rows_is_not_continued_and_a_broken_one_is_named(tmp_path):
     options = {"num_steps": 6, "checkpoint_every_s": 0}
     train(tmp_path / "shared", options)
