@@ -29,6 +29,13 @@ _EXTRA_CHANNELS = {
     7: "a U-Net that enlarges images",
     5: "a U-Net with depth maps",
 }
+_FURTHER_INPUTS = {
+    "class_embed_type": "class labels or embeddings of images",
+    "num_class_embeds": "class labels",
+    "encoder_hid_dim_type": "embeddings of images",
+    "time_cond_proj_dim": "the scale of guidance, as latent consistency models do",
+}
+"""Entries of a U-Net's config that say what it is called with beside noisy latents, time and prompt."""
 _TEXT_WIDTHS = {768: "Stable Diffusion v1", 1024: "Stable Diffusion 2", 1280: "SDXL's refiner", 2048: "SDXL"}
 _COPIED = ("conv_in.", "time_embedding.", "add_embedding.", "down_blocks.", "mid_block.")
 
@@ -46,6 +53,7 @@ def check_parts(files: ModelFiles) -> None:
     unet, vae = (files.parts[name] for name in ("unet", "vae"))
     texts = [files.parts[name] for name in ("text_encoder", "text_encoder_2") if name in files.parts]
     _check_latents(unet, vae)
+    _check_further_inputs(unet)
     _check_pooled(unet, texts)
     _check_prompts(unet, texts)
     for text, tokenizer in zip(texts, (files.tokenizer, files.tokenizer_2), strict=False):
@@ -101,9 +109,24 @@ def _check_latents(unet: ModelPart, vae: ModelPart) -> None:
         )
     channels_of(unet, "conv_in.weight", "in_channels", 1)
     channels_of(unet, "conv_in.weight", "block_out_channels", 0)
+    if (gives := shape_of(unet, "conv_out.weight")[0]) != makes:
+        raise DataError(
+            f"{unet.place}: the U-Net gives {gives} channels for latents of {makes}; expected one prediction for each, "
+            "without a variance"
+        )
     side = unet.config.get("sample_size")
     if not isinstance(side, int) or side <= 0:
         raise DataError(f"{unet.place}: sample_size in its config must be the side of square latents, got {side!r}")
+
+
+def _check_further_inputs(unet: ModelPart) -> None:
+    """Raise `DataError` where a U-Net takes more than noisy latents, time and prompt."""
+    for entry, what in _FURTHER_INPUTS.items():
+        value = unet.config.get(entry)
+        if value not in (None, "text_proj"):  # a projection of the prompt itself
+            raise DataError(
+                f"{unet.place}: this U-Net takes {what} beside the prompt: expected {entry} null, got {value!r}"
+            )
 
 
 def _check_pooled(unet: ModelPart, texts: Sequence[ModelPart]) -> None:

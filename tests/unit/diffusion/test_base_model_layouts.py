@@ -272,6 +272,33 @@ def test_inpainting_unet(folder):
     refused(folder, r"takes 9 latent channels")
 
 
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        (
+            {"class_embed_type": "projection", "projection_class_embeddings_input_dim": 24},
+            "embeddings of images .* got 'pr",
+        ),
+        ({"num_class_embeds": 10}, "takes class labels beside the prompt: expected num_class_embeds null, got 10"),
+        (
+            {"encoder_hid_dim_type": "image_proj", "encoder_hid_dim": 8},
+            "expected encoder_hid_dim_type null, got 'image",
+        ),
+        (
+            {"time_cond_proj_dim": 16},
+            "scale of guidance, as latent consistency models do .* time_cond_proj_dim null, got 16",
+        ),
+        ({"out_channels": 8}, "gives 8 channels for latents of 4; expected one prediction"),
+    ],
+)
+def test_unets_that_are_called_in_another_way(folder, entries, message):
+    """As of Stable Diffusion 2.1 unCLIP or LCM: whole and consistent, and no part of them is missing."""
+    changes = tiny_changes()
+    unet = make_models({**changes, "unet": {**changes["unet"], **entries}})["unet"]
+    unet.save_pretrained(folder / "unet")
+    refused(folder, message)
+
+
 def test_config_of_another_network(folder):
     change_json(folder / "unet" / "config.json", block_out_channels=[320, 640, 1280, 1280])
     refused(folder, r"config.json says block_out_channels 320, weight conv_in.weight has shape \[8, 4, 3, 3\]")
