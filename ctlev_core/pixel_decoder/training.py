@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ctlev_core import plugins
 from ctlev_core.cpu_precision import computed_in
+from ctlev_core.determinism import deterministic
 from ctlev_core.diffusion.pretrained.loading import choose_device
 from ctlev_core.diffusion.training.loop import sample_rows
 from ctlev_core.diffusion.training.options import TrainingOptions
@@ -220,7 +221,8 @@ def train_pixel_decoder(
     held_back, learnt = np.split(order, [min(MAX_VALIDATION, len(pairs) // 10)])
     step = _Step(network, classes, pairs, options, seed, device)
     saved = time.monotonic()
-    with ProgressBar(total=options.num_steps, initial=trainer.step, desc="pixel decoder", unit="step") as bar:
+    bar = ProgressBar(total=options.num_steps, initial=trainer.step, desc="pixel decoder", unit="step")
+    with bar, deterministic(device):
         while trainer.step < options.num_steps:
             rows = learnt[sample_rows(seed, trainer.step, options.batch_size, len(learnt))]
             trainer.optimizer.zero_grad(set_to_none=True)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from simulated_gpu import simulated_gpu
 
 from ctlev_core.pixel_decoder import training
 from ctlev_core.pixel_decoder.drawing import draw_values
@@ -59,6 +60,20 @@ def test_a_training_that_was_killed_ends_as_one_that_was_not(tmp_path, monkeypat
     for name, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
     assert vars(again) == vars(curves)
+
+
+def test_a_gpu_trains_by_deterministic_algorithms(tmp_path, monkeypatch):
+    found, loss = [], training._Step.loss
+
+    def noted(*arguments):
+        found.append(torch.are_deterministic_algorithms_enabled())
+        return loss(*arguments)
+
+    monkeypatch.setattr(training._Step, "loss", noted)
+    options = SMALL.model_copy(update={"num_steps": 2, "device": "cuda"})
+    with simulated_gpu():
+        train_pixel_decoder(make_pairs(), options, seed=2, work=tmp_path)
+    assert found == [True, True, True] and not torch.are_deterministic_algorithms_enabled()  # two steps, a validation
 
 
 @pytest.mark.parametrize("num_planes", [1, 2])
