@@ -45,7 +45,7 @@ class TrainingRows:
         spans = ((start, stop), (step * batch_size - start, (step + 1) * batch_size - stop))
         return np.concatenate(
             [
-                pool[_walk(len(pool), first, last - first, (seed, _STREAM_ORDER, part + 1))]
+                pool[walk(len(pool), first, last - first, (seed, _STREAM_ORDER, part + 1))]
                 for part, (pool, (first, last)) in enumerate(zip(self.pools, spans, strict=True))
             ]
         )
@@ -53,7 +53,7 @@ class TrainingRows:
 
 def batch_rows(count: int, batch_size: int, seed: int, step: int) -> np.ndarray:
     """Rows [batch_size] of step `step`: consecutive chunks of an endless row of permutations of the training set."""
-    return _walk(count, step * batch_size, batch_size, (seed, _STREAM_ORDER))
+    return walk(count, step * batch_size, batch_size, (seed, _STREAM_ORDER))
 
 
 def plan_rows(
@@ -124,7 +124,7 @@ def _hold_back(groups: np.ndarray, share: float, seed: int, classes: np.ndarray 
     return np.flatnonzero(held)
 
 
-def _walk(count: int, first: int, number: int, entropy: tuple[int, ...]) -> np.ndarray:
+def walk(count: int, first: int, number: int, entropy: tuple[int, ...]) -> np.ndarray:
     """Rows first .. first + number - 1 of an endless row of permutations of 0 .. count - 1."""
     rows = np.empty(number, dtype=np.int64)
     filled = 0

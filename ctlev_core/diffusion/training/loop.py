@@ -23,6 +23,7 @@ from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.diffusion.training.tensorboard import TrainingLog, training_log
 from ctlev_core.diffusion.training.trainer import Trainer, TrainingHistory
 from ctlev_core.progress import ProgressBar
+from ctlev_core.supervised.batches import walk
 
 BatchLoss = Callable[[Batch, torch.Generator], torch.Tensor]
 """From a batch and the stream of its noise to a loss [], whose gradients the trained weights get."""
@@ -30,10 +31,7 @@ BatchLoss = Callable[[Batch, torch.Generator], torch.Tensor]
 
 def sample_rows(seed: int, step: int, batch_size: int, count: int) -> np.ndarray:
     """Rows [batch_size] of the batch of `step`: every epoch is a permutation of its own of 0 .. count - 1."""
-    positions = np.arange(step * batch_size, (step + 1) * batch_size)
-    epochs = positions // count
-    orders = {epoch: np.random.default_rng([seed, int(epoch)]).permutation(count) for epoch in np.unique(epochs)}
-    return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
+    return walk(count, step * batch_size, batch_size, (seed,))
 
 
 def check_run(trainer: Trainer, distributed: DistributedContext, *, validated: bool) -> None:

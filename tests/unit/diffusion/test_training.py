@@ -14,6 +14,7 @@ from ctlev_core.diffusion.training import loop
 from ctlev_core.diffusion.training.finetuning import fine_tune, forget_weights
 from ctlev_core.diffusion.training.loop import sample_rows
 from ctlev_core.diffusion.training.options import FineTuningOptions
+from ctlev_core.supervised import batches
 from data_contracts.errors import TrainingError
 from data_contracts.labels import Conditions
 
@@ -182,6 +183,14 @@ def test_every_epoch_visits_every_row_once(count, batch_size, seed):
     rows = np.concatenate([sample_rows(seed, step, batch_size, count) for step in range(steps)])
     for epoch in range(3):
         assert sorted(rows[epoch * count : (epoch + 1) * count]) == list(range(count))
+
+
+def test_an_epoch_is_shuffled_once_and_not_at_every_step():
+    """Of a million frames that takes longer than a small network's step."""
+    batches._permutation.cache_clear()
+    expected = np.random.default_rng([3, 1]).permutation(100)
+    rows = np.concatenate([sample_rows(3, step, 10, 100) for step in range(10, 20)])
+    assert np.array_equal(rows, expected) and batches._permutation.cache_info().misses == 1
 
 
 def test_min_snr_weights_follow_the_definition():
