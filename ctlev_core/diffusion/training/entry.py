@@ -20,7 +20,7 @@ import torch
 from ctlev_core.diffusion.pretrained.loading import choose_device, load_base_model, save_base_model
 from ctlev_core.diffusion.sampling.value_table import write_value_table
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
-from ctlev_core.diffusion.training.finetuning import Tune, fine_tune, forget_weights
+from ctlev_core.diffusion.training.finetuning import Tune, digest_of_start, fine_tune, forget_weights
 from ctlev_core.diffusion.training.fsdp import check_sharding, gather_networks, shard_networks
 from ctlev_core.diffusion.training.latent_files import Latents
 from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
@@ -108,6 +108,7 @@ def _train(
     )
     if options.random_init:
         base_model = forget_weights(base_model, job["seed"])
+    start = digest_of_start(base_model)
     if job["fsdp"]:
         shard_networks(base_model)
         distributed = replace(distributed, sharded=True)
@@ -122,6 +123,7 @@ def _train(
         class_names=job["class_names"],
         latents=latents,
         distributed=distributed,
+        start=start,
     )
     written = gather_networks(base_model, keep=distributed.rank == 0) if distributed.sharded else base_model
     if distributed.rank == 0 and written is not None:

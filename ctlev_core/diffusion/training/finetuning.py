@@ -81,6 +81,7 @@ def fine_tune(
     class_names: Sequence[str] | None = None,
     latents: Latents | None = None,
     distributed: DistributedContext = SINGLE_PROCESS,
+    start: str | None = None,
 ) -> TrainingHistory:
     """Train the networks named by `tune` in place; autoencoder and text encoder stay frozen.
 
@@ -96,6 +97,7 @@ def fine_tune(
             paper draws a class name per iteration. None = each frame keeps its own prompt.
         latents: of the frames, where they were encoded and checked before; None = they are encoded here.
         distributed: which of several processes this is.
+        start: `digest_of_start` of the base model before its weights were shared out; None = they are whole.
     Returns:
         Loss curves; `shuffled_loss` is the validation loss with the conditions of other frames.
     Raises:
@@ -109,12 +111,12 @@ def fine_tune(
             f"rot90_probability needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0"
         )
     _check_text_route(options, conditions)
-    device = base_model.unet.device
+    device, start = base_model.unet.device, start or digest_of_start(base_model)
     names = ("unet", "controlnet") if tune == "both" else (tune,)
     networks = {name: getattr(base_model, name) for name in names}
     parameters = _start_to_learn(networks, options, seed)
     validation_rows, training_rows = split_rows(len(frames), options, seed)
-    identity = _identity(frames, conditions, options, tune, seed, class_names)
+    identity = _identity(start, frames, conditions, options, tune, seed, class_names)
     trainer = Trainer(parameters, options, identity, options.optimizer, keep=options.keep, patience=options.patience)
     # Two frames at least: one frame has no other's condition to be shuffled with.
     validated = len(validation_rows) >= 2
@@ -261,7 +263,18 @@ def _rows_of(conditions: Conditions, rows: np.ndarray) -> Conditions:
     return Conditions(tuple(conditions.prompts[row] for row in rows), images)
 
 
+def digest_of_start(base_model: PretrainedModel) -> str:
+    """Of the weights that a training starts from, also those that stay frozen, and of the noise schedule."""
+    digest = hashlib.sha256(json.dumps(base_model.scheduler_config, sort_keys=True).encode())
+    for network in filter(None, (base_model.unet, base_model.controlnet)):
+        for name, weight in network.state_dict().items():
+            digest.update(name.encode())
+            digest.update(np.ascontiguousarray(weight.detach().float().cpu().numpy()).data)
+    return digest.hexdigest()
+
+
 def _identity(
+    start: str,
     frames: Images,
     conditions: Conditions,
     options: FineTuningOptions,
@@ -275,7 +288,7 @@ def _identity(
     }
     named = None if class_names is None else list(class_names)
     made_by = conditions.made_by.model_dump(mode="json") if conditions.made_by and options.rot90_probability else None
-    digest = hashlib.sha256(json.dumps([material, tune, seed, conditions.prompts, named, made_by]).encode())
+    digest = hashlib.sha256(json.dumps([start, material, tune, seed, conditions.prompts, named, made_by]).encode())
     for array in (frames, conditions.images):
         if array is not None:
             digest.update(as_image_rows(array).digest().encode())

@@ -131,6 +131,12 @@ def test_state_of_another_run_is_refused(tmp_path):
     fine_tune(make_base_model(), frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
     with pytest.raises(TrainingError, match="of another run, delete it"):
         fine_tune(make_base_model(), frames[::-1], conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
+    other = make_base_model()
+    with torch.no_grad():  # frozen here, and yet what the saved ControlNet belongs to
+        next(other.unet.parameters()).add_(0.1)
+    fine_tune(make_base_model(), frames, conditions, OPTIONS, tune="controlnet", seed=0, work=tmp_path / "frozen")
+    with pytest.raises(TrainingError, match="of another run, delete it"):
+        fine_tune(other, frames, conditions, OPTIONS, tune="controlnet", seed=0, work=tmp_path / "frozen")
     (tmp_path / "state.pt").write_bytes(b"half a file")
     with pytest.raises(TrainingError, match="cannot be read, delete it"):
         fine_tune(make_base_model(), frames, conditions, OPTIONS, tune="unet", seed=0, work=tmp_path)
