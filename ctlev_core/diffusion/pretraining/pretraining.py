@@ -130,6 +130,11 @@ class PretrainingOptions(Frozen):
             raise ValueError("sample_every draws samples of a fine-tuning; pre-training has none, set it to 0")
         if self.pictures.root is not None and self.tune != "unet":
             raise ValueError(f"pictures of one's own have no condition images; set tune=unet, got {self.tune!r}")
+        shown = self.chunk_scenes * self.chunk_passes
+        if shown < self.training.batch_size:
+            raise ValueError(
+                f"chunk_scenes x chunk_passes must be a batch_size of {self.training.batch_size} at least, got {shown}"
+            )
         DistributedContext(0, self.num_processes).batches(self.training.gradient_accumulation)
         return self
 

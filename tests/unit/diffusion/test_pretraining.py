@@ -183,6 +183,10 @@ def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monk
         ({"num_processes": 2}, "multiple of the 2 processes"),
         ({"num_processes": 2, "max_seconds": 5.0}, "max_seconds must be null with several processes"),
         ({"data_mixture": {"styles": {"lines": 0.5}}}, "shares of styles must sum to 1, got 0.5"),
+        (
+            {"chunk_scenes": 2, "chunk_passes": 3},
+            "chunk_scenes x chunk_passes must be a batch_size of 8 at least, got 6",
+        ),
         ({"training": {"sample_every": 1}}, "sample_every draws samples of a fine-tuning"),
     ],
 )
