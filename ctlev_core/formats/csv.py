@@ -123,8 +123,12 @@ def _chunks(path: Path) -> Iterator[Events]:
         sensor_size = smallest_sensor(int(largest[1]), int(largest[2]), str(path))
 
     def columns() -> Iterator[event_tables.Columns]:
+        num_read = 0
         for rows, _ in _read_rows(path, layout, has_points and not layout.says_us):
+            num_read += len(rows)
             yield dict(zip(EVENT_DTYPES, rows.T, strict=True))
+        if num_read != num_rows:
+            raise DataError(f"{path}: the file changed while it was read: {num_rows} rows first, then {num_read}")
 
     yield event_chunks.empty_events(sensor_size)
     yield from event_tables.to_events(columns, str(path), sensor_size)

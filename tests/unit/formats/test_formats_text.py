@@ -87,3 +87,17 @@ def test_text_is_parsed_the_same_across_blocks(tmp_path, monkeypatch):
     path.write_text("0.1 1 2 1\n" + "0" * 100 + "1 1 2 1\n")
     with pytest.raises(DataError, match="a line of more than 37 bytes"):
         module.read(path)
+
+
+@pytest.mark.parametrize("change", ["shorter", "longer"])
+def test_text_that_changes_while_it_is_read_is_an_error(tmp_path, monkeypatch, change):
+    reader = plugins.load("formats", "csv")
+    monkeypatch.setattr(reader, "_BLOCK_BYTES", 1 << 14)
+    path = tmp_path / "a.csv"
+    rows = [f"{t} 1 2 1\n" for t in range(10_000, 20_000)]
+    path.write_text("".join(rows))
+    chunks = reader.read_chunks(path, 10)
+    next(chunks)  # the file has been looked through once
+    path.write_text("".join(rows[:7000]) if change == "shorter" else "".join([*rows, "20000 1 2 1\n"]))
+    with pytest.raises(DataError, match=r"a\.csv: the file changed while it was read: 10000 rows first, then \d+"):
+        list(chunks)
