@@ -202,15 +202,17 @@ def _fit(picture: np.ndarray, size: int) -> np.ndarray:
     return canvas
 
 
-def _modified(root: Path) -> int:
+def _modified(root: Path) -> tuple[tuple[int, int], ...]:
+    """Times of change and sizes of the place and, of a folder, of what lies in it: a class folder's are its own."""
     try:
-        return root.stat().st_mtime_ns
+        found = [entry.stat() for entry in (root, *(sorted(root.iterdir()) if root.is_dir() else ()))]
     except OSError:
-        return 0
+        return ()
+    return tuple((status.st_mtime_ns, status.st_size) for status in found)
 
 
 @functools.lru_cache(maxsize=4)
-def _open(root: Path, class_names: tuple[str, ...], modified: int) -> LabelledPictures:
+def _open(root: Path, class_names: tuple[str, ...], modified: tuple[tuple[int, int], ...]) -> LabelledPictures:
     if root.is_file() and root.suffix == ".npz":
         found = _open_npz(root, class_names)
     elif root.is_dir() and _idx_file(root, IDX_IMAGES) is not None:

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import os
 import struct
 import zipfile
 
@@ -138,6 +139,23 @@ def test_bad_places(tmp_path):
         open_pictures(PictureOptions(root=idx))
 
 
+def test_pictures_that_have_changed_are_opened_anew(tmp_path):
+    def age(root):  # whatever the resolution of the file system's clock
+        for place in (root, *root.rglob("*")):
+            os.utime(place, (1, 1))
+
+    root = write_folders(tmp_path / "folders", pictures(), ["cat", "dog"] * 12)
+    age(root)
+    assert len(open_pictures(PictureOptions(root=root))) == 24
+    (root / "dog" / "001.png").unlink()
+    assert len(open_pictures(PictureOptions(root=root))) == 23
+    idx = write_idx(tmp_path / "idx", pictures(), np.zeros(24, np.uint8))
+    age(idx)
+    open_pictures(PictureOptions(root=idx))
+    write_idx(idx, pictures() // 2, np.zeros(24, np.uint8))
+    assert open_pictures(PictureOptions(root=idx)).images.max() < 128
+
+
 @pytest.mark.parametrize("layout", ["npz", "gz"])
 def test_damaged_files_are_named(tmp_path, layout):
     images, labels = pictures(), np.arange(24, dtype=np.uint8)
@@ -152,7 +170,7 @@ def test_damaged_files_are_named(tmp_path, layout):
     for place in range(0, len(whole), 5):
         file.write_bytes(whole[:place] + bytes([whole[place] ^ 0x5A]) + whole[place + 1 :])
         try:
-            _open(root, (), place)
+            _open(root, (), ((place, 0),))
         except DataError as error:
             refused += str(error).startswith(str(file))
     assert refused > len(whole) / 10
