@@ -27,6 +27,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator
 
+from ctlev_core.dataset_files.picture_files import read_stored
 from ctlev_core.dataset_files.trees import check_inside, list_folder
 from ctlev_core.events.decoding.array_files import read_array_header, read_items
 from ctlev_core.pictures.image_moves import Moves, move_image
@@ -170,7 +171,7 @@ def read_picture(path: Path) -> np.ndarray:
     """
     import cv2
 
-    read = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    read = read_stored(path, cv2.IMREAD_UNCHANGED)
     if read is None or read.size == 0:
         raise DataError(f"{path}: cannot be read as a picture")
     picture = np.asarray(read)

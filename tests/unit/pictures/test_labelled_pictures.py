@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from ctlev_core.dataset_files.event_hpe_files import read_event_images
+from ctlev_core.dataset_files.picture_files import read_grey_pictures
 from ctlev_core.pictures import labelled_pictures
 from ctlev_core.pictures.image_moves import Moves, move_image
 from ctlev_core.pictures.labelled_pictures import PictureOptions, _open, move, open_pictures, read_picture
@@ -201,6 +203,20 @@ def test_a_file_that_is_no_picture_is_named(tmp_path):
     found = open_pictures(PictureOptions(root=root))
     with pytest.raises(DataError, match=r"000\.png: cannot be read as a picture"):
         found.read(0, 8)
+
+
+def test_a_damaged_picture_that_claims_too_many_pixels_is_named(tmp_path):
+    path = tmp_path / "a.bmp"
+    cv2.imwrite(str(path), np.zeros((8, 8, 4), np.uint8))
+    content = bytearray(path.read_bytes())
+    content[18:26] = struct.pack("<ii", 1 << 21, 1 << 21)  # width and height
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.bmp: cannot be read as a picture"):
+        read_picture(path)
+    with pytest.raises(DataError, match=r"a\.bmp: expected a picture of 8 x 8 px, got none"):
+        read_grey_pictures([path], (8, 8))
+    with pytest.raises(DataError, match=r"a\.bmp: expected four time slices \[8, 8, 4\] of 8 bits, got no picture"):
+        read_event_images([path], 8)
 
 
 def test_bad_options(tmp_path):
