@@ -109,5 +109,5 @@ def read_table(source: Path | pa.BufferReader, path: Path) -> pa.Table:
         if error.errno is not None:
             raise
         raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error
-    except pa.ArrowInvalid as error:
+    except (pa.ArrowInvalid, UnicodeDecodeError) as error:  # the last of names that are no text
         raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error
