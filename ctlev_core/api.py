@@ -81,7 +81,8 @@ def histogram(
     Args:
         events: of one recording.
         num_events: of each window, or
-        duration_us: length of each window; with neither, the recording is one window. An incomplete last is dropped.
+        duration_us: length of each window; those without events are left out. With neither, the recording is one
+            window. An incomplete last is dropped.
         polarity: count positive and negative events apart.
         image_size: (width, height) px to count in; None = the sensor's own.
     Returns:

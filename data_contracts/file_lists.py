@@ -62,13 +62,18 @@ def files_of(places: Sequence[Path]) -> list[tuple[str, Path]]:
     ]
 
 
-def _files_within(folder: Path) -> Iterator[Path]:
-    seen = set()
-    for place, folders, names in os.walk(folder, followlinks=True):
-        seen.add(os.path.realpath(place))
-        # Not into a folder that links to one around it.
-        folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) not in seen]
-        yield from (Path(place, name) for name in names)
+def _files_within(folder: Path, around: frozenset[str] = frozenset()) -> Iterator[Path]:
+    """Files below a folder; where links lead to one folder from several places it counts at each, but not in itself."""
+    place = os.path.realpath(folder)
+    try:
+        names = [] if place in around else os.listdir(folder)
+    except OSError:  # one that is not there has none
+        names = []
+    for path in (folder / name for name in names):
+        if path.is_dir():
+            yield from _files_within(path, around | {place})
+        else:
+            yield path
 
 
 def write_file_list(folder: Path, files: Sequence[Path]) -> None:
@@ -104,5 +109,5 @@ def read_table(source: Path | pa.BufferReader, path: Path) -> pa.Table:
         if error.errno is not None:
             raise
         raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error
-    except pa.ArrowInvalid as error:
+    except (pa.ArrowInvalid, UnicodeDecodeError) as error:  # the last of names that are no text
         raise DataError(f"{path}: is not a Parquet file: {str(error)[:200]}") from error

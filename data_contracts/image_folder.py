@@ -140,14 +140,15 @@ def read_image_table(folder: Path) -> pa.Table:
     try:
         with pq.ParquetFile(path) as file:
             table = file.read()
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:  # the last of names that are no text
         raise DataError(f"{path}: cannot be read as Parquet: {error}") from error
-    declared = json.loads((table.schema.metadata or {}).get(_SCHEMA_KEY, b"{}"))
-    if declared.get("version", IMAGES.version) != IMAGES.version:
-        raise TableVersionError(
-            f"{path}: table version {declared['version']}; this code reads version {IMAGES.version}"
-        )
-    return _completed(table.replace_schema_metadata(None), str(path))
+    try:
+        version = json.loads((table.schema.metadata or {}).get(_SCHEMA_KEY, b"{}")).get("version", IMAGES.version)
+        if version != IMAGES.version:
+            raise TableVersionError(f"{path}: table version {version}; this code reads version {IMAGES.version}")
+        return _completed(table.replace_schema_metadata(None), str(path))
+    except (AttributeError, UnicodeDecodeError, json.JSONDecodeError) as error:  # metadata or text that nobody wrote
+        raise DataError(f"{path}: damaged: {error}") from error
 
 
 def _completed(table: pa.Table, where: str) -> pa.Table:

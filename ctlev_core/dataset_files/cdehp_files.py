@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ctlev_core.events.decoding.array_files import read_array_header, read_items
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -181,7 +183,7 @@ def _table(path: Path) -> np.ndarray:
     """Columns of whole numbers [N, C] int64."""
     try:
         if path.suffix == ".npy":
-            table = np.load(path, allow_pickle=False)
+            table = _array(path)
         else:
             import pandas
 
@@ -197,6 +199,13 @@ def _table(path: Path) -> np.ndarray:
         row, column = wrong[0]
         raise DataError(f"{path}: expected whole numbers, got {table[row, column]} in row {row}, column {column}")
     return whole
+
+
+def _array(path: Path) -> np.ndarray:
+    with path.open("rb") as file:
+        header = read_array_header(file, path.name, path.stat().st_size)
+        items = read_items(file, header.dtype, math.prod(header.shape), path.name)
+    return items.reshape(header.shape, order="F" if header.fortran_order else "C")
 
 
 def _lines(path: Path) -> list[str]:

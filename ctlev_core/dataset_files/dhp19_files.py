@@ -303,5 +303,7 @@ def _read_dataset(path: Path, name: str, read: Callable[[Any], Any]) -> Any:
                 held = ", ".join(file)[:200] or "nothing"
                 raise DataError(f"{path}: expected numbers in /{name}, got {data!r}; it holds {held}")
             return read(hdf5_files.check_dataset(data, f"{path}: /{name}"))
-    except (OSError, RuntimeError) as error:
+    except (DataError, MemoryError):
+        raise
+    except Exception as error:  # h5py passes HDF5's errors on as half a dozen types
         raise DataError(f"{path}: expected an HDF5 file: {error}") from error

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ctlev_core.dataset_files.picture_files import read_stored
 from data_contracts.errors import DataError
 from data_contracts.events import Events
 
@@ -106,7 +107,7 @@ def read_event_images(paths: Sequence[Path], size: int) -> np.ndarray:
     images = np.empty((len(paths), size, size), np.uint8)
     for image, path in zip(images, paths, strict=True):
         # UNCHANGED: the fourth slice lies in the alpha channel.
-        slices = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        slices = read_stored(path, cv2.IMREAD_UNCHANGED)
         if slices is None or slices.shape != (size, size, 4) or slices.dtype != np.uint8:
             got = "no picture" if slices is None else f"{list(slices.shape)} {slices.dtype}"
             raise DataError(f"{path}: expected four time slices [{size}, {size}, 4] of 8 bits, got {got}")

@@ -35,18 +35,41 @@ def check_root(root: Path, tree: str, is_root: Callable[[Path], bool]) -> Path:
         raise DetailedDataError(f"{root}: {problem}; {tree}")
     if is_root(root):
         return root
-    folders = [entry for entry in list_folder(root) if entry.is_dir()]
-    below = [entry for folder in folders[:MAX_SEARCHED] for entry in list_folder(folder) if entry.is_dir()]
+    entries = _visible_entries(root)
+    folders = [entry for entry in entries if entry.is_dir()]
+    below = [folder for parent in folders[:MAX_SEARCHED] for folder in _folders_in(parent)]
     for candidate in [*folders, *below][:MAX_SEARCHED]:
-        if is_root(candidate):
+        if _may_be_root(candidate, is_root):
             raise DetailedDataError(f"{root}: not the dataset itself; the root is {candidate}; {tree}")
     for parent in list(root.resolve().parents)[:2]:
-        if is_root(parent):
+        if _may_be_root(parent, is_root):
             raise DetailedDataError(f"{root}: lies inside the dataset; the root is {parent}; {tree}")
-    packed = [entry.name for entry in list_folder(root) if entry.suffix.lower() in ARCHIVES]
+    packed = [entry.name for entry in entries if entry.suffix.lower() in ARCHIVES]
     if packed:
         raise DetailedDataError(f"{root}: holds archives that are not unpacked ({', '.join(packed[:3])}); {tree}")
     raise DetailedDataError(f"{root}: not the expected folder; {tree}")
+
+
+def _may_be_root(folder: Path, is_root: Callable[[Path], bool]) -> bool:
+    """What is wrong in a folder that nobody named is no reason not to say what is wrong with the one they did."""
+    try:
+        return is_root(folder)
+    except DataError:
+        return False
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        return [entry for entry in _visible_entries(folder) if entry.is_dir()]
+    except DataError:
+        return []
+
+
+def _visible_entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    except OSError as error:
+        raise DataError(f"{folder}: the folder cannot be read: {error.strerror}") from error
 
 
 def list_folder(folder: Path) -> list[Path]:
@@ -55,10 +78,7 @@ def list_folder(folder: Path) -> list[Path]:
     Raises:
         DataError: the folder cannot be read, or a link in it leads nowhere.
     """
-    try:
-        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
-    except OSError as error:
-        raise DataError(f"{folder}: the folder cannot be read: {error.strerror}") from error
+    entries = _visible_entries(folder)
     for entry in entries:
         if entry.is_symlink() and not entry.exists():
             raise DataError(f"{entry}: a link to nothing")

@@ -173,7 +173,10 @@ def _chunks(path: Path, num_events: int) -> Iterator[Events]:
                 for start in range(0, packet.num_events, num_events):
                     count = min(num_events, packet.num_events - start)
                     file.seek(packet.place + start * _EVENT.itemsize)
-                    events = np.frombuffer(file.read(count * _EVENT.itemsize), _EVENT)
+                    content = file.read(count * _EVENT.itemsize)
+                    if len(content) != count * _EVENT.itemsize:
+                        raise DataError(f"{path}: the file became shorter while it was read")
+                    events = np.frombuffer(content, _EVENT)
                     yield _columns(events, packet.overflows, f"{path}: packet with events from byte {packet.place}")
 
     with path.open("rb") as file:

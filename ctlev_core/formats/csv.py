@@ -123,8 +123,12 @@ def _chunks(path: Path) -> Iterator[Events]:
         sensor_size = smallest_sensor(int(largest[1]), int(largest[2]), str(path))
 
     def columns() -> Iterator[event_tables.Columns]:
+        num_read = 0
         for rows, _ in _read_rows(path, layout, has_points and not layout.says_us):
+            num_read += len(rows)
             yield dict(zip(EVENT_DTYPES, rows.T, strict=True))
+        if num_read != num_rows:
+            raise DataError(f"{path}: the file changed while it was read: {num_rows} rows first, then {num_read}")
 
     yield event_chunks.empty_events(sensor_size)
     yield from event_tables.to_events(columns, str(path), sensor_size)
@@ -142,7 +146,7 @@ def _find_layout(path: Path) -> _Layout | None:
         line = head[offset:stop].decode("latin-1").strip()
         is_comment = line.startswith("#")
         if is_comment and "sensor_size" in line:
-            sensor_size = event_tables.parse_sensor_size(line.partition("sensor_size")[2].strip(" :=")) or sensor_size
+            sensor_size = _stated_size(line, path) or sensor_size
         header = _parse_header(line.removeprefix("#"), path, is_comment) if line else None
         if header:
             named = _field_names(line.removeprefix("#"))[header.index("t")]
@@ -153,6 +157,15 @@ def _find_layout(path: Path) -> _Layout | None:
             return _Layout(offset, tuple(EVENT_DTYPES), sensor_size) if is_row else None
         offset = stop
     return None
+
+
+def _stated_size(line: str, path: Path) -> SensorSize | None:
+    """The sensor of a comment; None of one that only speaks of it."""
+    before, _, text = line.partition("sensor_size")
+    size = event_tables.parse_sensor_size(text.strip(" :=()"))
+    if size is None and before.strip() == "#":
+        raise DataError(f"{path}: expected the comment '# sensor_size WIDTHxHEIGHT', got {line[:80]!r}")
+    return size
 
 
 def _field_names(line: str) -> list[str]:

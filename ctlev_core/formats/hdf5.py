@@ -41,6 +41,8 @@ _GROUPS = ("events", "CD/events", "/")
 _ROWS = ("CD/events", "events")
 _MATRIX_COLUMNS = ("x", "y", "t", "p")
 _BLOCK = 1 << 18
+_FILTER_IS_MISSING = ("not registered", "plugin", "can't open directory")
+"""HDF5's words for it; of a filter that is there and fails it says `filter returned failure`."""
 
 
 def sniff(path: Path) -> bool:
@@ -123,7 +125,7 @@ def _open(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:  # h5py passes HDF5's errors on as half a dozen types
         text = str(error)
-        if "filter" in text.lower() or "can't open directory" in text.lower():
+        if any(said in text for said in _FILTER_IS_MISSING):
             raise DataError(
                 f"{path}: compressed with a filter that is not installed; pip install hdf5plugin ({text})"
             ) from error

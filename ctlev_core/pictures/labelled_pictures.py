@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import functools
 import gzip
+import math
 import struct
 import unicodedata
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +27,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator
 
+from ctlev_core.dataset_files.picture_files import read_stored
 from ctlev_core.dataset_files.trees import check_inside, list_folder
+from ctlev_core.events.decoding.array_files import read_array_header, read_items
 from ctlev_core.pictures.image_moves import Moves, move_image
 from data_contracts.config import RUN_SETTING, Frozen
 from data_contracts.errors import DataError
@@ -167,7 +171,7 @@ def read_picture(path: Path) -> np.ndarray:
     """
     import cv2
 
-    read = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    read = read_stored(path, cv2.IMREAD_UNCHANGED)
     if read is None or read.size == 0:
         raise DataError(f"{path}: cannot be read as a picture")
     picture = np.asarray(read)
@@ -199,15 +203,17 @@ def _fit(picture: np.ndarray, size: int) -> np.ndarray:
     return canvas
 
 
-def _modified(root: Path) -> int:
+def _modified(root: Path) -> tuple[tuple[int, int], ...]:
+    """Times of change and sizes of the place and, of a folder, of what lies in it: a class folder's are its own."""
     try:
-        return root.stat().st_mtime_ns
+        found = [entry.stat() for entry in (root, *(sorted(root.iterdir()) if root.is_dir() else ()))]
     except OSError:
-        return 0
+        return ()
+    return tuple((status.st_mtime_ns, status.st_size) for status in found)
 
 
 @functools.lru_cache(maxsize=4)
-def _open(root: Path, class_names: tuple[str, ...], modified: int) -> LabelledPictures:
+def _open(root: Path, class_names: tuple[str, ...], modified: tuple[tuple[int, int], ...]) -> LabelledPictures:
     if root.is_file() and root.suffix == ".npz":
         found = _open_npz(root, class_names)
     elif root.is_dir() and _idx_file(root, IDX_IMAGES) is not None:
@@ -240,16 +246,28 @@ def _open_folders(root: Path) -> LabelledPictures:
 
 
 def _open_npz(path: Path, class_names: Sequence[str]) -> LabelledPictures:
-    arrays: dict[str, np.ndarray] = {}
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with zipfile.ZipFile(path) as archive:
+            members = {name.removesuffix(".npy"): name for name in archive.namelist()}
             for name in ("images", "labels"):
-                if name not in archive.files:
-                    raise DataError(f"{path}: no array {name!r}, only {', '.join(archive.files) or 'none'}; {EXPECTED}")
-                arrays[name] = archive[name]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+                if name not in members:
+                    raise DataError(f"{path}: no array {name!r}, only {', '.join(members) or 'none'}; {EXPECTED}")
+            images, labels = (_read_array(archive, members[name], path) for name in ("images", "labels"))
+    except (DataError, MemoryError):
+        raise
+    except Exception as error:  # zipfile and zlib report damage as a dozen types
         raise DataError(f"{path}: cannot be read as .npz: {error}") from error
-    return _checked(arrays["images"], arrays["labels"], class_names, str(path))
+    return _checked(images, labels, class_names, str(path))
+
+
+def _read_array(archive: zipfile.ZipFile, name: str, path: Path) -> np.ndarray:
+    where, size = f"{path}: {name}", archive.getinfo(name).file_size
+    if size > MAX_BYTES:
+        raise DataError(f"{where} has {size} bytes, more than the limit of {MAX_BYTES}")
+    with archive.open(name) as file:
+        header = read_array_header(file, where, size)
+        items = read_items(file, header.dtype, math.prod(header.shape), where)
+    return items.reshape(header.shape, order="F" if header.fortran_order else "C")
 
 
 def _open_idx(root: Path, class_names: Sequence[str]) -> LabelledPictures:
@@ -275,7 +293,7 @@ def _read_idx(path: Path, magic: int) -> np.ndarray:
                 data = packed.read(MAX_BYTES)
         (found,) = struct.unpack_from(">I", data)
         shape = struct.unpack_from(f">{magic & 0xFF}I", data, 4)
-    except (OSError, EOFError, struct.error) as error:
+    except (OSError, EOFError, struct.error, zlib.error) as error:
         raise DataError(f"{path}: cannot be read as MNIST's format: {error}") from error
     start = 4 + 4 * len(shape)
     if found != magic or len(data) - start != int(np.prod(shape, dtype=np.int64)):

@@ -46,10 +46,21 @@ class IngestedRecording(NamedTuple):
 
 
 def list_recordings(plugin: Plugin) -> list[Recording]:
-    """The dataset's recordings, refused when a subject is in two of training, validation and test."""
+    """The dataset's recordings, refused when two have one id or a subject is in two of training, validation and test.
+
+    Raises:
+        DataError: these, none at all, or as the dataset's own `list_recordings`.
+    """
     recordings = plugin.module.list_recordings(plugin.options)
     if not recordings:
         raise DataError(f"dataset {plugin.name!r} has no recordings with options {plugin.options!r}")
+    named: dict[str, Recording] = {}
+    for recording in recordings:
+        if recording.recording_id in named:
+            alike = (named[recording.recording_id], recording)
+            files = " and ".join(str(one.files[0]) if one.files else "no file" for one in alike)
+            raise DataError(f"dataset {plugin.name!r}: two recordings are called {recording.recording_id!r}: {files}")
+        named[recording.recording_id] = recording
     subjects: dict[str, set[str]] = {}
     for recording in recordings:
         if len(recording.parts) == 1:  # a recording split in time shares its subject by the user's own choice

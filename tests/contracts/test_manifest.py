@@ -186,3 +186,13 @@ def test_visible_joint_without_position_is_refused():
     labels.visible[0, 0] = True
     with pytest.raises(DataError, match=r"here: joint 0 of row 0 is marked visible but its position is \[nan, nan\]"):
         check_labels(labels, "here")
+
+
+def test_a_damaged_name_of_a_column_is_named(tmp_path):
+    from data_contracts.file_lists import read_table
+
+    path = tmp_path / "labels.parquet"
+    pq.write_table(pa.table({"class_name": ["a"]}), path, store_schema=False)
+    path.write_bytes(path.read_bytes().replace(b"class_name", b"class\xffname"))
+    with pytest.raises(DataError, match=r"labels\.parquet: is not a Parquet file: .*utf-8"):
+        read_table(path, path)

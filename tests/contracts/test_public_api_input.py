@@ -117,3 +117,10 @@ def test_a_dataset_stays_where_it_was_opened(tmp_path, monkeypatch):
     for names in (["walk", "walk"], "walk"):
         with pytest.raises(ValueError, match="class_names must be different names"):
             ctlev.EventDataset(made.path, class_names=names)
+
+
+def test_windows_of_a_pause_are_left_out():
+    t = np.array([0, 35, 49])
+    none = np.zeros(3, np.uint16)
+    counts = ctlev.histogram(Events(t, none, none, np.ones(3, np.uint8), (1, 1)), duration_us=10)
+    assert counts[:, 0, 0, 0].tolist() == [1, 1, 1]  # of 0 .. 9, 30 .. 39 and 40 .. 49 us

@@ -75,6 +75,19 @@ def test_a_root_is_found_two_levels_away_but_no_home_folder_is_searched(tmp_path
     assert len(asked) <= trees.MAX_SEARCHED + 3
 
 
+@pytest.mark.parametrize("place", ["link", "stuff/link"])
+def test_a_wrong_root_is_told_whatever_lies_in_it(tmp_path, place):
+    (tmp_path / "stuff").mkdir()
+    (tmp_path / place).symlink_to(tmp_path / "gone")
+
+    def lists_what_it_is_asked_of(folder):
+        return folder != tmp_path and any(path.name == "mark" for path in trees.list_folder(folder))
+
+    for ask in (is_root, lists_what_it_is_asked_of):
+        with pytest.raises(DataError, match=f"not the expected folder; {TREE}"):
+            trees.check_root(tmp_path, TREE, ask)
+
+
 def test_hidden_entries_are_not_listed_and_links_are_checked(tmp_path):
     root = tmp_path / "root"
     root.mkdir()

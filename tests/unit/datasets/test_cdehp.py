@@ -221,6 +221,17 @@ def test_wrong_raw_events_are_named(root, rows, message):
     assert message in str(error.value) and "A0001P0002S00" in str(error.value)
 
 
+def test_a_damaged_file_of_raw_events_is_named(root):
+    shot = root / "outdoor/train/A0001P0002S00"
+    write_label(shot / "event_label/000000.txt")
+    path = shot / "event_point_cloud/000000.npy"
+    path.parent.mkdir()
+    np.save(path, np.array([[801, 3, 90_000, 1]]))
+    path.write_bytes(path.read_bytes().replace(b"'fortran_order': False", b"'fortran_order': (alse"))
+    with pytest.raises(DataError, match=r"000000\.npy: expected columns of events: .* not a complete NumPy file"):
+        cdehp.read_events(*first(root))
+
+
 def test_the_order_of_coordinates_can_be_given(root):
     shot = root / "outdoor/train/A0001P0002S00"
     write_label(shot / "event_label/000000.txt")

@@ -136,6 +136,18 @@ def test_damaged_frame_files_are_named(root):
         dhp19.read_labels(recording, options)
 
 
+def test_a_damaged_object_in_a_frame_file_is_named(root):
+    write_frames(root)
+    path = root / FOLDER / "S1_session1_mov2_7500events_label.h5"
+    with h5py.File(path) as file:
+        place = h5py.h5o.get_info(file["XYZ"].id).addr
+    content = bytearray(path.read_bytes())
+    content[place] ^= 0xFF  # the version of its header
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"_label\.h5: expected an HDF5 file: .*bad object header version"):
+        dhp19_files.read_frame_labels(path)
+
+
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_the_real_cameras_project_as_the_authors_do(number):
     if not CALIBRATION.is_dir():

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from ctlev_core import plugins
 from ctlev_core.datasets import n_caltech101
+from ctlev_core.recordings.ingestion import list_recordings
 from ctlev_core.stand_ins.dataset_writers import write_atis
 from data_contracts.config import ConditionChoice, DatasetChoice, EncodingChoice, Windows
 from data_contracts.errors import DataError
@@ -48,6 +49,15 @@ def root(tmp_path: Path) -> Path:
 
 def listed(root: Path, **options) -> list:
     return n_caltech101.list_recordings(n_caltech101.Options(root=root, **options))
+
+
+def test_two_recordings_of_one_name_are_refused_before_any_is_read(root, monkeypatch):
+    write_some(root / "accordion" / "image_0003.BIN", 99)
+    monkeypatch.setattr(n_caltech101, "read_events", lambda *_: pytest.fail("read"))
+    plugin = plugins.load_options(DatasetChoice(name="n_caltech101", options={"root": str(root)}))
+    message = r"two recordings are called 'accordion/image_0003': .*image_0003\.bin and .*image_0003\.BIN"
+    with pytest.raises(DataError, match=message):
+        list_recordings(plugin)
 
 
 def run_stage(stage, **arguments):

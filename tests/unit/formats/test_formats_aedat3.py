@@ -162,3 +162,15 @@ def test_an_empty_recording_is_written(tmp_path):
     reader.write(tmp_path / "a", make_events([], (240, 180)))
     events = reader.read(tmp_path / "a")
     assert len(events) == 0 and events.sensor_size == (240, 180) and events.t.dtype == np.int64
+
+
+@pytest.mark.parametrize("lost", [800 * 8, 800 * 8 - 3])
+def test_a_file_that_becomes_shorter_while_it_is_read_is_an_error(tmp_path, lost):
+    path = tmp_path / "a.aedat3"
+    reader.write(path, make_events([(t, 0, 0, 1) for t in range(50_000)]))
+    chunks = reader.read_chunks(path, 100)
+    next(chunks)
+    with path.open("r+b") as file:  # within the last packet
+        file.truncate(path.stat().st_size - lost)
+    with pytest.raises(DataError, match=r"a\.aedat3: the file became shorter while it was read"):
+        list(chunks)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -91,6 +94,30 @@ def test_hdf5_filter_that_is_not_installed_says_what_to_install(tmp_path):
         dataset = h5py.h5d.create(file["events"].id, b"t", h5py.h5t.NATIVE_INT64, space, properties)
         dataset.write_direct_chunk((0,), np.array(T).tobytes())
     raises_both_ways(path, "compressed with a filter that is not installed; pip install hdf5plugin")
+
+
+def test_hdf5_with_damaged_values_says_so_and_nothing_of_installing(tmp_path):
+    path = write_dsec(tmp_path / "a.h5")
+    with h5py.File(path) as file:
+        chunk = file["events/x"].id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = b"\xff" * chunk.size
+    path.write_bytes(content)
+    raises_both_ways(path, "not a complete HDF5 file: .*filter returned failure")
+
+
+def test_hdf5_plugins_without_the_filter_are_no_damage(tmp_path):
+    pytest.importorskip("hdf5plugin")
+    import hdf5plugin
+
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for name in "txyp":
+            file.create_dataset(f"events/{name}", data=np.zeros(5000, np.int64), **hdf5plugin.Blosc())
+    code = "import sys; sys.modules['hdf5plugin'] = None; import ctlev_core; ctlev_core.read_events(sys.argv[1])"
+    environment = {**os.environ, "HDF5_PLUGIN_PATH": str(tmp_path)}
+    found = subprocess.run([sys.executable, "-c", code, str(path)], env=environment, capture_output=True, text=True)
+    assert "filter that is not installed; pip install hdf5plugin (" in found.stderr, found.stderr
 
 
 def test_hdf5_with_a_shape_and_no_values_is_an_error(tmp_path):

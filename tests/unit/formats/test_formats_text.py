@@ -67,6 +67,14 @@ def test_text_seconds_are_rounded_exactly(tmp_path_factory, value, style):
         ("t,x,y,p\n", "no events, and nothing else tells the sensor size"),
         ("# sensor_size 20x10\n0.1 20 2 1\n", "x must be below 20, got 20 at event 0"),
         ("# sensor_size 20x10\n0.1 19 10 1\n", "y must be below 10, got 10 at event 0"),
+        (
+            "# sensor_size -20x10\n0.1 2 2 1\n",
+            "comment '# sensor_size WIDTHxHEIGHT', got '# sensor_size -20x10'",
+        ),
+        (
+            "# sensor_size: VGA\n0.1 2 2 1\n",
+            "comment '# sensor_size WIDTHxHEIGHT', got '# sensor_size: VGA'",
+        ),
         ("dear reader, this is no table of events\n", "not an event file"),
         ("1 2 3\n", "not an event file"),
     ],
@@ -87,3 +95,24 @@ def test_text_is_parsed_the_same_across_blocks(tmp_path, monkeypatch):
     path.write_text("0.1 1 2 1\n" + "0" * 100 + "1 1 2 1\n")
     with pytest.raises(DataError, match="a line of more than 37 bytes"):
         module.read(path)
+
+
+@pytest.mark.parametrize("stated", ["sensor_size 20x10", "sensor_size: (20, 10)", "the sensor_size = 20 x 10"])
+def test_a_comment_states_the_sensor(stated, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(f"# {stated}\n# its sensor_size is that of the camera\n1 2 3 1\n")
+    assert read_both_ways(path).sensor_size == (20, 10)
+
+
+@pytest.mark.parametrize("change", ["shorter", "longer"])
+def test_text_that_changes_while_it_is_read_is_an_error(tmp_path, monkeypatch, change):
+    reader = plugins.load("formats", "csv")
+    monkeypatch.setattr(reader, "_BLOCK_BYTES", 1 << 14)
+    path = tmp_path / "a.csv"
+    rows = [f"{t} 1 2 1\n" for t in range(10_000, 20_000)]
+    path.write_text("".join(rows))
+    chunks = reader.read_chunks(path, 10)
+    next(chunks)  # the file has been looked through once
+    path.write_text("".join(rows[:7000]) if change == "shorter" else "".join([*rows, "20000 1 2 1\n"]))
+    with pytest.raises(DataError, match=r"a\.csv: the file changed while it was read: 10000 rows first, then \d+"):
+        list(chunks)

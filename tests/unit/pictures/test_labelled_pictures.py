@@ -1,15 +1,21 @@
 """Pictures of a user's own: three layouts, the same pictures; what cannot be read is said before training starts."""
 
 import gzip
+import io
+import os
 import struct
+import zipfile
 
 import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from ctlev_core.dataset_files.event_hpe_files import read_event_images
+from ctlev_core.dataset_files.picture_files import read_grey_pictures
+from ctlev_core.pictures import labelled_pictures
 from ctlev_core.pictures.image_moves import Moves, move_image
-from ctlev_core.pictures.labelled_pictures import PictureOptions, move, open_pictures, read_picture
+from ctlev_core.pictures.labelled_pictures import PictureOptions, _open, move, open_pictures, read_picture
 from data_contracts.errors import DataError
 
 
@@ -135,12 +141,82 @@ def test_bad_places(tmp_path):
         open_pictures(PictureOptions(root=idx))
 
 
+def test_pictures_that_have_changed_are_opened_anew(tmp_path):
+    def age(root):  # whatever the resolution of the file system's clock
+        for place in (root, *root.rglob("*")):
+            os.utime(place, (1, 1))
+
+    root = write_folders(tmp_path / "folders", pictures(), ["cat", "dog"] * 12)
+    age(root)
+    assert len(open_pictures(PictureOptions(root=root))) == 24
+    (root / "dog" / "001.png").unlink()
+    assert len(open_pictures(PictureOptions(root=root))) == 23
+    idx = write_idx(tmp_path / "idx", pictures(), np.zeros(24, np.uint8))
+    age(idx)
+    open_pictures(PictureOptions(root=idx))
+    write_idx(idx, pictures() // 2, np.zeros(24, np.uint8))
+    assert open_pictures(PictureOptions(root=idx)).images.max() < 128
+
+
+@pytest.mark.parametrize("layout", ["npz", "gz"])
+def test_damaged_files_are_named(tmp_path, layout):
+    images, labels = pictures(), np.arange(24, dtype=np.uint8)
+    if layout == "npz":
+        root = file = tmp_path / "a.npz"
+        np.savez_compressed(file, images=images, labels=labels)
+    else:
+        root = write_idx(tmp_path / "a", images, labels, packed=True)
+        file = root / "train-images-idx3-ubyte.gz"
+    whole = file.read_bytes()
+    refused = 0
+    for place in range(0, len(whole), 5):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 0x5A]) + whole[place + 1 :])
+        try:
+            _open(root, (), ((place, 0),))
+        except DataError as error:
+            refused += str(error).startswith(str(file))
+    assert refused > len(whole) / 10
+
+
+def test_an_archive_that_claims_more_than_it_holds_is_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    header = io.BytesIO()
+    shape = (10**7, 1000, 1000)
+    np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": shape})
+    np.savez(path, labels=np.zeros(24, np.uint8))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("images.npy", header.getvalue() + bytes(100))
+    with pytest.raises(DataError, match=r"a\.npz: images\.npy: not a complete NumPy file: shape .* got 100"):
+        open_pictures(PictureOptions(root=path))
+
+
+def test_an_array_larger_than_the_limit_is_not_read(tmp_path, monkeypatch):
+    np.savez_compressed(tmp_path / "a.npz", images=np.zeros((24, 50, 50), np.uint8), labels=np.zeros(24, np.uint8))
+    monkeypatch.setattr(labelled_pictures, "MAX_BYTES", 50_000)
+    with pytest.raises(DataError, match=r"a\.npz: images\.npy has 60128 bytes, more than the limit of 50000"):
+        open_pictures(PictureOptions(root=tmp_path / "a.npz"))
+
+
 def test_a_file_that_is_no_picture_is_named(tmp_path):
     root = write_folders(tmp_path / "p", pictures(), ["cat", "dog"] * 12)
     (root / "cat" / "000.png").write_bytes(b"no picture")
     found = open_pictures(PictureOptions(root=root))
     with pytest.raises(DataError, match=r"000\.png: cannot be read as a picture"):
         found.read(0, 8)
+
+
+def test_a_damaged_picture_that_claims_too_many_pixels_is_named(tmp_path):
+    path = tmp_path / "a.bmp"
+    cv2.imwrite(str(path), np.zeros((8, 8, 4), np.uint8))
+    content = bytearray(path.read_bytes())
+    content[18:26] = struct.pack("<ii", 1 << 21, 1 << 21)  # width and height
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.bmp: cannot be read as a picture"):
+        read_picture(path)
+    with pytest.raises(DataError, match=r"a\.bmp: expected a picture of 8 x 8 px, got none"):
+        read_grey_pictures([path], (8, 8))
+    with pytest.raises(DataError, match=r"a\.bmp: expected four time slices \[8, 8, 4\] of 8 bits, got no picture"):
+        read_event_images([path], 8)
 
 
 def test_bad_options(tmp_path):

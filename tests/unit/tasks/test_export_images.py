@@ -297,6 +297,15 @@ def test_a_damaged_or_newer_table_is_refused(tmp_path, monkeypatch):
         write_image_table(folder, table)
     with pytest.raises(TableVersionError, match="table version 2; this code reads version 1"):
         read_image_table(folder)
+    for metadata in (b"[]", b"no JSON", b"\xff"):
+        pq.write_table(table.replace_schema_metadata({b"ctlev.schema": metadata}), folder / "labels.parquet")
+        with pytest.raises(DataError, match=r"labels\.parquet: damaged: "):
+            read_image_table(folder)
+    pq.write_table(table, folder / "labels.parquet", compression="none", use_dictionary=False)
+    content = (folder / "labels.parquet").read_bytes()
+    (folder / "labels.parquet").write_bytes(content.replace(b"class_name", b"class\xffname"))
+    with pytest.raises(DataError, match=r"labels\.parquet: "):
+        read_image_table(folder)
     (folder / "labels.parquet").write_bytes((folder / "labels.parquet").read_bytes()[:-10])
     with pytest.raises(DataError, match="cannot be read as Parquet"):
         read_image_table(folder)

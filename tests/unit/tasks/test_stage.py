@@ -420,6 +420,22 @@ def test_linked_folders_are_read_and_loops_are_not(tmp_path):
     assert [name for name, _ in files_of([model])] == ["0/unet/weights"]
 
 
+def test_a_folder_that_two_links_lead_to_is_read_in_both_places(tmp_path):
+    (tmp_path / "shared" / "vae").mkdir(parents=True)
+    (tmp_path / "shared" / "vae" / "weights").write_bytes(b"1")
+    for name in ("a", "b"):
+        (tmp_path / "models" / name).mkdir(parents=True)
+        (tmp_path / "models" / name / "vae").symlink_to(tmp_path / "shared" / "vae")
+    assert [name for name, _ in files_of([tmp_path / "models"])] == ["0/a/vae/weights", "0/b/vae/weights"]
+    (tmp_path / "models" / "b" / "vae").unlink()
+    assert [name for name, _ in files_of([tmp_path / "models"])] == ["0/a/vae/weights"]
+    # In one another: whoever walks on and on never comes back.
+    (tmp_path / "models" / "a" / "other").symlink_to(tmp_path / "models" / "b")
+    (tmp_path / "models" / "b" / "other").symlink_to(tmp_path / "models" / "a")
+    assert [name for name, _ in files_of([tmp_path / "models"])] == ["0/a/vae/weights", "0/b/other/vae/weights"]
+    assert files_of([tmp_path / "nothing"]) == []
+
+
 def test_versions_of_readers_enter_the_key_of_stages_that_read_files(tmp_path, monkeypatch):
     (tmp_path / "a").write_bytes(b"1")
     keys = []
