@@ -34,7 +34,7 @@ from data_contracts.errors import DataError
 from data_contracts.events import Events, check_events
 from data_contracts.labels import ImageTrack, Labels, Part, Recording, check_labels
 
-VERSION = 2
+VERSION = 3
 JOINT_SET = "cdehp"
 Place = Literal["indoor", "outdoor"]
 

@@ -172,9 +172,7 @@ def _encode_images(source: RecordingSource, file: Path, plugin: Plugin, windows:
         raise DataError(f"{name}: finished event images cannot be split in time")
     images, times_us = load_array(file), np.atleast_2d(load_array(Path(times_file(str(file)))))
     starts_us, t_us = times_us[0], times_us[-1]
-    known = np.arange(len(images))
-    if windows.labels == "interpolated":
-        known = np.flatnonzero(is_between_labels(source.track, t_us))
+    known = np.flatnonzero(_is_labelled(source.track, t_us, t_us, windows))
     chosen = known[spread(len(known), windows.max_windows)]
     at_once = _windows_at_once(plugin, source.sensor_size)
     for first in range(0, len(chosen), at_once):

@@ -153,6 +153,15 @@ def test_finished_event_images_become_frames_with_the_labels_of_their_moment(fra
     np.testing.assert_allclose(frames.labels.joints2d[:3, 0], [[4.0, 6.0], [4.5, 6.5], [5.0, 7.0]])
 
 
+@pytest.mark.parametrize(("labels", "kept"), [("mean", [0, 400, 1500]), ("interpolated", [0, 400])])
+def test_finished_event_images_far_from_every_label_are_left_out(frames_of, labels, kept):
+    """Labels are at 0, 500 and 1000 us: what was true half a second ago is no label, as for windows of events."""
+    times = np.array([0, 400, 1500, 1501, 500_000], np.int64)
+    release = ImageTrack(np.full((len(times), SENSOR[1], SENSOR[0]), 9, np.uint8), times)
+    _, frames = frames_of(make_dataset(release=release), windows=Windows(num_events=40, labels=labels), polarity=False)
+    assert frames.column("t_end_us") == 2 * kept
+
+
 @pytest.mark.parametrize("side", [16, 64, 100])
 def test_the_raw_and_the_released_layout_of_a_recording_give_the_same_frames(frames_of, side):
     """As DHP19: the release holds the counts of each window, three standard deviations of them being white."""
