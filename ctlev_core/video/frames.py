@@ -37,6 +37,8 @@ _ROWS = 16
 _WITHOUT_COUNT = (".mkv", ".webm")
 _NOT_SHOWN = 0.01
 """A container may count so many frames more than it has; with fewer, the file was cut."""
+_LATEST_US = 2.0**53
+"""The sensor's clock is float64, which has every whole us up to here: 285 years."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +184,7 @@ class _StoredFrames(Frames):
             if options.stop_s is not None and time_s > options.stop_s:
                 break
             first_s = time_s if first_s is None else first_s
-            t_us = round((time_s - first_s) / options.slow_motion * 1e6)
+            t_us = self._life_us(time_s - first_s, number)
             if t_us <= last_us:
                 self.num_skipped += 1
                 continue
@@ -194,6 +196,15 @@ class _StoredFrames(Frames):
         if count < 2:
             stretch = "" if options.stop_s is None and not options.start_s else " in this stretch"
             raise DataError(f"{self.path}: expected two frames or more at different times{stretch}, got {count}")
+
+    def _life_us(self, shown_s: float, number: int) -> int:
+        life_us = shown_s / self.options.slow_motion * 1e6
+        if not life_us <= _LATEST_US:
+            raise DataError(
+                f"{self.path}: frame {number} is {life_us / 1e6:.3g} s after the first, expected at most "
+                f"{_LATEST_US / 1e6:.3g} s (285 years); look at the times, fps and slow_motion"
+            )
+        return round(life_us)
 
     def stored_size(self) -> SensorSize:
         """See `Frames`; reads one frame."""
@@ -212,8 +223,9 @@ def _in_stretch(count: int, fps: float, options: FrameOptions) -> int:
         return count
     if not fps:
         return 0
-    stop = count if options.stop_s is None else min(count, round(options.stop_s * fps) + 1)
-    return max(stop - math.ceil(options.start_s * fps), 0)
+    # Cut to the count before they become whole numbers: seconds may be as many as a float can say.
+    stop = count if options.stop_s is None else min(count, round(min(options.stop_s * fps, count)) + 1)
+    return max(stop - math.ceil(min(options.start_s * fps, count)), 0)
 
 
 class _VideoFile(_StoredFrames):

@@ -111,6 +111,8 @@ def test_the_suffix_says_the_format(tmp_path):
         (["{video}", "{out}.parquet", "--fps", "-3"], "fps must be a number above 0"),
         (["{video}", "{out}.parquet", "--max-displacement-px", "0"], "max_displacement_px must be above 0"),
         (["{video}", "{out}.parquet", "--start", "50"], "two frames or more"),
+        (["{video}", "{out}.parquet", "--start", "inf"], "two frames or more"),
+        (["{video}", "{out}.parquet", "--fps", "1e-300"], "s after the first, expected at most"),
     ],
 )
 def test_what_cannot_be_done_is_said_and_leaves_nothing(video, tmp_path, arguments, message):

@@ -182,6 +182,27 @@ def test_how_many_frames_a_stretch_has_is_known_before(tmp_path, start_s, stop_s
         assert frames.expected == count == len(list(frames))
 
 
+@pytest.mark.parametrize("far_s", [1e308, float("inf")])
+def test_a_stretch_may_begin_or_end_as_late_as_a_float_can_say(tmp_path, far_s):
+    write_video(tmp_path / "a.avi", [10] * 4)
+    frames = open_frames(tmp_path / "a.avi", FrameOptions(stop_s=far_s))
+    assert frames.expected == 4 == len(list(frames))
+    frames = open_frames(tmp_path / "a.avi", FrameOptions(start_s=far_s))
+    assert frames.expected == 0
+    with pytest.raises(DataError, match="two frames or more at different times in this stretch, got 0"):
+        list(frames)
+
+
+@pytest.mark.parametrize("options", [{"fps": 1e-300}, {"fps": 5e-324}, {"fps": 1e-12}, {"slow_motion": 1e-300}])
+def test_frames_later_than_the_clock_of_a_sensor_are_refused(tmp_path, options):
+    write_video(tmp_path / "a.avi", [10] * 20)
+    with pytest.raises(DataError, match=r"a.avi: frame \d+ is \S+ s after the first, expected at most 9.01e\+09 s"):
+        list(open_frames(tmp_path / "a.avi", FrameOptions(**options)))
+    folder = write_folder(tmp_path / "f", [10, 20], [0, 1e300])
+    with pytest.raises(DataError, match="frame 1 is 1e"):
+        list(open_frames(folder, FrameOptions()))
+
+
 @pytest.mark.parametrize("asked", [{"fps": 5.0}, {"slow_motion": 10.0}, {"start_s": 0.1}, {"stop_s": 0.1}])
 def test_a_still_picture_has_times_of_its_own(tmp_path, asked):
     assert cv2.imwrite(str(tmp_path / "a.png"), picture(100))
