@@ -158,6 +158,11 @@ class _Light:
             return cv2.LUT(stored, self._of_bytes)
         if stored.dtype == np.uint16:
             return (stored.astype(np.float32) / 65535) ** self._gamma
+        if stored.dtype.kind != "f":
+            raise DataError(
+                f"{self._path}: expected pixels of 8 or 16 bits without a sign, or floating-point ones, got "
+                f"{stored.dtype} in frame {number}"
+            )
         light = stored.astype(np.float32)
         if not np.isfinite(light).all() or light.min() < 0:
             raise DataError(f"{self._path}: light must be finite and not negative, it is not in frame {number}")
@@ -190,7 +195,7 @@ class _StoredFrames(Frames):
                 continue
             last_us, count = t_us, count + 1
             shown.append(Shown(t_us, number))
-            yield t_us, light.of(stored, count - 1)
+            yield t_us, light.of(stored, number)
         else:
             self.num_seen_to_end = num_read
         if count < 2:
@@ -260,13 +265,16 @@ class _VideoFile(_StoredFrames):
                     fps = stated_fps if math.isfinite(stated_fps) and stated_fps > 0 else 0.0
                     if not fps:
                         raise DataError(f"{self.path}: the file says nothing of the times of its frames; give fps")
+                if has_times and count and time_s == 0:
+                    # OpenCV has no time of this frame, as of the last one of MPEG-1 and MPEG-2, which comes late.
+                    time_s = before_s + (1 / stated_fps if math.isfinite(stated_fps) and stated_fps > 0 else 0.0)
                 before_s = time_s
                 yield (count / fps if fps else time_s), frame
                 count += 1
         finally:
             capture.release()
         seen = count
-        if has_times and math.isfinite(stated_fps) and stated_fps > 0:
+        if count and has_times and math.isfinite(stated_fps) and stated_fps > 0:
             seen = round(before_s * stated_fps) + 1  # rates vary: what counts is how far the frames reach
         if seen < self._counted - max(2, _NOT_SHOWN * self._counted):
             raise DataError(

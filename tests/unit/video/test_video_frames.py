@@ -225,6 +225,43 @@ def test_sixteen_bits_and_floats(tmp_path):
     np.testing.assert_allclose(light, 3.5, rtol=0.01)
 
 
+@pytest.mark.parametrize("channels", [(), (1,), (3,), (4,)])
+def test_floating_point_tiffs_of_grey_colours_and_alpha_are_light(tmp_path, channels):
+    level = np.full((20, 20, *channels), 0.25, np.float32)
+    assert cv2.imwrite(str(tmp_path / "a.tiff"), level)
+    _, light = next(iter(open_frames(tmp_path / "a.tiff", FrameOptions())))
+    np.testing.assert_allclose(light, 0.25, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int32])
+def test_pixels_with_a_sign_are_no_light(tmp_path, dtype):
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for number in range(4):
+        level = np.full((20, 20), 100, np.uint8 if number < 3 else dtype)
+        assert cv2.imwrite(str(folder / f"{number}.tiff"), level)
+    message = rf"f: expected pixels of 8 or 16 bits without a sign, .*, got {np.dtype(dtype)} in frame 3"
+    with pytest.raises(DataError, match=message):
+        list(open_frames(folder, FrameOptions(fps=10.0, start_s=0.1)))
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".mpg", "MPG2"), (".avi", "MPG2"), (".avi", "PIM1")])
+def test_the_last_frame_of_mpeg_has_no_time_and_is_there(tmp_path, suffix, codec):
+    path = tmp_path / f"a{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 25.0, (64, 48))
+    for level in range(0, 200, 4):
+        writer.write(picture(level, (64, 48)))
+    writer.release()
+    times, light = zip(*open_frames(path, FrameOptions()), strict=True)
+    assert len(times) == 50 and times[-1] - times[-2] == 40_000
+    assert (np.diff([one.mean() for one in light]) >= 0).all()
+
+
+def test_a_video_without_frames_says_so(tmp_path):
+    with pytest.raises(DataError, match="expected two frames or more at different times, got 0"):
+        list(open_frames(write_video(tmp_path / "a.avi", []), FrameOptions()))
+
+
 @pytest.mark.parametrize(
     "wrong", [{"fps": 0}, {"fps": float("nan")}, {"slow_motion": -1}, {"start_s": -1}, {"start_s": 2, "stop_s": 1}]
 )
