@@ -270,6 +270,14 @@ def test_options_that_cannot_be_are_refused(wrong):
         FrameOptions(**wrong)
 
 
+@pytest.mark.parametrize("max_displacement_px", [1e-9, 5e-324])
+def test_a_still_picture_has_a_frame_a_microsecond_at_most(tmp_path, max_displacement_px):
+    assert cv2.imwrite(str(tmp_path / "a.png"), picture(100))
+    frames = open_frames(tmp_path / "a.png", FrameOptions(), max_displacement_px)
+    times = [t_us for (t_us, _), _ in zip(frames, range(4), strict=False)]
+    assert times == [0, 1, 2, 3] and frames.expected == 307_501
+
+
 def test_a_still_picture_makes_a_closed_path_of_saccades(tmp_path):
     level = np.linspace(20, 230, 68 * 68).reshape(68, 68).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), level)
