@@ -58,7 +58,7 @@ def find_page(name: str | None, home: Path) -> tuple[Path | None, str]:
     for path in (
         () if not Path(name).name else (Path(name), Path(name).with_name(f"{Path(name).name}.html"), Path(name) / PAGE)
     ):
-        if path.is_file():
+        if os.path.isfile(path):  # False of a name that is too long for a file, where `is_file` raises
             return path.absolute(), ""
     if len(name) >= 6 and set(name) <= set("0123456789abcdef"):
         found = sorted((home / "artefacts").glob(f"*report*/{name}*/{PAGE}"))

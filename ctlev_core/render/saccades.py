@@ -71,7 +71,7 @@ def path_frames(
     Args:
         path_us: times of its points, ascending from 0.
         path_px: where the picture is then, (x right, y down); smooth in between.
-        max_displacement_px: movement between two frames.
+        max_displacement_px: movement between two frames, which are never closer than a microsecond.
     Returns:
         Times [T] int64 us, and where [T, 2] px the picture is then against its start.
     """
@@ -81,9 +81,13 @@ def path_frames(
     fine_us = np.unique(np.append(np.arange(0, path_us[-1], PATH_STEP_US), path_us[-1]))
     steps = np.linalg.norm(np.diff(path(fine_us), axis=0), axis=1)
     # Each fine step is a share of a frame: by how far it moves, and by how long it lasts.
-    shares = np.maximum(steps / max_displacement_px, np.diff(fine_us) / MAX_INTERVAL_US)
+    with np.errstate(over="ignore"):
+        shares = np.maximum(steps / max_displacement_px, np.diff(fine_us) / MAX_INTERVAL_US)
     progress = np.concatenate([[0.0], np.cumsum(shares)])
-    count = int(np.ceil(progress[-1])) + 1
-    times_us = np.interp(np.linspace(0, progress[-1], count), progress, fine_us)
-    times_us = np.unique(np.rint(times_us).astype(np.int64))
+    if progress[-1] > path_us[-1]:
+        times_us = np.arange(path_us[-1] + 1)  # times are whole us: there can be no more
+    else:
+        count = int(np.ceil(progress[-1])) + 1
+        times_us = np.interp(np.linspace(0, progress[-1], count), progress, fine_us)
+        times_us = np.unique(np.rint(times_us).astype(np.int64))
     return times_us, path(times_us)

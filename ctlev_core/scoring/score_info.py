@@ -6,6 +6,7 @@ Each metric says so of its own scores, in `SCORES`; tables, verdicts, gates and 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class ScoreInfo:
     is_share: bool = False
 
 
+@lru_cache(maxsize=4096)  # a report of a thousand classes asks once a cell, and each look goes to the disk
 def find_score(name: str) -> ScoreInfo:
     """What the metrics say of a score; of a name that none of them knows, that higher is better."""
     from ctlev_core import plugins

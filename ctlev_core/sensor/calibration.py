@@ -207,6 +207,9 @@ def _measure_thresholds(
     middle = float(np.median(ratio))
     measured["off_to_on_threshold"] = math.exp(middle)
     found["threshold_off"] = base.threshold * math.exp(middle)
+    if found["threshold_off"] < base.threshold_minimum:
+        found["threshold_minimum"] = base.threshold_minimum * math.exp(middle)
+        assumed["threshold_minimum"] = "as far below the OFF threshold as that of the base is below its ON threshold"
     relative = _intercept((ratio - middle) ** 2, 4.0 / (on[usable] + off[usable]) ** 2)
     measured["threshold_spread"] = math.sqrt(max(relative, 0.0) / 2)
     found["threshold_sigma"] = measured["threshold_spread"] * base.threshold

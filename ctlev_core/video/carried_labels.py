@@ -43,6 +43,11 @@ class CarriedLabels:
         self._moments = [frames.shown[place] for place in places]
         self._times = np.array([one.t_us for one in self._moments], np.int64)
         self._last: dict[int, tuple[int, Label | None, Label | None]] = {}
+        # Annotations without an instance are a track each: a moment looks at none but those of its frame.
+        self._in_frame: dict[int, list[Track]] = {}
+        for track in labels.tracks:
+            for frame in track.labels:
+                self._in_frame.setdefault(frame, []).append(track)
         spacing = np.diff(places)
         self._joined = spacing <= MAX_SPACING * (np.median(spacing) if len(spacing) else 0)
 
@@ -55,8 +60,9 @@ class CarriedLabels:
                 {"id": number, "video_id": 1, "frame_id": number, "file_name": name, "width": width, "height": height}
                 | {"t_us": time_us}
             )
-            for track in self._labels.tracks:
-                found = self._at(track, time_us)
+            before = int(np.searchsorted(self._times, time_us, "right")) - 1
+            for track in self._in_frame.get(self._moments[before].number, ()) if before >= 0 else ():
+                found = self._at(track, time_us, before)
                 if found:
                     ids = {"id": len(annotations), "image_id": number, "video_id": 1, "category_id": track.category_id}
                     instance = {} if track.instance is None else {"instance_id": track.instance}
@@ -67,11 +73,8 @@ class CarriedLabels:
             "videos": videos, "images": images, "annotations": annotations, "categories": self._labels.categories,
         }  # fmt: skip
 
-    def _at(self, track: Track, time_us: int) -> dict[str, Any] | None:
-        """What is seen of an instance; None = nothing, or nobody knows."""
-        before = int(np.searchsorted(self._times, time_us, "right")) - 1
-        if before < 0:
-            return None
+    def _at(self, track: Track, time_us: int, before: int) -> dict[str, Any] | None:
+        """What is seen of an instance after the labelled moment `before`; None = nothing, or nobody knows."""
         if self._last.get(id(track), (-1,))[0] != before:
             self._last[id(track)] = before, *self._ends(track, before)
         _, start, stop = self._last[id(track)]

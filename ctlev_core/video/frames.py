@@ -37,6 +37,8 @@ _ROWS = 16
 _WITHOUT_COUNT = (".mkv", ".webm")
 _NOT_SHOWN = 0.01
 """A container may count so many frames more than it has; with fewer, the file was cut."""
+_LATEST_US = 2.0**53
+"""The sensor's clock is float64, which has every whole us up to here: 285 years."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,11 @@ class _Light:
             return cv2.LUT(stored, self._of_bytes)
         if stored.dtype == np.uint16:
             return (stored.astype(np.float32) / 65535) ** self._gamma
+        if stored.dtype.kind != "f":
+            raise DataError(
+                f"{self._path}: expected pixels of 8 or 16 bits without a sign, or floating-point ones, got "
+                f"{stored.dtype} in frame {number}"
+            )
         light = stored.astype(np.float32)
         if not np.isfinite(light).all() or light.min() < 0:
             raise DataError(f"{self._path}: light must be finite and not negative, it is not in frame {number}")
@@ -182,18 +189,27 @@ class _StoredFrames(Frames):
             if options.stop_s is not None and time_s > options.stop_s:
                 break
             first_s = time_s if first_s is None else first_s
-            t_us = round((time_s - first_s) / options.slow_motion * 1e6)
+            t_us = self._life_us(time_s - first_s, number)
             if t_us <= last_us:
                 self.num_skipped += 1
                 continue
             last_us, count = t_us, count + 1
             shown.append(Shown(t_us, number))
-            yield t_us, light.of(stored, count - 1)
+            yield t_us, light.of(stored, number)
         else:
             self.num_seen_to_end = num_read
         if count < 2:
             stretch = "" if options.stop_s is None and not options.start_s else " in this stretch"
             raise DataError(f"{self.path}: expected two frames or more at different times{stretch}, got {count}")
+
+    def _life_us(self, shown_s: float, number: int) -> int:
+        life_us = shown_s / self.options.slow_motion * 1e6
+        if not life_us <= _LATEST_US:
+            raise DataError(
+                f"{self.path}: frame {number} is {life_us / 1e6:.3g} s after the first, expected at most "
+                f"{_LATEST_US / 1e6:.3g} s (285 years); look at the times, fps and slow_motion"
+            )
+        return round(life_us)
 
     def stored_size(self) -> SensorSize:
         """See `Frames`; reads one frame."""
@@ -212,8 +228,9 @@ def _in_stretch(count: int, fps: float, options: FrameOptions) -> int:
         return count
     if not fps:
         return 0
-    stop = count if options.stop_s is None else min(count, round(options.stop_s * fps) + 1)
-    return max(stop - math.ceil(options.start_s * fps), 0)
+    # Cut to the count before they become whole numbers: seconds may be as many as a float can say.
+    stop = count if options.stop_s is None else min(count, round(min(options.stop_s * fps, count)) + 1)
+    return max(stop - math.ceil(min(options.start_s * fps, count)), 0)
 
 
 class _VideoFile(_StoredFrames):
@@ -248,13 +265,16 @@ class _VideoFile(_StoredFrames):
                     fps = stated_fps if math.isfinite(stated_fps) and stated_fps > 0 else 0.0
                     if not fps:
                         raise DataError(f"{self.path}: the file says nothing of the times of its frames; give fps")
+                if has_times and count and time_s == 0:
+                    # OpenCV has no time of this frame, as of the last one of MPEG-1 and MPEG-2, which comes late.
+                    time_s = before_s + (1 / stated_fps if math.isfinite(stated_fps) and stated_fps > 0 else 0.0)
                 before_s = time_s
                 yield (count / fps if fps else time_s), frame
                 count += 1
         finally:
             capture.release()
         seen = count
-        if has_times and math.isfinite(stated_fps) and stated_fps > 0:
+        if count and has_times and math.isfinite(stated_fps) and stated_fps > 0:
             seen = round(before_s * stated_fps) + 1  # rates vary: what counts is how far the frames reach
         if seen < self._counted - max(2, _NOT_SHOWN * self._counted):
             raise DataError(

@@ -144,7 +144,7 @@ class _Moved:
 
 def num_steps(displacement_px: float, max_displacement_px: float, max_steps: int) -> int:
     """Into how many steps the time between two frames is cut, so that nothing moves farther in one; 1 to max_steps."""
-    return int(min(max(math.ceil(displacement_px / max_displacement_px), 1), max_steps))
+    return max(math.ceil(min(displacement_px / max_displacement_px, max_steps)), 1)
 
 
 def _stored(light: np.ndarray) -> np.ndarray:

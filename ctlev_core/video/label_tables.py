@@ -39,7 +39,7 @@ def read_table(path: Path, text: str) -> VideoLabels:
         category = ids.setdefault(cells.get("category") or "object", len(ids) + 1)
         instance = cells["instance"]
         track = tracks.setdefault(instance, Track(category, int(instance) if instance.isdecimal() else instance))
-        if track.labels and frame < max(track.labels):
+        if track.labels and frame < next(reversed(track.labels)):  # the last that was added
             raise DataError(f"{where}: frames of instance {track.instance} must ascend, got {frame} late")
         add_label(track, frame, category, _label(cells, names, where), where)
     categories = [

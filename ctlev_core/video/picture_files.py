@@ -52,8 +52,10 @@ def read_picture(path: Path) -> np.ndarray:
     """[H, W, 3] as it is stored, in blue, green, red; `DataError` if OpenCV reads no picture there."""
     import cv2
 
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
-    stored = cv2.imdecode(np.fromfile(path, np.uint8), flags) if path.stat().st_size else None
+    encoded = np.fromfile(path, np.uint8)
+    stored = cv2.imdecode(encoded, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR) if len(encoded) else None
+    if stored is None and len(encoded):
+        stored = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)  # OpenCV makes no colours of grey TIFFs in floating point
     if stored is None:
         raise DataError(f"{path}: not a picture that OpenCV can read ({path.stat().st_size} bytes)")
-    return stored
+    return np.repeat(stored[..., None], 3, axis=2) if stored.ndim == 2 else stored[..., :3]

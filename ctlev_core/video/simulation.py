@@ -13,11 +13,14 @@ from ctlev_core.sensor.dvs_pixel import Sensor
 from ctlev_core.sensor.options import SensorOptions
 from ctlev_core.video.frames import Frames
 from ctlev_core.video.interpolation import Fading, Flow, Interpolator, num_steps
+from data_contracts.errors import DataError
 from data_contracts.events import Events, SensorSize
 
 Interpolation = Literal["flow", "fade"]
 MAX_STEPS = 200
 """Between two frames; so many are enough for 100 px."""
+MAX_NOISE_EVENTS = 10**8
+"""Between two frames, whose events lie in memory together: 7 GB."""
 
 
 @dataclass
@@ -47,6 +50,7 @@ class VideoSimulation:
     num_events: int = field(default=0, init=False)
     duration_us: int = field(default=0, init=False)
     last_light: np.ndarray | None = field(default=None, init=False)
+    _noise_rate_hz: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
         if not self.max_displacement_px > 0:
@@ -56,7 +60,8 @@ class VideoSimulation:
         """The events of each interval between two frames, times in us from the first frame on.
 
         Raises:
-            DataError: see `ctlev_core.video.frames.open_frames`.
+            DataError: see `ctlev_core.video.frames.open_frames`; or two frames are so far apart that noise alone sends
+                more than `MAX_NOISE_EVENTS` in between.
         """
         camera: Sensor | None = None
         self.last_light, self.duration_us = None, 0
@@ -68,6 +73,9 @@ class VideoSimulation:
                         self.size, self.sensor, sensor_seed=self.seed, seed=[self.seed, 1], marks=self.marks
                     )
                     self.num_frames = self.num_drawn = self.num_events = 0
+                    maps = camera.maps
+                    rates_hz = maps.leak / maps.threshold_on + maps.shot_noise_rate_hz + maps.hot_rate_hz
+                    self._noise_rate_hz = float(rates_hz.sum())
                 events = self._seen(camera, t_us, light)
                 self.num_events += len(events)
                 yield events
@@ -81,6 +89,7 @@ class VideoSimulation:
             self.num_drawn += 1
             return camera.push(light[None], np.array([t_us], np.int64))
         span_us = t_us - self.duration_us
+        self._check_span(span_us)
         between = self.interpolator.between(self.last_light, light)
         steps = num_steps(between.displacement_px, self.max_displacement_px, min(MAX_STEPS, span_us))
         shares = np.arange(1, steps) / steps
@@ -88,6 +97,16 @@ class VideoSimulation:
         self.num_drawn += steps
         drawn = (between.at(share) for share in shares.tolist())
         return camera.push_between(between.moving, drawn, times, light, t_us)
+
+    def _check_span(self, span_us: int) -> None:
+        """Times in another unit than seconds would fill the memory with noise."""
+        num_noise = self._noise_rate_hz * 1e-6 * span_us
+        if num_noise > MAX_NOISE_EVENTS:
+            raise DataError(
+                f"video: frame {self.num_frames} is {1e-6 * span_us:.6g} s after the one before, in which noise alone "
+                f"sends up to {num_noise:.2g} events, expected at most {MAX_NOISE_EVENTS:.0e}. Are the times of the "
+                f"frames in seconds? Else take a camera with less noise, or fewer pixels"
+            )
 
 
 def interpolator_of(name: Interpolation) -> Interpolator:

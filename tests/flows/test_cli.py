@@ -121,6 +121,8 @@ def test_show_finds_reports(tmp_path):
     for asked, found in (((), "smoke"), (("demo",), "demo"), ((str(folder / "demo"),), "demo")):
         status, output, _ = invoke("show", *asked, "--home", str(tmp_path))
         assert (status, output.strip()) == (0, str(folder / f"{found}.html"))
+    status, _, errors = invoke("show", "d" * 300, "--home", str(tmp_path))
+    assert status == 2 and "has no report" in errors
     status, _, errors = invoke("show", "demoo", "--home", str(tmp_path))
     assert status == 2 and "did you mean 'demo'?; it has demo, smoke" in errors
 

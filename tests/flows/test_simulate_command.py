@@ -111,6 +111,8 @@ def test_the_suffix_says_the_format(tmp_path):
         (["{video}", "{out}.parquet", "--fps", "-3"], "fps must be a number above 0"),
         (["{video}", "{out}.parquet", "--max-displacement-px", "0"], "max_displacement_px must be above 0"),
         (["{video}", "{out}.parquet", "--start", "50"], "two frames or more"),
+        (["{video}", "{out}.parquet", "--start", "inf"], "two frames or more"),
+        (["{video}", "{out}.parquet", "--fps", "1e-300"], "s after the first, expected at most"),
     ],
 )
 def test_what_cannot_be_done_is_said_and_leaves_nothing(video, tmp_path, arguments, message):
@@ -118,6 +120,19 @@ def test_what_cannot_be_done_is_said_and_leaves_nothing(video, tmp_path, argumen
     status, _, errors = invoke(*(argument.format(**given) for argument in arguments))
     assert status == 2 and message in " ".join(errors.replace("│", " ").split())
     assert not list(tmp_path.iterdir())
+
+
+def test_times_in_microseconds_do_not_fill_the_memory_with_noise(tmp_path):
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((48, 64), 60 + 40 * number, np.uint8))
+    (folder / "timestamps.txt").write_text("0\n33333\n66667\n")  # us, read as s
+    arguments = folder, tmp_path / "a.parquet", "--size", "346x260"
+    status, _, errors = invoke(*arguments)
+    assert status == 2 and not (tmp_path / "a.parquet").exists()
+    assert "frame 1 is 33333 s after the one before" in errors and "in seconds?" in errors
+    assert invoke(*arguments, "--noise", "0")[0] == 0
 
 
 def test_a_format_without_a_writer_is_read_only(tmp_path, monkeypatch):

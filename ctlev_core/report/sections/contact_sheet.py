@@ -6,6 +6,7 @@ import numpy as np
 
 from ctlev_core.events.windows import spread
 from ctlev_core.report.page.html import ImageGrid, Section, Table
+from data_contracts.array_rows import Images
 from data_contracts.labels import Labels
 from data_contracts.manifest import Manifest
 
@@ -51,22 +52,22 @@ def training_grid(frames: np.ndarray, conditions: np.ndarray | None, labels: Lab
     )
 
 
-def sampling_grid(conditions: np.ndarray, labels: Labels, classes: list[str]) -> ImageGrid:
-    """Conditions to sample from with their joints, one row a class.
+def sampling_grid(conditions: Images, labels: Labels, classes: list[str]) -> ImageGrid:
+    """Conditions to sample from with their joints, one row a class, evenly spread; only what is shown is read.
 
     Args:
         conditions: [N, H, W, 3] uint8.
         labels: N rows in image pixels.
         classes: the class of each, empty where there is none.
     """
-    members = {name: [row for row, of_row in enumerate(classes) if of_row == name] for name in dict.fromkeys(classes)}
+    members = {name: rows[spread(len(rows), COLUMNS)].tolist() for name, rows in _by_class(classes).items()}
     if max(map(len, members.values()), default=0) < FEW:
         # Many classes of one picture each would make a column: several share a row.
         names = list(members)
         groups = [names[start : start + PER_ROW] for start in range(0, len(names), PER_ROW)]
         members = {", ".join(group): [row for name in group for row in members[name]] for group in groups}
     rows = [
-        (name or "pose", [_shown(conditions[row], labels, row) for row in of_name[:COLUMNS]])
+        (name or "pose", [_shown(np.asarray(conditions[row]), labels, row) for row in of_name[:COLUMNS]])
         for name, of_name in list(members.items())[:MAX_ROWS]
     ]
     more = f" {len(members) - MAX_ROWS} more rows are not shown." if len(members) > MAX_ROWS else ""
@@ -110,22 +111,21 @@ def _sampling_section(conditions: Manifest) -> Section:
         rows = [list(pair) for pair in prompts[:MAX_PROMPTS]]
         more = f" The first {MAX_PROMPTS} of {len(prompts)}." if len(prompts) > MAX_PROMPTS else ""
         return Table("Prompts to sample from", ["class", "prompt"], rows, caption="Each prompt once." + more)
-    shown = np.concatenate([_of_class(classes, name) for name in dict.fromkeys(classes)])
-    images = np.asarray(conditions.array("images")[shown])
-    return sampling_grid(images, conditions.labels.take(shown), [classes[row] for row in shown])
+    return sampling_grid(conditions.array("images"), conditions.labels, classes)
 
 
 def _in_turns(classes: list[str]) -> np.ndarray:
     """Rows for the columns: classes take turns, and the rows of each are evenly spread."""
-    names = list(dict.fromkeys(classes))
-    share = -(-COLUMNS // len(names))
-    queues = [np.array([row for row, of_row in enumerate(classes) if of_row == name]) for name in names]
-    queues = [rows[spread(len(rows), share)] for rows in queues]
+    by_class = _by_class(classes)
+    share = -(-COLUMNS // len(by_class))
+    queues = [rows[spread(len(rows), share)] for rows in by_class.values()]
     turns = [rows[turn] for turn in range(share) for rows in queues if turn < len(rows)]
     return np.array(turns[:COLUMNS], np.int64)
 
 
-def _of_class(classes: list[str], name: str) -> np.ndarray:
-    """A few rows of a class, evenly spread."""
-    rows = np.array([row for row, of_row in enumerate(classes) if of_row == name])
-    return rows[spread(len(rows), COLUMNS)]
+def _by_class(classes: list[str]) -> dict[str, np.ndarray]:
+    """Rows of each class, in the order in which classes come."""
+    rows: dict[str, list[int]] = {}
+    for row, name in enumerate(classes):
+        rows.setdefault(name, []).append(row)
+    return {name: np.array(of_class, np.int64) for name, of_class in rows.items()}

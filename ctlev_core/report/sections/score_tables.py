@@ -321,13 +321,13 @@ def _by_group(
             for name, part in zip(titles, parts, strict=True)
             for table in _by_group(name, rows, part, caption, first)
         ]
+    by_group: dict[str, dict[str, list[Row]]] = {}
+    for row in rows:
+        by_group.setdefault(row["group"], {}).setdefault(row["subject"], []).append(row)
     body: list[list[Cell]] = []
-    for group in dict.fromkeys(row["group"] for row in rows):
-        of_group = [row for row in rows if row["group"] == group]
-        cells: list[Cell] = [
-            cell_text([row for row in of_group if row["subject"] == training_set]) for training_set in training_sets
-        ]
-        body.append([group, *cells, of_group[0]["num_samples"]])
+    for group, of_group in by_group.items():
+        cells: list[Cell] = [cell_text(of_group.get(training_set, ())) for training_set in training_sets]
+        body.append([group, *cells, next(iter(of_group.values()))[0]["num_samples"]])
     return [Table(title, [first, *map(set_name, training_sets), "frames scored"], body, caption=caption)]
 
 

@@ -1,5 +1,7 @@
 """The contact sheet shows what it says: joints where the labels are, events over conditions."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -40,3 +42,20 @@ def test_every_class_has_its_row_and_single_pictures_share_one(per_class, num_cl
     grid = contact_sheet.sampling_grid(conditions, labels(len(classes)), classes)
     assert len(grid.rows) == expected and all(len(images) <= contact_sheet.COLUMNS for _, images in grid.rows)
     assert ("more rows" in grid.caption) == (num_classes > contact_sheet.MAX_ROWS)
+
+
+def test_no_more_pictures_are_read_than_are_shown():
+    class Counted(np.ndarray):
+        def __getitem__(self, index):
+            read.append(np.arange(len(self))[index].size)
+            return np.ndarray.__getitem__(self, index)
+
+    classes, read = [f"motion{number % 200}" for number in range(6000)], []
+    names = {"sample_id": list(map(str, range(6000))), "class_name": classes}
+    pictures = np.zeros((len(classes), 2, 2, 3), np.uint8).view(Counted)
+    stored = SimpleNamespace(
+        column=names.__getitem__, has_array=lambda _: True, array=lambda _: pictures, labels=labels(len(classes))
+    )
+    sections = contact_sheet.contact_sheet_sections(stored, stored, stored)
+    assert sum(read) == 2 * contact_sheet.COLUMNS + sum(len(images) for _, images in sections[1].rows)
+    assert [len(images) for _, images in sections[1].rows] == [contact_sheet.COLUMNS] * contact_sheet.MAX_ROWS

@@ -3,10 +3,12 @@ silent."""
 
 import re
 
+import numpy as np
 import pytest
 from browser import CHROMIUM, check_pages, run_in_browser
 from report_artefacts import Experiment
 
+from ctlev_core.report.page.html import ImageGrid, render_report
 from tasks.report import report
 from tasks.stage import Output
 
@@ -86,6 +88,40 @@ def test_dark_mode_turns_ink_and_page_round(page, tmp_path):
 def test_every_text_can_be_read_at_every_width_and_nothing_is_too_wide(page, tmp_path):
     (tmp_path / "report.html").write_text(page, encoding="utf-8")
     check_pages(tmp_path, ["report.html"], tmp_path)
+
+
+GRID_PROBE = """
+const frame = document.createElement("iframe");
+frame.style = "border: 0; width: 1280px; height: 800px";
+frame.src = "page.html";
+frame.addEventListener("load", () => {
+  const page = frame.contentDocument, picture = page.querySelector(".grid img").getBoundingClientRect();
+  const place = ({left, right, top, bottom}) => [left, right, top, bottom].map(Math.round);
+  const text = (span) => {
+    const range = page.createRange();
+    range.selectNodeContents(span);
+    return Math.round(range.getBoundingClientRect().right);
+  };
+  const labels = [...page.querySelectorAll(".labels span")];
+  document.querySelector("pre").textContent = JSON.stringify({
+    picture: place(picture), labels: labels.map((span) => [...place(span.getBoundingClientRect()), text(span)]),
+  });
+});
+document.body.append(frame);
+"""
+
+
+def test_labels_of_any_length_stay_beside_their_row_of_pictures(tmp_path):
+    names = ["run", "walking_with_long_steps_and_turning_round", "x" * 500, "words " * 200, "jump"]
+    grid = ImageGrid("Conditions", [(name, [np.zeros((12, 12), np.uint8)] * 10) for name in names])
+    page = render_report(title="t", lead="l", verdict="v", sections=[grid])
+    (tmp_path / "page.html").write_text(page, encoding="utf-8")
+    found, _ = run_in_browser(GRID_PROBE, tmp_path, tmp_path)
+    left, _, top, bottom = found["picture"]
+    height = (bottom - top) / len(names)
+    for row, (_, right, above, below, text_right) in enumerate(found["labels"]):
+        assert text_right <= right <= left
+        assert top + row * height - 3 <= above <= below <= top + (row + 1) * height + 3
 
 
 def test_pale_text_wide_boxes_and_messages_are_found(tmp_path):

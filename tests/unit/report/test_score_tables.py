@@ -5,6 +5,7 @@ import pyarrow as pa
 import pytest
 from scipy import stats
 
+from ctlev_core import plugins
 from ctlev_core.provenance.scores import paired_samples
 from ctlev_core.report.page.html import Curves
 from ctlev_core.report.sections.scaling import ScalePoint, scaling_figure, scaling_points
@@ -197,3 +198,21 @@ def test_the_verdict_says_how_much_of_the_oracles_gain_was_reached_and_whether_l
     assert "scores 5.500 on synthetic frames against their labels, and 15.00 on them with shuffled labels." in text
     unsure = str(verdict(rows, training_sets, difference, oracle=(Difference(-0.1, -0.3, 0.1), None)))
     assert "change it by -0.100 [-0.300, +0.100]." in unsure and "of that" not in unsure
+
+
+def test_many_classes_cost_in_proportion_to_their_number(monkeypatch):
+    class Counted(dict):
+        asked = 0
+
+        def __getitem__(self, name):
+            Counted.asked += name == "group"
+            return dict.__getitem__(self, name)
+
+    looks = []
+    names_of = plugins.names
+    monkeypatch.setattr(plugins, "names", lambda kind: looks.append(kind) or names_of(kind))
+    sets = ["recorded", "recorded+synthetic"]
+    rows = [Counted(row(name, float(number), group=f"class{number}")) for number in range(300) for name in sets]
+    _, (table,) = group_tables(rows, sets)
+    assert len(table.rows) == 300 and table.rows[7] == ["class7", "7.000", "7.000", 40]
+    assert Counted.asked < 12 * len(rows) and len(looks) < 10

@@ -51,6 +51,15 @@ def test_spread_and_imbalance_of_thresholds(frames, sigma, threshold_off):
     assert calibration.measured["threshold_spread"] == pytest.approx(relative, rel=0.1, abs=0.01)
 
 
+def test_off_thresholds_far_below_those_of_on(frames):
+    """The base's least threshold, 0.05, lies above them."""
+    options = SensorOptions(threshold=0.5, threshold_off=0.06, starts_settled=False)
+    calibration = calibrate(events_of(frames, **options.model_dump()))
+    assert calibration.options.threshold_off == pytest.approx(0.25 * 0.06 / 0.5, rel=0.05)
+    assert calibration.options.threshold_minimum == pytest.approx(0.05 * 0.06 / 0.5, rel=0.05)
+    assert "base" in calibration.assumed["threshold_minimum"]
+
+
 def test_noise_and_leak(frames):
     events = events_of(frames, shot_noise_rate_hz=0.8, shot_noise_rate_bright=1.0, leak_rate_hz=0.3, rate_spread=0.5)
     options = calibrate(events).options

@@ -182,6 +182,27 @@ def test_how_many_frames_a_stretch_has_is_known_before(tmp_path, start_s, stop_s
         assert frames.expected == count == len(list(frames))
 
 
+@pytest.mark.parametrize("far_s", [1e308, float("inf")])
+def test_a_stretch_may_begin_or_end_as_late_as_a_float_can_say(tmp_path, far_s):
+    write_video(tmp_path / "a.avi", [10] * 4)
+    frames = open_frames(tmp_path / "a.avi", FrameOptions(stop_s=far_s))
+    assert frames.expected == 4 == len(list(frames))
+    frames = open_frames(tmp_path / "a.avi", FrameOptions(start_s=far_s))
+    assert frames.expected == 0
+    with pytest.raises(DataError, match="two frames or more at different times in this stretch, got 0"):
+        list(frames)
+
+
+@pytest.mark.parametrize("options", [{"fps": 1e-300}, {"fps": 5e-324}, {"fps": 1e-12}, {"slow_motion": 1e-300}])
+def test_frames_later_than_the_clock_of_a_sensor_are_refused(tmp_path, options):
+    write_video(tmp_path / "a.avi", [10] * 20)
+    with pytest.raises(DataError, match=r"a.avi: frame \d+ is \S+ s after the first, expected at most 9.01e\+09 s"):
+        list(open_frames(tmp_path / "a.avi", FrameOptions(**options)))
+    folder = write_folder(tmp_path / "f", [10, 20], [0, 1e300])
+    with pytest.raises(DataError, match="frame 1 is 1e"):
+        list(open_frames(folder, FrameOptions()))
+
+
 @pytest.mark.parametrize("asked", [{"fps": 5.0}, {"slow_motion": 10.0}, {"start_s": 0.1}, {"stop_s": 0.1}])
 def test_a_still_picture_has_times_of_its_own(tmp_path, asked):
     assert cv2.imwrite(str(tmp_path / "a.png"), picture(100))
@@ -204,12 +225,57 @@ def test_sixteen_bits_and_floats(tmp_path):
     np.testing.assert_allclose(light, 3.5, rtol=0.01)
 
 
+@pytest.mark.parametrize("channels", [(), (1,), (3,), (4,)])
+def test_floating_point_tiffs_of_grey_colours_and_alpha_are_light(tmp_path, channels):
+    level = np.full((20, 20, *channels), 0.25, np.float32)
+    assert cv2.imwrite(str(tmp_path / "a.tiff"), level)
+    _, light = next(iter(open_frames(tmp_path / "a.tiff", FrameOptions())))
+    np.testing.assert_allclose(light, 0.25, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int32])
+def test_pixels_with_a_sign_are_no_light(tmp_path, dtype):
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for number in range(4):
+        level = np.full((20, 20), 100, np.uint8 if number < 3 else dtype)
+        assert cv2.imwrite(str(folder / f"{number}.tiff"), level)
+    message = rf"f: expected pixels of 8 or 16 bits without a sign, .*, got {np.dtype(dtype)} in frame 3"
+    with pytest.raises(DataError, match=message):
+        list(open_frames(folder, FrameOptions(fps=10.0, start_s=0.1)))
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".mpg", "MPG2"), (".avi", "MPG2"), (".avi", "PIM1")])
+def test_the_last_frame_of_mpeg_has_no_time_and_is_there(tmp_path, suffix, codec):
+    path = tmp_path / f"a{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 25.0, (64, 48))
+    for level in range(0, 200, 4):
+        writer.write(picture(level, (64, 48)))
+    writer.release()
+    times, light = zip(*open_frames(path, FrameOptions()), strict=True)
+    assert len(times) == 50 and times[-1] - times[-2] == 40_000
+    assert (np.diff([one.mean() for one in light]) >= 0).all()
+
+
+def test_a_video_without_frames_says_so(tmp_path):
+    with pytest.raises(DataError, match="expected two frames or more at different times, got 0"):
+        list(open_frames(write_video(tmp_path / "a.avi", []), FrameOptions()))
+
+
 @pytest.mark.parametrize(
     "wrong", [{"fps": 0}, {"fps": float("nan")}, {"slow_motion": -1}, {"start_s": -1}, {"start_s": 2, "stop_s": 1}]
 )
 def test_options_that_cannot_be_are_refused(wrong):
     with pytest.raises(ValueError, match=r"must be"):
         FrameOptions(**wrong)
+
+
+@pytest.mark.parametrize("max_displacement_px", [1e-9, 5e-324])
+def test_a_still_picture_has_a_frame_a_microsecond_at_most(tmp_path, max_displacement_px):
+    assert cv2.imwrite(str(tmp_path / "a.png"), picture(100))
+    frames = open_frames(tmp_path / "a.png", FrameOptions(), max_displacement_px)
+    times = [t_us for (t_us, _), _ in zip(frames, range(4), strict=False)]
+    assert times == [0, 1, 2, 3] and frames.expected == 307_501
 
 
 def test_a_still_picture_makes_a_closed_path_of_saccades(tmp_path):

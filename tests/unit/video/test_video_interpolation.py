@@ -78,6 +78,7 @@ def test_tiny_pictures_fade():
 
 def test_number_of_steps():
     assert [num_steps(moved, 0.5, 10) for moved in (0, 0.4, 0.5, 0.51, 3.0, 99)] == [1, 1, 1, 2, 6, 10]
+    assert num_steps(5.0, 5e-324, 10) == 10
 
 
 def test_events_of_a_video_with_flow_are_nearer_to_those_of_the_scene():

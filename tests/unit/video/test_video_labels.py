@@ -1,6 +1,8 @@
 """Labels of a video on the sensor and between its frames, beside things whose place is known at every time."""
 
 import json
+import time
+from pathlib import Path
 
 import cv2
 import hypothesis
@@ -12,6 +14,7 @@ from ctlev_core.video.carried_labels import CarriedLabels, _cut_off, _polygon_ar
 from ctlev_core.video.coco_masks import read_runs, write_runs
 from ctlev_core.video.frames import FrameOptions, open_frames
 from ctlev_core.video.label_files import read_video_labels
+from ctlev_core.video.label_tables import read_table
 from data_contracts.errors import DataError
 
 STORED = (64, 48)
@@ -339,6 +342,24 @@ def test_wrong_tables_are_named_with_their_line(tmp_path, text, message):
     with pytest.raises(DataError) as caught:
         read_video_labels(labels, open_frames(folder_of(tmp_path / "f"), FrameOptions()))
     assert message in str(caught.value) and str(labels) in str(caught.value) and len(str(caught.value)) < 500
+
+
+def test_rows_of_a_table_take_time_in_proportion_to_their_number():
+    def seconds(count):
+        start = time.process_time()
+        read_table(Path("a.csv"), HEAD + "\n".join(f"{frame},1,2,3,4,5" for frame in range(count)))
+        return time.process_time() - start
+
+    seconds(100)
+    assert seconds(16_000) < 24 * seconds(2000)  # the square would be 64
+
+
+def test_a_moment_looks_at_the_labels_of_its_frame_alone(tmp_path, monkeypatch):
+    looked, look = [], CarriedLabels._at
+    monkeypatch.setattr(CarriedLabels, "_at", lambda *given: looked.append(given) or look(*given))
+    given = [annotation(k, box_at(0), instance=None) for k in range(9) for _ in range(5)]
+    found = carried(coco(tmp_path / "a.json", given), folder_of(tmp_path / "f"))
+    assert len(looked) == sum(map(len, found.values())) == len(given)
 
 
 def test_files_that_are_no_labels(tmp_path):
