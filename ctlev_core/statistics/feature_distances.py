@@ -62,7 +62,8 @@ class DistanceEstimate:
         high: upper end.
         halved: mean of the score over halves of both sets: larger than `value` by the bias of smaller sets.
         floor: mean of the score between halves of the reference set, what a perfect set of that size would get;
-            compare with `halved`, which has the same bias where both sets are equally large.
+            compare with `halved`, which has the same bias where both sets are equally large. Of a score that has a
+            reference of its own (`fd_to_...`) the mean score of halves of the reference set against that, no floor.
         floor_low: central 95 % of the floor over the random halves, lower end.
         floor_high: and upper end.
         num_predicted: rows judged.
