@@ -547,7 +547,10 @@ class PreparedMetric(Metric, Protocol):
     """A metric that can look at all rows once and then score any of them quickly."""
 
     def prepare(self, predicted: Any, target: Any, options: Any) -> Callable[[np.ndarray], dict[str, float]]:
-        """From row numbers to what `compute` returns for those rows."""
+        """From row numbers to what `compute` returns for those rows.
+
+        One of `ctlev_core.statistics.bootstrap.ScoresOfDraws` is not called for each of many resamplings.
+        """
         ...
 
 

@@ -17,7 +17,7 @@ from ctlev_core.plugin_contracts import (
     MetricOfRows,
 )
 from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
-from ctlev_core.scoring.scored_rows import score_each_row, score_rows
+from ctlev_core.scoring.scored_rows import RowScores
 from ctlev_core.scoring.sensor_pixels import SensorSource, is_on_sensor, on_sensor, sensor_sizes
 from ctlev_core.scoring.subsets import Group, class_groups, origin_groups, part_groups, subject_groups
 from ctlev_core.statistics.feature_distances import (
@@ -57,7 +57,7 @@ class _DistanceScores(Stage):
         check_distances(arguments["downstream"], arguments["distances"])
 
 
-@partial(_ModelScores, version=12, schema=tables.SCORES, raw_files=None, optional=("sensor",))
+@partial(_ModelScores, version=13, schema=tables.SCORES, raw_files=None, optional=("sensor",))
 def score_model(
     out: Output,
     model: Manifest,
@@ -114,16 +114,17 @@ def score_model(
         if sensor is not None and is_on_sensor(choice):
             sizes = sensor_sizes(data, rows, only_part(sensor.recordings, sensor.part))
             predicted, true = on_sensor(prediction, labels, sizes, sensor.encoding)
+        scored = RowScores(metric, predicted, true, recordings)
         for group, members in groups:
             try:
-                scores, low, high = score_rows(metric, predicted, true.take(members), members, recordings[members])
+                scores, low, high = scored.of(members)
             except ValueError:
                 if group == "all":
                     raise
                 continue  # a class without a visible joint, for example, has no score of its own
             if group == "all" and isinstance(metric.module, MetricOfRows):
                 columns = {"sample_id": sample_ids, "recording_id": recordings}
-                sample_scores.append(pa.table(columns | score_each_row(metric, predicted, true, scores)))
+                sample_scores.append(pa.table(columns | scored.each_row(scores)))
             _refuse_twice(metric, scores, {row["metric"] for row in found if row["group"] == group})
             found += [
                 {

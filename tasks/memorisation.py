@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -20,6 +21,7 @@ from data_contracts.manifest import Manifest
 from data_contracts.training_sets import HELD_OUT
 from tasks.stage import Output, stage
 
+logger = logging.getLogger(__name__)
 MAX_OTHER_FRAMES = 5_000
 """Of more other recorded, or generated, frames so many, evenly spread. Training frames are never left out: any of them
 may have been copied."""
@@ -41,28 +43,32 @@ def memorisation(
     features.
 
     Other recorded frames are the training frames against those of other recordings; where all training frames are of
-    one recording, the held-out frames. Rows of the subject `held-out recorded` are the floor: what held-out frames,
-    which nobody made from training frames, score in the place of generated ones. The closest pairs lie beside the
-    table.
+    one recording, the held-out frames of others. Where there are none, there are no rows. Rows of the subject
+    `held-out recorded` are the floor: what held-out frames, which nobody made from training frames, score in the place
+    of generated ones. The closest pairs lie beside the table.
     """
     learnt, made = frames.rows_where(split="train"), generated.rows_where(split="train")
     made = made[spread(len(made), MAX_OTHER_FRAMES)]
     recordings = np.array(frames.column("recording_id"))
-    other = learnt if len(set(recordings[learnt])) > 1 else frames.rows_where(split=frames.held_out)
-    other = other[spread(len(other), MAX_OTHER_FRAMES)]
-    if not len(learnt) or not len(made) or not len(other):
-        raise DataError(
-            f"memorisation: needs training, other recorded and generated frames, got {len(learnt)}, {len(other)} "
-            f"and {len(made)}"
-        )
+    held_out = frames.rows_where(split=frames.held_out)
+    is_alone = len(set(recordings[learnt])) == 1
+    if is_alone:  # frames are compared with those of other recordings
+        held_out = held_out[recordings[held_out] != recordings[learnt[0]]]
+    held_out = held_out[spread(len(held_out), MAX_OTHER_FRAMES)]
+    other = held_out if is_alone else learnt[spread(len(learnt), MAX_OTHER_FRAMES)]
+    if not len(learnt) or not len(made):
+        raise DataError(f"memorisation: needs training and generated frames, got {len(learnt)} and {len(made)}")
     ways: dict[str, Callable[[Images], np.ndarray]] = {PICTURES: small_pictures}
     if extractor is not None and downstream is not None:
         plugin, folder = plugins.load_options(downstream), extractor.ref.path / "model"
         ways[f"features of {plugin.name}"] = lambda images: plugin.module.features(folder, images)
-    held_out = frames.rows_where(split=frames.held_out)
-    if len(set(recordings[learnt])) == 1:  # frames are compared with those of other recordings
-        held_out = held_out[recordings[held_out] != recordings[learnt[0]]]
-    held_out = held_out[spread(len(held_out), MAX_OTHER_FRAMES)]
+    if not len(other):
+        logger.warning(
+            "%s: all frames are of one recording, and no copies are looked for: a frame resembles its neighbours as a "
+            "copy does",
+            frames.ref.path,
+        )
+        ways.clear()
     scores: list[dict[str, Any]] = []
     pairs: list[dict[str, Any]] = []
     for name, features_of in ways.items():

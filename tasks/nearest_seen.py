@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
@@ -21,7 +22,7 @@ def nearest_seen(
     """The nearest classes of the training frames for each other class in `conditions`, by the generator's own text
     encoder.
     """
-    seen = sorted({frames.column("class_name")[row] for row in frames.rows_where(split="train")})
+    seen = sorted(set(np.array(frames.column("class_name"))[frames.rows_where(split="train")].tolist()))
     unseen = sorted(set(conditions.column("class_name")) - set(seen))
     found = []
     if unseen:

@@ -11,7 +11,7 @@ from data_contracts.manifest import Manifest
 from tasks.stage import Output, stage
 
 
-@stage(version=25, schema=tables.REPORT, optional=("sequences",), aside=("openings",))
+@stage(version=26, schema=tables.REPORT, optional=("sequences",), aside=("openings",))
 def report(
     out: Output, made: ReportInputs[Manifest], sequences: Manifest | None = None, *, openings: int | None = None
 ) -> pa.Table:

@@ -114,7 +114,7 @@ def sampling_errors(
         return FeatureSet(feature_plugin.module.features(folder, pictures), np.array(groups))
 
     held_out = frames.rows_where(split=frames.held_out)
-    recordings = [frames.column("recording_id")[row] for row in held_out]
+    recordings = np.array(frames.column("recording_id"))[held_out].tolist()
     real_frames = np.asarray(frames.array("frames")[held_out])
     real = features(real_frames, recordings)
     references = features(*_pooled(reference)[:2])

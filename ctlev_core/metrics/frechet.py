@@ -27,6 +27,8 @@ from data_contracts.remembered_files import remembered_digest
 
 VERSION = 3
 INPUT = "features"
+TO_STATISTICS = "fd_to_"
+"""How the name of a distance to a file begins."""
 SCORES = (ScoreInfo("fd", lower_is_better=True), ScoreInfo("fid", lower_is_better=True))
 
 
@@ -69,7 +71,7 @@ def compute(predicted: np.ndarray, target: np.ndarray, options: Options) -> dict
         return {"fd": refined_frechet_distance(predicted, target)}
     digest = remembered_digest(Path(options.statistics))
     reference = _reference(options.statistics, digest)
-    return {f"fd_to_{digest[:8]}": frechet_distance_of_gaussians(fit_gaussian(predicted), reference)}
+    return {f"{TO_STATISTICS}{digest[:8]}": frechet_distance_of_gaussians(fit_gaussian(predicted), reference)}
 
 
 @lru_cache(maxsize=2)

@@ -12,7 +12,8 @@ does not say how it draws negatives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from pydantic import Field
 from ctlev_core.scoring.classification import Guesses, read_guesses
 from ctlev_core.scoring.score_info import ScoreInfo
 from ctlev_core.scoring.zero_shot import balanced_accuracy
+from ctlev_core.statistics.bootstrap import ScoresOfDraws, sums_of_draws
 from data_contracts.config import Frozen
 from data_contracts.labels import Labels
 
@@ -57,7 +59,7 @@ def compute(predicted: Mapping[str, Any], target: Labels, options: Options) -> d
     return prepare(predicted, target, options)(np.arange(len(target)))
 
 
-def prepare(predicted: Mapping[str, Any], target: Labels, options: Options) -> Callable[[np.ndarray], dict[str, float]]:
+def prepare(predicted: Mapping[str, Any], target: Labels, options: Options) -> ScoresOfDraws:
     """The scores of any rows: what resampling asks for many times, with names compared once.
 
     A sample that lacks a class raises ValueError.
@@ -68,18 +70,49 @@ def prepare(predicted: Mapping[str, Any], target: Labels, options: Options) -> C
     called = _calls(predicted, guesses)
     if missing := [name for name in names if name not in target.class_names]:
         raise ValueError(f"no target row is of class {', '.join(missing)}")
+    return _Scores(guesses.truth, called, {name: numbers[name] for name in names})
 
-    def compute_of(rows: np.ndarray) -> dict[str, float]:
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """`compute` of any rows, and of many draws of groups of them.
+
+    Attributes:
+        truth: [N] the class of each row.
+        called: [N, K] which classes it is called.
+        numbers: of the classes that are told from the others, by name.
+    """
+
+    truth: np.ndarray
+    called: np.ndarray
+    numbers: Mapping[str, int]
+
+    def __call__(self, rows: np.ndarray) -> dict[str, float]:
         found = {}
-        for name in names:
-            is_positive, is_called = guesses.truth[rows] == numbers[name], called[rows, numbers[name]]
+        for name, number in self.numbers.items():
+            is_positive, is_called = self.truth[rows] == number, self.called[rows, number]
             count = int(np.count_nonzero(is_positive))
             if count in (0, len(rows)):
                 raise ValueError(f"class {name!r} has {count} of {len(rows)} rows; it needs some and not all")
             found[f"binary_accuracy_{name}"] = balanced_accuracy(is_positive, is_called)
         return {"binary_accuracy_mean": float(np.mean(list(found.values()))), **found}
 
-    return compute_of
+    def of_draws(self, groups: np.ndarray, draws: np.ndarray) -> dict[str, np.ndarray]:
+        """Without the draws in which a class has no row, or all of them."""
+        rows, codes = np.nonzero(self.called)
+        own = codes == self.truth[rows]
+        chosen, num_classes = list(self.numbers.values()), self.called.shape[1]
+        true, called, hits = (
+            sums_of_draws(groups[of], draws, code, num_classes)[:, chosen]
+            for of, code in ((slice(None), self.truth), (rows, codes), (rows[own], codes[own]))
+        )
+        num_rows = (draws @ np.bincount(groups, minlength=draws.shape[1]))[:, None]
+        usable = ((true > 0) & (true < num_rows)).all(axis=1)
+        true, called, hits, num_rows = (counts[usable] for counts in (true, called, hits, num_rows))
+        others = num_rows - true
+        accuracies = np.ascontiguousarray((hits / true + (others - (called - hits)) / others) / 2)
+        found = {f"binary_accuracy_{name}": of for name, of in zip(self.numbers, accuracies.T, strict=True)}
+        return {"binary_accuracy_mean": accuracies.mean(axis=1), **found}
 
 
 def compute_rows(predicted: Mapping[str, Any], target: Labels, options: Options) -> np.ndarray:

@@ -119,8 +119,7 @@ def class_scores(truth: np.ndarray, guess: np.ndarray, num_classes: int) -> Clas
 
 def calibrate(confidence: np.ndarray, is_right: np.ndarray, num_bins: int) -> Calibration:
     """Compare confidences [N] in [0, 1] with how often they are right [N]."""
-    edges = np.arange(1, num_bins) / num_bins
-    index = np.searchsorted(edges, confidence, side="left")
+    index = bin_of(confidence, num_bins)
     count = np.bincount(index, minlength=num_bins)
     sums = [np.bincount(index, weights=column, minlength=num_bins) for column in (confidence, is_right)]
     return Calibration(
@@ -129,3 +128,18 @@ def calibrate(confidence: np.ndarray, is_right: np.ndarray, num_bins: int) -> Ca
         accuracy=sums[1] / np.maximum(count, 1),
         expected_error=float(np.abs(sums[1] - sums[0]).sum() / max(len(confidence), 1)),
     )
+
+
+def bin_of(confidence: np.ndarray, num_bins: int) -> np.ndarray:
+    """The bin [N] of `Calibration` that each confidence [N] lies in."""
+    return np.searchsorted(np.arange(1, num_bins) / num_bins, confidence, side="left")
+
+
+def adds_up_exactly(confidence: np.ndarray, num_rows: int) -> bool:
+    """Are sums of up to `num_rows` of the confidences [N] exact in float64, so that their order changes nothing?
+
+    Those that were float32 mostly are: all are multiples of a power of two that leaves room for the sum in 53 bits.
+    """
+    fraction_bits = 51 - num_rows.bit_length()
+    scaled = np.ldexp(confidence, fraction_bits)
+    return bool((scaled == np.floor(scaled)).all())

@@ -50,7 +50,7 @@ CLOSEST_PAIRS = TableSchema(
 
 NEAR_QUANTILE = 0.01
 NUM_REPLICATES = 1000
-_BLOCK_NUMBERS = 4_000_000
+_BLOCK_NUMBERS, _ROWS_AT_ONCE = 4_000_000, 1024
 _ROUNDING = 4 * float(np.finfo(np.float64).eps)
 """Of squared distances, relative to the squared norms they are the difference of, for each feature added up."""
 
@@ -199,7 +199,8 @@ def nearest_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The nearest reference of each row, exactly: equal rows have distance 0.
 
-    Matrix products name the candidates, blocks of rows at a time; their distances are then computed from differences.
+    Matrix products name the candidates, blocks of both sets at a time, so that memory does not grow with them; their
+    distances are then computed from differences.
 
     Args:
         rows: [N, D].
@@ -212,30 +213,48 @@ def nearest_rows(
         ValueError: shapes do not fit, a set is empty, a value is not finite (names the row), or a row has no reference
             of another group.
     """
-    rows = check_features(rows, "first", least_rows=1).astype(np.float64)
-    references = check_features(references, "second", least_rows=1).astype(np.float64)
+    rows = check_features(rows, "first", least_rows=1)
+    references = check_features(references, "second", least_rows=1)
     check_same_width(rows, references)
     groups = _numbers_of_groups(row_groups, reference_groups, len(rows), len(references))
-    centred_rows, centred = rows - references[0], references - references[0]
-    norms, row_norms = (np.einsum("nd,nd->n", part, part) for part in (centred, centred_rows))
     distances, nearest = np.empty(len(rows)), np.empty(len(rows), np.int64)
-    step = max(1, _BLOCK_NUMBERS // len(references))
-    for start in range(0, len(rows), step):
-        block = slice(start, start + step)
-        squared = row_norms[block, None] + norms
-        slack = _ROUNDING * rows.shape[1] * squared
-        squared -= 2 * (centred_rows[block] @ centred.T)
-        if groups is not None:
-            squared[groups[0][block, None] == groups[1]] = np.inf
-        # No reference that is farther than another by more than rounding can be the nearest.
-        candidates = squared - slack <= (squared + slack).min(axis=1, keepdims=True)
-        candidates &= np.isfinite(squared)
-        for row in range(len(squared)):
-            chosen = np.flatnonzero(candidates[row])
+    for start in range(0, len(rows), _ROWS_AT_ONCE):
+        block = rows[start : start + _ROWS_AT_ONCE].astype(np.float64)
+        own = None if groups is None else (groups[0][start : start + _ROWS_AT_ONCE], groups[1])
+        for row, chosen in enumerate(_candidates(block, references, own)):
             if len(chosen) == 0:
                 raise ValueError(f"row {start + row} has no reference of another group")
-            distances[start + row], nearest[start + row] = _nearest_of(rows[start + row], references, chosen)
+            distances[start + row], nearest[start + row] = _nearest_of(block[row], references, chosen)
     return distances, nearest
+
+
+def _candidates(
+    rows: np.ndarray, references: np.ndarray, groups: tuple[np.ndarray, np.ndarray] | None
+) -> list[np.ndarray]:
+    """For each row [N, D] the references that may be the nearest, ascending, some at a time as float64."""
+    origin = references[0].astype(np.float64)
+    rows = rows - origin
+    norms = np.einsum("nd,nd->n", rows, rows)
+    least = np.full(len(rows), np.inf)
+    found = []
+    step = max(1, _BLOCK_NUMBERS // max(rows.shape))
+    for start in range(0, len(references), step):
+        centred = references[start : start + step] - origin
+        squared = norms[:, None] + np.einsum("nd,nd->n", centred, centred)
+        slack = _ROUNDING * rows.shape[1] * squared
+        squared -= 2 * (rows @ centred.T)
+        if groups is not None:
+            squared[groups[0][:, None] == groups[1][start : start + step]] = np.inf
+        # No reference that is farther than another by more than rounding can be the nearest.
+        least = np.minimum(least, (squared + slack).min(axis=1))
+        lower = squared - slack
+        near, number = np.nonzero((lower <= least[:, None]) & np.isfinite(squared))
+        found.append((near, number + start, lower[near, number]))
+    near, number, lower = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    chosen = lower <= least[near]
+    near, number = near[chosen], number[chosen]
+    order = np.argsort(near, kind="stable")
+    return np.split(number[order], np.searchsorted(near[order], np.arange(1, len(rows))))
 
 
 def small_pictures(frames: Images, size: int = 32, blur: float = 1.0) -> np.ndarray:

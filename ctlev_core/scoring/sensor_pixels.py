@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -64,11 +65,12 @@ def sensor_sizes(data: Manifest, rows: np.ndarray, recordings: Manifest) -> np.n
     of_recording = {name: size for name, *size in zip(*map(recordings.column, names), strict=True)}
     synthetic = "source_id" in data.table.column_names
     own = data.column("source_id" if synthetic else "recording_id")
+    of_experiment = cache(partial(sensor_size_of, recordings))
     sizes = []
     for row in rows.tolist():
         name, _, rest = own[row].partition(":")
         # The label of a frame is RECORDING:SPLIT:NUMBER, that of a moment RECORDING:MOMENT.
-        size = sensor_size_of(recordings) if synthetic and ":" not in rest else of_recording.get(name, (0, 0))
+        size = of_experiment() if synthetic and ":" not in rest else of_recording.get(name, (0, 0))
         if min(size) <= 0:
             raise DataError(f"{data.ref.path}: row {row}: {name} has no sensor size in {recordings.ref.path}")
         sizes.append(size)

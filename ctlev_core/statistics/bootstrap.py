@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -89,6 +90,26 @@ def bootstrap_interval(
     return low.get("mean", float("nan")), high.get("mean", float("nan"))
 
 
+@runtime_checkable
+class ScoresOfDraws(Protocol):
+    """Scores of any rows, which of many draws of whole groups can be had at once."""
+
+    def __call__(self, rows: np.ndarray) -> dict[str, float]:
+        """Named scores of the given rows; those drawn twice come twice."""
+        ...
+
+    def of_draws(self, groups: np.ndarray, draws: np.ndarray) -> dict[str, np.ndarray] | None:
+        """The same, to the last digit, of every draw that has scores.
+
+        Args:
+            groups: [N] int64, the group of each row.
+            draws: [R, G] how often each group is drawn.
+        Returns:
+            [R or fewer] of each score; None where they would be rounded otherwise.
+        """
+        ...
+
+
 def cluster_bootstrap(
     compute: Callable[[np.ndarray], Mapping[str, float]],
     groups: Sequence[str] | np.ndarray,
@@ -97,10 +118,11 @@ def cluster_bootstrap(
     num_resamples: int = 500,
     seed: int = 0,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Intervals of any scores under resampling of whole groups; one call of `compute` a replicate.
+    """Intervals of any scores under resampling of whole groups.
 
     Args:
-        compute: named scores of the given rows, in which rows of a group drawn twice come twice.
+        compute: named scores of the given rows, in which rows of a group drawn twice come twice. It is called once a
+            replicate, unless it is one of `ScoresOfDraws`.
         groups: [N] recording or sequence of each row.
         level: probability each interval should cover.
         num_resamples: bootstrap replicates.
@@ -112,18 +134,53 @@ def cluster_bootstrap(
     names, index = np.unique(np.asarray(groups), return_inverse=True)
     if len(names) < 2:
         return {}, {}
-    by_group, sizes = np.argsort(index, kind="stable"), np.bincount(index)
     whole = compute(np.arange(len(index)))
-    replicates: list[Mapping[str, float]] = []
+    parts = []
     for draws in _draws(len(names), num_resamples, seed):
-        for counts in draws:
-            with suppress(ValueError):
-                replicates.append(compute(by_group[_repeated(sizes, counts)]))
-    if 2 * len(replicates) < num_resamples:  # those that are left are like the whole set, and vary too little
+        at_once = compute.of_draws(index, draws) if isinstance(compute, ScoresOfDraws) else None
+        parts.append(_one_by_one(compute, index, draws) if at_once is None else at_once)
+    parts = [part for part in parts if part]
+    if not parts:
         return {}, {}
-    scores = [name for name in replicates[0] if name in whole]
-    found = np.array([[replicate[name] for name in scores] for replicate in replicates])
+    scores = [name for name in parts[0] if name in whole]
+    found = np.stack([np.concatenate([part[name] for part in parts]) for name in scores], axis=1)
+    if 2 * len(found) < num_resamples:  # those that are left are like the whole set, and vary too little
+        return {}, {}
     return _ends(scores, found, np.array([whole[name] for name in scores]), percentile_levels(len(names), level))
+
+
+def _one_by_one(
+    compute: Callable[[np.ndarray], Mapping[str, float]], index: np.ndarray, draws: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Scores of those draws that have some, one call of `compute` a draw; rows come group by group."""
+    by_group, sizes = np.argsort(index, kind="stable"), np.bincount(index)
+    replicates: list[Mapping[str, float]] = []
+    for counts in draws:
+        with suppress(ValueError):
+            replicates.append(compute(by_group[_repeated(sizes, counts)]))
+    names = replicates[0] if replicates else ()
+    return {name: np.array([replicate[name] for replicate in replicates]) for name in names}
+
+
+def sums_of_draws(
+    groups: np.ndarray, draws: np.ndarray, codes: np.ndarray, num_codes: int, weights: np.ndarray | None = None
+) -> np.ndarray:
+    """How often each code occurs in each draw of groups, or the sum of the weights it occurs with.
+
+    Args:
+        groups: [M] int64.
+        draws: [R, G] how often each group is drawn.
+        codes: [M] int64, below `num_codes`.
+        num_codes: K.
+        weights: [M]; None = ones.
+    Returns:
+        [R, K] float64.
+    """
+    from scipy.sparse import coo_array  # here, because a cached run needs no scipy
+
+    weights = np.ones(len(codes)) if weights is None else weights
+    of_groups = coo_array((weights, (codes, groups)), shape=(num_codes, draws.shape[1])).tocsr()
+    return np.ascontiguousarray((of_groups @ draws.T.astype(np.float64)).T)
 
 
 def _ends(

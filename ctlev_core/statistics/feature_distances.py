@@ -27,6 +27,7 @@ import pyarrow as pa
 from ctlev_core.plugin_contracts import NamedFeatureExtractor
 from ctlev_core.plugins import Plugin
 from ctlev_core.statistics.bootstrap import MIN_RECORDINGS, rows_of_groups
+from ctlev_core.statistics.small_samples import t_quantile
 from data_contracts.tables import Column, TableSchema
 
 DISTANCE_ESTIMATES = TableSchema(
@@ -61,7 +62,8 @@ class DistanceEstimate:
         high: upper end.
         halved: mean of the score over halves of both sets: larger than `value` by the bias of smaller sets.
         floor: mean of the score between halves of the reference set, what a perfect set of that size would get;
-            compare with `halved`, which has the same bias where both sets are equally large.
+            compare with `halved`, which has the same bias where both sets are equally large. Of a score that has a
+            reference of its own (`fd_to_...`) the mean score of halves of the reference set against that, no floor.
         floor_low: central 95 % of the floor over the random halves, lower end.
         floor_high: and upper end.
         num_predicted: rows judged.
@@ -126,7 +128,7 @@ def estimate_distances(
         if halves:
             pairs = np.array([[first[name], second[name]] for first, second in halves])
             deviation = np.sqrt(np.mean(np.diff(pairs, axis=1) ** 2)) / 2
-            half_width = _t_quantile(level, min(fewest, num_splits) - 1) * deviation
+            half_width = t_quantile(min(fewest, num_splits) - 1, level) * deviation
             low, high, halved = value - half_width, value + half_width, pairs.mean()
             between = [scores_of_halves[name] for scores_of_halves in floors]
             floor, (floor_low, floor_high) = np.mean(between), np.quantile(between, [0.025, 0.975])
@@ -205,9 +207,3 @@ def _halve(groups: list[np.ndarray], generator: np.random.Generator) -> tuple[np
     middle = (len(groups) + int(generator.integers(2))) // 2
     first, second = (np.sort(np.concatenate([groups[g] for g in part])) for part in np.split(order, [middle]))
     return first, second
-
-
-def _t_quantile(level: float, degrees: int) -> float:
-    from scipy.stats import t
-
-    return float(t.ppf((1 + level) / 2, degrees))

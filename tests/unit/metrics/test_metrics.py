@@ -6,7 +6,7 @@ from sklearn.metrics import accuracy_score, precision_score, recall_score
 
 from ctlev_core.metrics import classification, frechet, mpjpe2d, oks, pck2d
 from ctlev_core.plugins import load_options
-from ctlev_core.scoring.scored_rows import score_rows
+from ctlev_core.scoring.scored_rows import RowScores
 from ctlev_core.statistics.bootstrap import (
     bootstrap_interval,
     cluster_bootstrap,
@@ -241,7 +241,7 @@ def test_few_scored_recordings_have_no_interval():
     for num_scored, has_interval in ((6, True), (5, True), (4, False)):
         seen = visible & (np.repeat(np.arange(6), 4) < num_scored)[:, None]
         labels = Labels(("a",) * 24, np.arange(24), joints, seen, "dhp19")
-        scores, low, high = score_rows(options, prediction, labels, np.arange(24), recordings)
+        scores, low, high = RowScores(options, prediction, labels, recordings).of(np.arange(24))
         assert scores["mpjpe2d_px"] == pytest.approx(2**0.5) and ("mpjpe2d_px" in low) == has_interval == bool(high)
 
 

@@ -11,6 +11,7 @@ from sklearn import metrics as sklearn_metrics
 from ctlev_core.metrics import classification, zero_shot
 from ctlev_core.scoring.classification import calibrate, class_scores, read_guesses
 from ctlev_core.scoring.zero_shot import balanced_accuracy, nearest_seen_classes
+from ctlev_core.statistics.bootstrap import cluster_bootstrap
 from data_contracts.labels import Labels
 
 ZERO: Any = {"zero_division": 0}
@@ -93,6 +94,34 @@ def test_prepared_scores_of_rows_are_those_of_the_rows(metric):
     rows = np.array([0, 0, 1, 2, 4, 5, 9, 9])
     chosen = {"probability": predicted["probability"][rows], "classes": predicted["classes"]}
     assert compute_of(rows) == pytest.approx(metric.compute(chosen, target.take(rows), metric.Options()))
+
+
+@pytest.mark.parametrize("metric", [classification, zero_shot])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("known", "tested"), [("abcde", "abcdf"), ("abc", "ab"), ("ab", "abbbbbbbbbbb")])
+def test_many_draws_at_once_have_the_scores_of_one_after_the_other_to_the_last_digit(metric, dtype, known, tested):
+    random = np.random.default_rng(0)
+    truth = random.choice(list(tested), 80).tolist()
+    predicted, target = random_prediction(1, truth, list(known)), class_labels(truth)
+    predicted["probability"] = predicted["probability"].astype(dtype)
+    compute_of = metric.prepare(predicted, target, metric.Options())
+    groups = random.integers(0, 12, 80)
+    expected = cluster_bootstrap(lambda rows: compute_of(rows), groups, num_resamples=150, seed=3)
+    assert cluster_bootstrap(compute_of, groups, num_resamples=150, seed=3) == expected and expected[0]
+    draws = random.multinomial(12, np.full(12, 1 / 12), size=5)
+    # Sums of confidences that were float64 would be rounded otherwise.
+    is_exact = metric is zero_shot or dtype == np.float32
+    assert (compute_of.of_draws(groups, draws) is not None) == is_exact
+
+
+def test_draws_of_rows_of_one_class_have_the_scores_of_one_after_the_other():
+    """A class's own group of rows: which classes are guessed, and count in a macro mean, differs from draw to draw."""
+    predicted, target = random_prediction(1, ["k"] * 40, list("abcdefghijklmnopqrst")), class_labels("k" * 40)
+    compute_of = classification.prepare(
+        {**predicted, "probability": predicted["probability"].astype(np.float32)}, target, classification.Options()
+    )
+    expected = cluster_bootstrap(lambda rows: compute_of(rows), np.arange(40), num_resamples=100)
+    assert cluster_bootstrap(compute_of, np.arange(40), num_resamples=100) == expected
 
 
 def test_logits_and_repeated_classes_are_refused():

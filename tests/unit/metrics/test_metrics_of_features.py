@@ -2,6 +2,8 @@
 
 import hashlib
 import math
+import subprocess
+import sys
 from dataclasses import asdict
 from fractions import Fraction
 
@@ -257,6 +259,16 @@ def test_floor_and_halves_say_what_small_sets_do():
     assert far.floor == same.floor and far.halved > 5 * far.floor
     assert (same.num_predicted, same.num_target, same.num_features) == (100, 100, 6)
     assert estimate_distances(score, normal(13, 100), normal(14, 100))["fd"] == same
+
+
+def test_intervals_do_without_the_slow_import():
+    code = (
+        "import sys, numpy as np; from ctlev_core.statistics.feature_distances import estimate_distances; "
+        "found = estimate_distances(lambda a, b: {'sum': a.sum()}, np.diag(np.arange(8.0)), np.eye(8)); "
+        "print(found['sum'].high > found['sum'].value, 'scipy.stats' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == ["True", "False"]
 
 
 def test_estimates_become_rows_with_what_they_have_to_be_read_with():

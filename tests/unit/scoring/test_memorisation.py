@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -51,13 +53,26 @@ def test_nearest_rows_are_those_of_a_slow_search(seed, shape, offset, grid, grou
     np.testing.assert_allclose(distances, expected[0], rtol=1e-13)
 
 
-def test_blocks_change_nothing(monkeypatch):
+@pytest.mark.parametrize("values", [3, 1000])
+def test_blocks_change_nothing(monkeypatch, values):
     rng = np.random.default_rng(0)
-    rows, references = rng.standard_normal((50, 5)), rng.standard_normal((40, 5))
-    expected = nearest_rows(rows, references)
+    rows, references = rng.integers(0, values, (50, 3)), rng.integers(0, values, (40, 3))
+    groups = {"row_groups": np.arange(50) % 4, "reference_groups": np.arange(40) // 10}
+    expected = nearest_rows(rows, references, **groups)
     monkeypatch.setattr(memorisation, "_BLOCK_NUMBERS", 90)
-    for found, wanted in zip(nearest_rows(rows, references), expected, strict=True):
+    monkeypatch.setattr(memorisation, "_ROWS_AT_ONCE", 7)
+    for found, wanted in zip(nearest_rows(rows, references, **groups), expected, strict=True):
         np.testing.assert_array_equal(found, wanted)
+
+
+def test_many_references_are_not_copied(monkeypatch):
+    monkeypatch.setattr(memorisation, "_BLOCK_NUMBERS", 100_000)
+    references = np.random.default_rng(0).random((10_000, 256), np.float32)
+    tracemalloc.start()
+    nearest_rows(references[:20], references)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < references.nbytes / 2
 
 
 def test_equal_rows_have_distance_0_far_from_the_origin():

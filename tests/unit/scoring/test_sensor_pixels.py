@@ -1,12 +1,16 @@
 """Errors in px of the sensor against closed forms: of a known shift, whatever the fit, the sensor and the mixture."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pyarrow as pa
 import pytest
 
 from ctlev_core import plugins
 from ctlev_core.downstream import pose2d
+from ctlev_core.labels.sources import sensor_size_of
 from ctlev_core.plugins import PluginError
+from ctlev_core.scoring import sensor_pixels
 from ctlev_core.scoring.sensor_pixels import SensorSource, check_in_image, on_sensor, sensor_sizes
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
@@ -123,12 +127,16 @@ def test_each_frame_of_a_union_is_measured_on_its_own_sensor(tmp_path, monkeypat
     assert scores["dataset far", "mpjpe2d_px"] == pytest.approx(5 * np.mean([64 / 1280, 64 / 400, 64 / 1280]), abs=1e-3)
 
 
-def test_synthetic_frames_are_on_the_sensor_that_their_label_was_mapped_from(tmp_path):
+def test_synthetic_frames_are_on_the_sensor_that_their_label_was_mapped_from(tmp_path, monkeypatch):
     recordings = recordings_of(tmp_path / "recordings", {"a": DAVIS, "b": CELEX, "poses": TALL})
     table = pa.table({"source_id": ["b:train:00003", "poses:1500", "a:train:00000", "elsewhere:7"]})
     made = Manifest(ManifestRef(key="made", path=tmp_path), tables.SYNTHETIC, table, {})
+    # The recordings are looked through once, not for each of many frames.
+    first_sensor = Mock(wraps=sensor_size_of)
+    monkeypatch.setattr(sensor_pixels, "sensor_size_of", first_sensor)
     # Labels of no frame were scaled onto the experiment's first sensor when they were chosen.
     assert sensor_sizes(made, np.arange(4), recordings).tolist() == [[*CELEX], [*DAVIS], [*DAVIS], [*DAVIS]]
+    first_sensor.assert_called_once()
 
 
 def test_a_frame_without_a_sensor_is_refused(tmp_path):

@@ -34,6 +34,13 @@ def test_quantiles_of_the_printed_tables(freedom, quantile):
     assert t_quantile(freedom) == pytest.approx(quantile, abs=6e-4)
 
 
+@pytest.mark.parametrize("level", [0.5, 0.95, 0.99])
+def test_quantiles_are_those_of_scipy_to_the_last_digit(level):
+    """Without `scipy.stats`, whose import takes a second."""
+    freedoms = range(1, 60)
+    assert [t_quantile(n, level) for n in freedoms] == [float(stats.t.ppf((1 + level) / 2, n)) for n in freedoms]
+
+
 def test_degrees_of_freedom_are_those_of_welch():
     random = np.random.default_rng(0)
     first, second = random.normal(0, 1, 4), random.normal(0, 3, 9)

@@ -77,3 +77,16 @@ def test_without_held_out_frames_or_other_recordings_what_can_be_scored_is(tmp_p
     _, found = search(tmp_path, splits, lambda frames: pictures(1, 40))
     assert ("synthetic", "data_copying_z") in found and found["synthetic", "close_share"]["num_samples"] == 40
     assert (("held-out recorded", "close_share") in found) == ("test" in splits)
+
+
+@pytest.mark.parametrize("others", [0, 10])
+def test_held_out_frames_of_the_only_training_recording_are_not_compared_with_it(tmp_path, others):
+    """As where one recording is split in time: its frames resemble their neighbours without being copied."""
+    recordings, splits = ["r0"] * 60 + ["r1"] * others, ["train"] * 40 + ["test"] * (20 + others)
+    frames = write(tmp_path / "frames", pictures(0, 60 + others), recordings, splits)
+    made = write(tmp_path / "made", pictures(1, 40), [f"m{n}" for n in range(40)], ["train"] * 40)
+    (tmp_path / "out").mkdir()
+    out = Output(tmp_path / "out", tmp_path)
+    table = memorisation.function(out, frames, made, None, downstream=None, subject="synthetic")
+    counts = {row["subject"]: row["num_samples"] for row in table.to_pylist()}
+    assert counts == ({"synthetic": 40, "held-out recorded": others} if others else {})

@@ -13,7 +13,7 @@ from ctlev_core.metrics import mpjpe2d, mpjpe3d, oks, pck2d
 from ctlev_core.report.sections.verdict import verdict
 from ctlev_core.scoring.pose import quotients
 from ctlev_core.scoring.score_info import lower_is_better
-from ctlev_core.scoring.scored_rows import score_each_row
+from ctlev_core.scoring.scored_rows import RowScores
 from ctlev_core.statistics.paired_differences import Difference
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
@@ -191,7 +191,7 @@ def test_the_rows_of_a_metric_are_parts_of_one_of_its_scores(module, score):
     options = module.Options()
     metric = plugins.Plugin("metrics", "m", module, options)
     scores = module.compute(predicted, labels, options)
-    found = score_each_row(metric, predicted, labels, scores)
+    found = RowScores(metric, predicted, labels, np.array([])).each_row(scores)
     assert set(found["metric"].to_pylist()) == {score}
     values, weights = (np.array(found[name].to_pylist(), float) for name in ("value", "weight"))
     known = ~np.isnan(values)
