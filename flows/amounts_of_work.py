@@ -70,12 +70,14 @@ class Amounts:
 
     def work(self, key: str) -> float:
         """Of a training steps times batch, of a sampling frames times steps, of scores the frames that a model sees, of
-        two-sample tests their number; else rows.
+        two-sample tests their number, of a report one; else rows.
         """
         stage = self._stages.get(key)
         arguments = {} if stage is None else stage.arguments
         if stage is not None and stage.stage in _TWO_SAMPLE_TESTS:
             return self._two_sample_tests(stage.stage, arguments)
+        if stage is not None and stage.stage == "report":
+            return 1.0  # a page is not longer for the frames that its numbers are of
         if stage is not None and stage.stage == "score_model":
             frames = self.rows(arguments["data"]["manifest"])
             held_out = frames.total - frames.training

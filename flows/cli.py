@@ -57,7 +57,9 @@ Preset = Annotated[
         show_default=False,
     ),
 ]
-PresetOption = Annotated[str | None, typer.Option("--preset", metavar="PRESET", help="the same", show_default=False)]
+PresetOption = Annotated[
+    str | None, typer.Option("--preset", metavar="PRESET", help="the preset, as an option", show_default=False)
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
@@ -196,11 +198,11 @@ def _part(name: str, module: str, help_text: str, *, default: str = "pose", pane
         given = preset, preset_option
         _run(module, default, given, overrides=overrides, dry_run=dry_run, home=home, verbose=verbose)
 
-    app.command(name, help=f"{help_text} By default of the preset `{default}`.", rich_help_panel=panel)(command)
+    app.command(name, help=f"{help_text} PRESET is `{default}` unless named.", rich_help_panel=panel)(command)
 
 
 _part(
-    "prepare", "prepare_dataset", "Ingest recordings, encode them as event images, render conditions; a contact sheet."
+    "prepare", "prepare_dataset", "Read recordings, make event images and conditions, and a contact sheet to look at."
 )
 _part("train", "train_generator", "Fine-tune a generator on labelled event images.")
 _part(
@@ -215,7 +217,7 @@ _part("pretrain", "pretrain", "Train a small base model on pictures.", default="
 _part(
     "regenerate",
     "regenerate",
-    "Make the next version of the synthetic data, and publish it if it keeps the gates.",
+    "Make the next version of the synthetic data, and publish it if it passes its checks.",
     panel=SINGLE_RUNS,
 )
 
@@ -309,7 +311,7 @@ def record(
     folder: Annotated[Path, typer.Argument(help="folder to make", show_default=False)],
     recordings: Annotated[int, typer.Option(min=1, help="how many")] = 10,
     split: Annotated[
-        str, typer.Option(help="whose people and motions: train, test, validation, or condition, everybody another")
+        str, typer.Option(help="whose people and motions: train, test, validation, or condition (a new person each)")
     ] = "condition",
     rate: Annotated[float, typer.Option(help="labelled moments a second")] = 100.0,
     suffix: Annotated[str, typer.Option(help="of the files of events: .parquet, .h5, .raw, ...")] = ".parquet",
@@ -359,7 +361,7 @@ def _finite(value: float) -> float:
 @app.command(rich_help_panel=STORE)
 def prune(
     keep_days: Annotated[
-        float, typer.Option(min=0, metavar="N", help="keep what was used since", callback=_finite)
+        float, typer.Option(min=0, metavar="N", help="keep what was used in the last N days", callback=_finite)
     ] = 30,
     keep_versions: Annotated[
         int,
@@ -370,7 +372,7 @@ def prune(
     apply: Annotated[bool, typer.Option("--apply", help="remove; without it, list what would be removed")] = False,
     home: Home = None,
 ) -> None:
-    """Remove from the store what no run has used for long, and nothing that anything kept was made from."""
+    """Remove artefacts that no run has used lately; what the kept ones were made from stays."""
     from flows.prune import prune_home
 
     raise typer.Exit(prune_home(_home(home), keep_days, keep_versions, apply=apply))

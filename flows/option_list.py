@@ -80,7 +80,7 @@ def options_of(name: str) -> Iterator[tuple[str, list[Option]]]:
     """Sections of options: a title, and the options.
 
     Args:
-        name: of a preset (`pose`, `pretraining/small`), or of a plug-in (`controlnet`, `datasets/folder`).
+        name: of a preset (`pose`, `small`, `speed_vs_error/pose`), or of a plug-in (`controlnet`, `datasets/folder`).
 
     Raises:
         PluginError: there is neither of that name, or the preset cannot be read.
@@ -94,6 +94,10 @@ def options_of(name: str) -> Iterator[tuple[str, list[Option]]]:
         yield from _of_preset(name)
         return
     kinds = [kind for kind in plugins.KINDS if name in plugins.names(kind)]
+    folders = [folder for folder in _FOLDERS if name in preset_names(PRESETS / folder)]
+    if not kinds and folders:
+        yield from _of_preset(f"{folders[0]}/{name}")
+        return
     if not kinds:
         presets = preset_names() + [f"{folder}/{one}" for folder in _FOLDERS for one in preset_names(PRESETS / folder)]
         known = [*presets, *(one for kind in plugins.KINDS for one in plugins.names(kind))]

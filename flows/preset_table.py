@@ -11,7 +11,7 @@ from flows.preset_list import PRESETS, preset_heads
 _FOLDERS = {
     "": "ctlev run NAME",
     "pretraining": "ctlev pretrain NAME",
-    "speed_vs_error": "ctlev speed-vs-error NAME",
+    "speed_vs_error": "ctlev speed-vs-error NAME (options: ctlev options speed_vs_error/NAME)",
 }
 
 
@@ -33,5 +33,6 @@ def print_presets() -> None:
                 console.print(f"  {head.name:{width}}  {told}", soft_wrap=True, markup=False)
         console.print()
     console.print(
-        "ctlev options NAME lists what can be set; ctlev plan NAME what a run does and takes.", soft_wrap=True
+        "ctlev options NAME lists what can be set; ctlev plan NAME what `ctlev run NAME` does and takes.",
+        soft_wrap=True,
     )

@@ -49,7 +49,7 @@ class MadeVersion(Frozen):
 
 @flow(name="regenerate")
 def regenerate(regeneration: Regeneration) -> Any:
-    """Sample the next version of the synthetic data, score it, and make it the latest if it keeps the gates."""
+    """Sample the next version of the synthetic data, score it, and make it the latest if it passes every gate."""
     version = make_next_version(regeneration)
     return version and _show(version)
 

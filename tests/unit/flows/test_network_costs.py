@@ -279,6 +279,14 @@ def test_realism_is_as_many_two_sample_tests_as_have_enough_frames():
     assert amounts.work("e") == 1
 
 
+def test_a_report_of_sequences_costs_as_much_as_any_other():
+    made = planned("sample", "a", conditions=ref("x"), count=960)
+    time = planned("sequence_realism", "b", frames=ref("a"), generated=[ref("a")], length=8)
+    reports = planned("report", "c", made=ref("x")), planned("report", "d", made=ref("x"), sequences=ref("b"))
+    foretold = predict_stages([*reports], of=[made, time, *reports])
+    assert foretold["c"] is not None and foretold["c"] == foretold["d"] and foretold["c"].seconds < 60
+
+
 def test_gpus_share_the_work_and_hold_what_processes_would(base_model, monkeypatch):
     choice = generator("controlnet", base_model, tune="controlnet", gradient_accumulation=4, num_processes=4)
     monkeypatch.setattr(network_costs, "num_gpus", lambda device: 0)

@@ -40,6 +40,11 @@ def test_every_preset_can_be_listed_though_its_files_are_missing(name):
     assert listed(name)
 
 
+@pytest.mark.parametrize("name", preset_names(PRESETS / "pretraining"))
+def test_presets_of_pretraining_are_found_by_the_name_that_is_listed(name):
+    assert listed(name) == listed(f"pretraining/{name}")
+
+
 @pytest.mark.parametrize("kind", plugins.KINDS)
 def test_every_plug_in_can_be_listed(kind, capsys):
     for name in plugins.names(kind):
