@@ -101,8 +101,17 @@ def _problems(experiments: Mapping[str, Experiment]) -> list[str]:
     listed = []
     for problem, names in found.items():
         of = ", ".join(dict.fromkeys(names))
-        listed.append(f"{of}: {problem}" if of else problem)
+        listed.append(f"{of}: {problem}" if of else _name_option(problem, experiments[""]))
     return listed
+
+
+def _name_option(problem: str, experiment: Experiment) -> str:
+    """`--set ...root=PATH` with the whole name of the option: plug-ins do not know what an experiment has them for."""
+    for field in type(experiment).model_fields:
+        choice = getattr(experiment, field)
+        if isinstance(choice, Choice) and problem.startswith(f"{choice.KIND} {choice.name!r}: "):
+            return problem.replace("--set ...", f"--set {field}.options.")
+    return problem
 
 
 def _look_for(choice: Choice) -> None:

@@ -37,6 +37,10 @@ def refused(home, *arguments, preset="folder", run=plan_script, **how):
         ),
         (("--set", "baselines={test: {generator: {name: smpl_esim}}}"), "a baseline's name is made of a-z, 0-9 and _"),
         (("--set", "metrics=[{name: oks}, {name: oks}]"), "expected each once, got 'oks' twice with the same options"),
+        (
+            ("--preset", "folder"),
+            "datasets 'folder': option 'root' must be a path, got None; --set dataset.options.root=PATH",
+        ),
         (("--set", "downstream_seeds=[0,0]"), "expected each once, got 0 twice"),
         (("--set", "nonesuch=1"), "unknown option 'nonesuch'; known: name,"),
         (("--set", "windows.num_events=0"), "option 'windows.num_events': input should be greater than 0, got 0"),
