@@ -194,3 +194,25 @@ def test_a_run_that_does_not_mind_an_interrupt_is_ended():
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(STUBBORN)], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and done.stdout == "went on\n"
     assert "error: the local Prefect server ended with code 0" in done.stderr and "LOG" in done.stderr
+
+
+AT_ONCE = """
+    import sys
+    from pathlib import Path
+    from flows import local_server
+    local_server.configure(Path(sys.argv[1]), verbose=False)
+    local_server.start(Path(sys.argv[1]))
+    with local_server.connected():
+        print("answers")
+    sys.stdout.flush()
+    local_server.stop()
+"""
+
+
+@pytest.mark.slow
+def test_servers_that_start_at_once_in_a_new_home_all_answer(tmp_path):
+    """Else both make the tables of the one database, and one ends with `duplicate column name`."""
+    command = [sys.executable, "-c", textwrap.dedent(AT_ONCE), str(tmp_path)]
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PREFECT_")}
+    started = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    assert [process.communicate(timeout=300)[0] for process in started] == ["answers\n"] * 2
