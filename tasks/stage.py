@@ -413,11 +413,13 @@ class Stage:
 
 def _prepare_work(work: Path, upstream: dict[str, str]) -> None:
     """Make the folder of resumable state; what a killed run left there of inputs of other content is deleted."""
-    note, content = work / UPSTREAM_FILE, json.dumps(upstream, sort_keys=True)
-    if note.exists() and note.read_text(encoding="utf-8") != content:
+    note, content = work / UPSTREAM_FILE, json.dumps(upstream, sort_keys=True).encode()
+    if note.exists():
+        if note.read_bytes() == content:
+            return  # written again on a full disk it would be lost, and with it what it vouches for
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
-    note.write_text(content, encoding="utf-8")
+    note.write_bytes(content)
 
 
 class StageTimeoutError(RuntimeError):
