@@ -432,27 +432,48 @@ def _time_limit(name: str) -> Iterator[None]:
 
     Stages of branches run in processes of their own, and those of scripts in the script's main thread.
     """
-    asked = os.environ.get(TIMEOUT, "")
-    if not asked or threading.current_thread() is not threading.main_thread():
+    seconds = time_limit_s()
+    if seconds is None or threading.current_thread() is not threading.main_thread():
         yield
         return
+    told = f"{name} took longer than {seconds:g} s ({TIMEOUT}); its checkpoints are kept"
+    expired: list[float] = []
+
+    def expire(number: int, frame: object) -> None:
+        expired.append(seconds)
+        raise StageTimeoutError(told)
+
+    before = signal.signal(signal.SIGALRM, expire)
+    signal.setitimer(signal.ITIMER_REAL, min(seconds, threading.TIMEOUT_MAX))
+    try:
+        yield
+    except Exception as error:
+        if not expired or isinstance(error, StageTimeoutError):
+            raise
+        raise StageTimeoutError(told) from error  # what was interrupted may say that a file is damaged
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    if expired:  # and may have taken it for an error that it can do without
+        raise StageTimeoutError(told)
+
+
+def time_limit_s() -> float | None:
+    """The variable CTLEV_STAGE_TIMEOUT_S; None where it is not set.
+
+    Raises:
+        DataError: it is no number of seconds above 0.
+    """
+    asked = os.environ.get(TIMEOUT, "")
+    if not asked:
+        return None
     try:
         seconds = float(asked)
     except ValueError:
         seconds = 0.0
     if not 0 < seconds < math.inf:
         raise DataError(f"{TIMEOUT} must be a number of seconds above 0, got {asked!r}")
-
-    def expire(number: int, frame: object) -> None:
-        raise StageTimeoutError(f"{name} took longer than {seconds:g} s ({TIMEOUT}); its checkpoints are kept")
-
-    before = signal.signal(signal.SIGALRM, expire)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+    return seconds
 
 
 def numbered(label: str, number: int) -> str:

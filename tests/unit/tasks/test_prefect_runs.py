@@ -122,6 +122,30 @@ def test_a_stage_that_takes_too_long_is_ended_and_keeps_its_work(home, monkeypat
     assert not Store().temporary_folder(key).exists()
 
 
+@stage(version=1, schema=tables.TRAINING)
+def hides(out, *, how):
+    """Takes the interruption for something else."""
+    try:
+        time.sleep(20)
+    except Exception as error:
+        if how == "renamed":
+            raise DataError("the file is damaged") from error
+    return pa.table({"curve": ["training"], "step": pa.array([0], pa.int64()), "loss": [0.0]})
+
+
+@pytest.mark.parametrize("how", ["renamed", "passed over"])
+def test_work_that_is_cut_short_is_never_taken_for_finished_or_for_damage(home, monkeypatch, how):
+    monkeypatch.setenv("CTLEV_STAGE_TIMEOUT_S", "0.2")
+    arguments = {"how": how}
+    key = hides.key(arguments, Store())
+    with pytest.raises(StageTimeoutError, match=r"hides took longer than 0.2 s"):
+        hides.run(key, arguments)
+    assert not Store().folder("hides", key).exists()
+    monkeypatch.setenv("CTLEV_STAGE_TIMEOUT_S", "1e300")
+    quick = {"seconds": 0.0}
+    assert slow.run(slow.key(quick, Store()), quick)[0].rows == 1
+
+
 def test_after_a_stage_its_alarm_is_off(home, monkeypatch):
     monkeypatch.setenv("CTLEV_STAGE_TIMEOUT_S", "60")
     before = signal.getsignal(signal.SIGALRM)
