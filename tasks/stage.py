@@ -45,7 +45,7 @@ from pydantic import BaseModel
 from ctlev_core import plugins
 from ctlev_core.cpu_precision import computed_in
 from ctlev_core.plugin_contracts import PluginWithFiles
-from ctlev_core.processes import asked_threads, begin_memory_peak, few_threads, memory_peak_mib
+from ctlev_core.processes import asked_threads, begin_memory_peak, few_threads, memory_peak_mib, num_cores
 from ctlev_core.progress import Progress, current_report, reporting_to
 from ctlev_core.provenance.raw_file_digests import digest_raw_files
 from data_contracts.arrays import save_compressed
@@ -56,11 +56,11 @@ from data_contracts.file_lists import files_of
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.table_writer import TableWriter
 from data_contracts.tables import TableSchema
-from tasks.gpus import GpuNeed, gpu_need, gpus_held
-from tasks.prefect_runs import run_as_task
+from tasks.gpus import GpuNeed, gpu_need, gpus_held, stages_per_gpu
+from tasks.prefect_runs import num_retries, run_as_task
 from tasks.runners import Runner, asked_runner
 from tasks.store import Store
-from tasks.workers import current_workers, stage_workers, together
+from tasks.workers import current_workers, num_workers, stage_workers, together
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -122,9 +122,10 @@ def planning() -> Iterator[list[PlannedStage]]:
     """Inside this block stages and flows only note what they would do; nothing is computed or written.
 
     Raises:
-        DataError: there is no such runner as is asked for, so that nothing could be run either.
+        DataError: a variable of the environment that stages read is wrong, so that nothing could be run either.
     """
-    asked_runner()
+    for read in (asked_runner, num_cores, num_workers, num_retries, time_limit_s, stages_per_gpu):
+        read()
     plan = _Plan()
     token = _plan.set(plan)
     try:

@@ -15,7 +15,7 @@ from data_contracts import tables
 from data_contracts.errors import DataError
 from tasks.prefect_runs import DEFAULT_RETRIES, RETRIES, num_retries
 from tasks.runners import is_passing, reply_with
-from tasks.stage import StageTimeoutError, stage
+from tasks.stage import StageTimeoutError, planning, stage
 from tasks.store import Store
 
 
@@ -53,7 +53,7 @@ def test_the_number_of_attempts_is_an_option(monkeypatch):
     assert num_retries() == 0
     monkeypatch.setenv(RETRIES, "-1")
     with pytest.raises(
-        ValueError, match="CTLEV_STAGE_RETRIES must be a number of further attempts, 0 or more, got '-1'"
+        DataError, match="CTLEV_STAGE_RETRIES must be a number of further attempts, 0 or more, got '-1'"
     ):
         num_retries()
 
@@ -120,6 +120,23 @@ def test_a_stage_that_takes_too_long_is_ended_and_keeps_its_work(home, monkeypat
     assert time.monotonic() - started < 5
     assert (Store().work_folder(key) / "checkpoint").read_text() == "kept"
     assert not Store().temporary_folder(key).exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "CTLEV_RUNNER",
+        "CTLEV_WORKERS",
+        "CTLEV_CORES",
+        "CTLEV_STAGE_RETRIES",
+        "CTLEV_STAGE_TIMEOUT_S",
+        "CTLEV_STAGES_PER_GPU",
+    ],
+)
+def test_a_wrong_variable_is_refused_before_anything_is_planned(home, monkeypatch, name):
+    monkeypatch.setenv(name, "some")
+    with pytest.raises(DataError, match=f"{name} must be .*got 'some'"), planning():
+        raise AssertionError
 
 
 @stage(version=1, schema=tables.TRAINING)
