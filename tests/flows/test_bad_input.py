@@ -52,6 +52,8 @@ def refused(home, *arguments, preset="folder", run=plan_script, **how):
         ),
         (("--set", "generator.options.num_steps=many"), "generators 'controlnet': option 'num_steps'"),
         (("--set", "sampling.num_inference_steps=0"), "option 'num_inference_steps': input should be greater"),
+        (("--set", "name=../X"), "string should match pattern '^[A-Za-z0-9_-][A-Za-z0-9._-]*$', got '../X'"),
+        (("--preset", ""), "unknown preset ''; known: ablations, "),
         (("--set", "novalue"), "--set expects key=value, got 'novalue'"),
         (("--set", "generator.options.base_model=/does/not/exist"), "/does/not/exist"),
     ],

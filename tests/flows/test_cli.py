@@ -99,6 +99,15 @@ def _seconds(text):
         (("run", "smoke", "--dry-run", "--set", "num_synthetik=3"), "did you mean 'num_synthetic'?"),
         (("plan", "smoke", "--set", "dataset.name=foldr"), "did you mean 'folder'?"),
         (("run", "smoke", "--preset", "pose"), "two presets are named"),
+        (
+            ("plan", "demo", "--set", "experiments.pos.seed=3"),
+            "no experiment 'pos'; did you mean 'pose'?; the preset has",
+        ),
+        (
+            ("plan", "smoke", "--home", "~no.such.user/x"),
+            "'~no.such.user/x': the home folder of that user is not known",
+        ),
+        (("prune", "--apply", "--home", ""), "expected a folder or a URL, got ''"),
         (("runn",), "Did you mean 'run'"),
         (("run", "--dry-rum"), "--dry-run"),
     ],
