@@ -250,10 +250,10 @@ def run_command(command: Command, asked: Asked) -> int:
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
             result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
-        described = command.describe(result, options)
+        print(command.describe(result, options), flush=True)  # what is done is said, whatever becomes of the rest
         Store(home).send_files()
         if asked.track:
-            described += "\n" + track(asked.track, result.path, options, home)
+            print(track(asked.track, result.path, options, home))
     except _TOLD as error:
         if isinstance(error, InputsMissing) and asked.dry_run:
             print_costs(error.asked)
@@ -263,7 +263,6 @@ def run_command(command: Command, asked: Asked) -> int:
         how, status = ("ended by SIGTERM", 143) if isinstance(error, _Terminated) else ("interrupted", 130)
         print(f"{how}; finished stages and checkpoints are kept", file=sys.stderr)
         return status
-    print(described)
     stages = {row.key: row.cached for row in rows}
     took = duration_text(time.perf_counter() - started)
     print(f"{len(stages)} stages, {sum(stages.values())} of them cached, in {took}")
