@@ -63,7 +63,12 @@ class Worker:
             CORES: str(cores),
         }
         command = [sys.executable, "-m", "tasks.workers"]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
+        # Ctrl-C is for us to handle, also while Python starts there.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def call(self, function: Callable[..., R], *arguments: Any) -> R:
         """`function(*arguments)`, there; what it raises is raised here, with the other process's traceback as a note.
@@ -309,7 +314,6 @@ def _serve() -> None:
     """Do what comes in on standard input; results go out on what was standard output, prints to standard error."""
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started us decides
     signal.signal(signal.SIGTERM, _give_up)
     sending = threading.Lock()
 

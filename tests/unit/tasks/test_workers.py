@@ -12,7 +12,7 @@ import pytest
 
 from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError
-from tasks.workers import WorkerError, Workers, current_workers, together
+from tasks.workers import Worker, WorkerError, Workers, current_workers, together
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -146,6 +146,19 @@ def test_a_process_that_is_killed_is_an_error_that_says_so():
         pool.close()
     with pytest.raises(WorkerError, match="closed"):
         pool.call(os.getpid)
+
+
+def test_ctrl_c_is_left_to_us_from_the_start_of_a_process(capfd):
+    """Python's own start-up would end with a traceback."""
+    worker = Worker(1)
+    try:
+        for _ in range(40):
+            os.kill(worker._process.pid, signal.SIGINT)
+            time.sleep(0.05)
+        assert worker.call(os.getpid) == worker._process.pid
+    finally:
+        worker.close()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_what_cannot_travel_fails_here_and_the_process_serves_on():
