@@ -49,6 +49,10 @@ WAITING = 2
 """Groups a process that may be ahead of the one that is wanted."""
 
 
+class ProcessesClosedError(WorkerError):
+    """Another call failed, or the run was interrupted; says nothing about what went wrong."""
+
+
 class Worker:
     """One process that is handed calls.
 
@@ -132,9 +136,13 @@ class Workers:
         try:
             with self._lock:
                 if self._closed:
-                    raise WorkerError("the processes that run stages are closed")
+                    raise ProcessesClosedError("the processes that run stages are closed")
                 worker = self._workers[number] = self._workers[number] or Worker(self._cores)
             return worker.call(function, *arguments)
+        except WorkerError as error:
+            if self._closed:  # and the process was asked to end
+                raise ProcessesClosedError("the processes that run stages are closed") from error
+            raise
         finally:
             self._free.put(number)
 
@@ -216,7 +224,9 @@ def together(calls: Sequence[Callable[[], R]]) -> list[R]:
             # arrive: calls within calls hand it on.
             done, _ = wait(futures)
             errors = [error for future in done if (error := future.exception()) is not None]
-            raise min(errors, key=lambda error: isinstance(error, WorkerError))
+            raise min(
+                errors, key=lambda error: (isinstance(error, ProcessesClosedError), isinstance(error, WorkerError))
+            )
         return [future.result() for future in futures]
 
 

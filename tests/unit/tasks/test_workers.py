@@ -71,19 +71,22 @@ def test_the_first_error_ends_the_other_calls_at_once():
     assert time.monotonic() - started < 50
 
 
-def test_the_error_is_told_that_ended_the_others_also_when_it_takes_longer_to_arrive(monkeypatch):
+@pytest.mark.parametrize(
+    ("ends", "said"), [("raise_data_error", "wrong"), ("kill_self", "signal SIGKILL; if memory ran out")]
+)
+def test_the_error_is_told_that_ended_the_others_also_when_it_takes_longer_to_arrive(monkeypatch, ends, said):
     """As in a flow of flows: the branches beside it have lost their processes by then, and say so sooner."""
 
-    monkeypatch.setenv("CTLEV_WORKERS", "3")
+    monkeypatch.setenv("CTLEV_WORKERS", "4")
 
     def branch():
         try:
-            return together([lambda: elsewhere(raise_data_error), lambda: elsewhere(time.sleep, 60)])
+            return together([lambda: elsewhere(globals()[ends]), lambda: elsewhere(time.sleep, 60)])
         finally:
             time.sleep(3)
 
-    with pytest.raises(DataError, match="wrong"):
-        together([branch, lambda: elsewhere(time.sleep, 60)])
+    with pytest.raises((DataError, WorkerError), match=said):
+        together([branch, *[lambda: elsewhere(time.sleep, 60)] * 2])
 
 
 def test_a_process_that_is_closed_clears_away_what_it_was_writing(tmp_path):
