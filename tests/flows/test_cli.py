@@ -92,6 +92,13 @@ def _seconds(text):
     return sum(int(number) * units[unit] for number, unit in re.findall(r"([0-9]+) (s|min|h)\b", text))
 
 
+def test_a_narrow_terminal_shortens_no_name_of_a_preset(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    status, output, _ = invoke("presets")
+    assert status == 0 and all(name in output for name in preset_names())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
