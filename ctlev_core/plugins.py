@@ -169,9 +169,8 @@ def validate_options(model: type[BaseModel], values: Mapping[str, Any], where: s
                 # Options that do not go together: the message names them, and all of them would bury it.
                 lines.append((f"option {option!r}: " if option else "") + problem["msg"].removeprefix("Value error, "))
             else:
-                lines.append(
-                    f"option {option!r}: {problem['msg'].lower()[:300]}, got {_show(problem['input'])}{_hint(problem)}"
-                )
+                told = problem["msg"][:1].lower() + problem["msg"][1:300]  # what it expects may be upper case
+                lines.append(f"option {option!r}: {told}, got {_show(problem['input'])}{_hint(problem)}")
         raise PluginError(f"{where}: " + "; ".join(lines)) from None
 
 

@@ -24,12 +24,13 @@ def home_folder(home: str | os.PathLike[str] | None = None) -> Path:
         home: folder or URL; None = CTLEV_HOME, else `.ctlev` in the working directory.
 
     Raises:
-        DataError: the URL is of another kind than buckets that can be used, or names no bucket.
+        DataError: the URL is of another kind than buckets that can be used, or names no bucket; or nobody is called as
+            a `~NAME` says.
         OSError: the cache of a bucket cannot be made.
     """
     given = os.fspath(home) if home else os.environ.get("CTLEV_HOME") or ".ctlev"
     if "://" not in given:
-        return Path(given).expanduser().absolute()
+        return _absolute(given)
     url = _checked(given)
     name = re.sub(r"[^A-Za-z0-9.-]+", "_", url)[:80]
     folder = _caches() / f"{name}_{hashlib.sha256(url.encode()).hexdigest()[:8]}"
@@ -64,5 +65,12 @@ def _checked(given: str) -> str:
 def _caches() -> Path:
     asked = os.environ.get(CACHE)
     if asked:
-        return Path(asked).expanduser().absolute()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser().absolute() / "ctlev"
+        return _absolute(asked)
+    return _absolute(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "ctlev"
+
+
+def _absolute(given: str) -> Path:
+    try:
+        return Path(given).expanduser().absolute()
+    except RuntimeError as error:
+        raise DataError(f"folder {given!r}: the home folder of that user is not known") from error

@@ -144,7 +144,8 @@ def _run(module: str, default: str, given: tuple[str | None, str | None], **aske
 
     command = importlib.import_module(f"flows.{module}").COMMAND
     overrides = list(asked.pop("overrides") or [])
-    raise typer.Exit(run_command(command, Asked(given[0] or given[1] or default, overrides, **asked)))
+    preset = next((name for name in given if name is not None), default)  # an empty name is none of a preset
+    raise typer.Exit(run_command(command, Asked(preset, overrides, **asked)))
 
 
 @app.command(rich_help_panel=SINGLE_RUNS)
@@ -381,6 +382,8 @@ def prune(
 def _home(home: str | None) -> Path:
     from data_contracts.home_folder import home_folder
 
+    if home == "":  # of a variable that is not set; another home might be pruned
+        raise typer.BadParameter("expected a folder or a URL, got ''", param_hint="--home")
     try:
         return home_folder(home)
     except (ValueError, OSError) as error:

@@ -31,10 +31,22 @@ from flows.plan_table import print_plan_with_costs
 from flows.preset_list import PRESETS, preset_names
 from flows.run_progress import shown
 from flows.settings import ScriptFlow
-from tasks.stage import PlannedStage, in_one_run, planning
+from tasks.runners import WorkerError
+from tasks.stage import PlannedStage, StageTimeoutError, in_one_run, planning
 from tasks.store import Store, home_folder
 
 X = TypeVar("X", bound=Experiment)
+_TOLD = (
+    DataError,
+    PluginError,
+    TrainingError,
+    ValidationError,
+    OSError,
+    local_server.ServerLostError,
+    StageTimeoutError,
+    WorkerError,
+)
+"""Errors whose message says what a person can do; others are faults of ours."""
 
 
 def load_experiment(preset: str, overrides: list[str], model: type[X] = Experiment) -> X:
@@ -205,7 +217,8 @@ def run_command(command: Command, asked: Asked) -> int:
     """Run a flow as a script does; `flows.settings.configure` was called.
 
     Returns:
-        Exit status: 0 done, 2 wrong input or the private server was lost, 130 interrupted, 143 ended by SIGTERM.
+        Exit status: 0 done, 2 wrong input, or something that the run needs was lost (a file, the server, a process, its
+        time), 130 interrupted, 143 ended by SIGTERM.
     """
     started = time.perf_counter()
     with contextlib.suppress(ValueError):  # in a thread of another program
@@ -237,11 +250,11 @@ def run_command(command: Command, asked: Asked) -> int:
         all_cached = all(row.cached for row in rows)
         with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
             result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
-        described = command.describe(result, options)
+        print(command.describe(result, options), flush=True)  # what is done is said, whatever becomes of the rest
         Store(home).send_files()
         if asked.track:
-            described += "\n" + track(asked.track, result.path, options, home)
-    except (DataError, PluginError, TrainingError, ValidationError, OSError, local_server.ServerLostError) as error:
+            print(track(asked.track, result.path, options, home))
+    except _TOLD as error:
         if isinstance(error, InputsMissing) and asked.dry_run:
             print_costs(error.asked)
         print(f"error: {error}", file=sys.stderr)
@@ -250,7 +263,6 @@ def run_command(command: Command, asked: Asked) -> int:
         how, status = ("ended by SIGTERM", 143) if isinstance(error, _Terminated) else ("interrupted", 130)
         print(f"{how}; finished stages and checkpoints are kept", file=sys.stderr)
         return status
-    print(described)
     stages = {row.key: row.cached for row in rows}
     took = duration_text(time.perf_counter() - started)
     print(f"{len(stages)} stages, {sum(stages.values())} of them cached, in {took}")

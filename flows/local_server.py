@@ -58,7 +58,7 @@ _log = Path()
 
 
 class ServerLostError(RuntimeError):
-    """The private server ended before the run did."""
+    """The server ended before the run did, or none answers."""
 
 
 def environment() -> dict[str, str]:
@@ -115,10 +115,11 @@ def connected() -> Iterator[None]:
     """Inside this block Prefect talks to the private server, where one was started; waits until it answers.
 
     Raises:
-        RuntimeError: it ended or did not answer in time; the message names its log.
-        ServerLostError: it ended while the block ran.
+        ServerLostError: it ended, or did not answer in time; the message names its log. Or nobody answers at the
+            address that the user named.
     """
     if _server is None:
+        _check_server_of_user()
         yield
         return
     _wait(_server)
@@ -148,6 +149,22 @@ def connected() -> Iterator[None]:
         ended.set()
 
 
+def _check_server_of_user() -> None:
+    """Raise `ServerLostError` unless the server in PREFECT_API_URL answers us, and speaks our version."""
+    from prefect.client.orchestration import get_client
+
+    try:
+        with get_client(sync_client=True) as client:
+            client.raise_for_api_version_mismatch()
+    except Exception as error:  # of httpx, of Prefect, of what answers in the place of a server
+        told = (str(error) or type(error).__name__).splitlines()[0]
+        cause = f" ({error.__cause__})" if error.__cause__ else ""
+        raise ServerLostError(
+            f"PREFECT_API_URL: {told}{cause}; start that server, or unset the variable: then a "
+            "run has a server of its own"
+        ) from error
+
+
 def _lost(server: subprocess.Popen[bytes]) -> str:
     return (
         f"the local Prefect server ended with code {server.returncode} in the middle of the run; finished stages and "
@@ -175,14 +192,14 @@ def _wait(server: subprocess.Popen[bytes]) -> None:
     deadline = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline:
         if server.poll() is not None:
-            raise RuntimeError(f"the local Prefect server ended with code {server.returncode}; see {_log}")
+            raise ServerLostError(f"the local Prefect server ended with code {server.returncode}; see {_log}")
         try:
             with urllib.request.urlopen(f"{_url}/health", timeout=5) as response:
                 if response.status == 200:
                     return
         except (urllib.error.URLError, OSError):
             time.sleep(0.05)
-    raise RuntimeError(f"the local Prefect server did not answer within {START_TIMEOUT_S:.0f} s; see {_log}")
+    raise ServerLostError(f"the local Prefect server did not answer within {START_TIMEOUT_S:.0f} s; see {_log}")
 
 
 def stop() -> None:

@@ -23,6 +23,8 @@ def print_presets() -> None:
         console.print(f"[bold]{command}[/bold]")
         if console.is_terminal:
             table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+            # A name is to be typed again, so that a narrow terminal folds the others and shortens none of these.
+            table.add_column(min_width=2 + max(len(head.name) for head in heads))
             for head in heads:
                 table.add_row(f"  [cyan]{head.name}[/cyan]", escape(head.summary), escape(head.time))
             console.print(table)

@@ -84,6 +84,7 @@ def _load_study(values: dict[str, Any], overrides: list[str], where: str) -> Stu
     for override in others:
         if name := next((name for name in left_out if override.startswith(f"experiments.{name}.")), None):
             raise PluginError(f"--set {override}: {left_out[name]}")
+        _check_experiment(override, parts)
         apply_override(values, override)
     study = validate_options(Study, values, where)
     done_without = {path for name in left_out for path in wanted[name]}
@@ -113,6 +114,17 @@ def _read_study(
     if not _are_texts(changes):
         raise PluginError(f"{where}: set must be a list of texts key=value, got {shortened(repr(changes), 200)}")
     return parts, paths, groups, changes
+
+
+def _check_experiment(override: str, parts: Collection[str]) -> None:
+    """Raise where an override is of an experiment that a study does not have, which would begin as an empty one."""
+    first, *rest = override.partition("=")[0].split(".")
+    if first == "experiments" and rest and rest[0] not in ("*", *parts):
+        hint = name_hint(rest[0], parts)
+        raise PluginError(
+            f"--set {override}: there is no experiment {rest[0]!r}{hint}; the preset has {', '.join(parts)}, and * for "
+            "all of them"
+        )
 
 
 def _check_changes(changes: list[str], parts: Mapping[str, Any], where: str) -> None:

@@ -75,13 +75,21 @@ def track(kind: str, report: Path, asked: Experiment | Study, home: Path) -> str
         report: folder of the artefact of `report` or `study_report`.
         asked: what was run.
         home: of the store.
+
+    Raises:
+        PluginError: the tracker cannot be told now.
     """
     parts = asked.experiments if isinstance(asked, Study) else {"": asked}
     runs = [
         tracked_run(report / name, part, home, " / ".join(filter(None, (asked.name, name))))
         for name, part in parts.items()
     ]
-    return _TRACKERS[kind](runs, asked.name, home)
+    try:
+        return _TRACKERS[kind](runs, asked.name, home)
+    except Exception as error:  # each package has errors of its own
+        raise PluginError(
+            f"--track {kind}: {type(error).__name__}: {error}; the report is finished, the same command tells it again"
+        ) from error
 
 
 def tracked_run(folder: Path, experiment: Experiment, home: Path, name: str) -> TrackedRun:

@@ -65,12 +65,15 @@ def note_opening(home: Path, test_set: str, experiment: Experiment) -> int | Non
         bucket.create(f"{FOLDER}/{test_set}/{options}.json", f"{json.dumps(line)}\n".encode())
         return len(bucket.list(f"{FOLDER}/{test_set}"))
     file = home / FOLDER / f"{test_set}.jsonl"
-    known = _read_options(file.read_text(encoding="utf-8")) if file.is_file() else set()
+    text = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
+    known = _read_options(text)
     if options not in known:
         file.parent.mkdir(parents=True, exist_ok=True)
-        # One short write at the end of the file: experiments side by side do not mix their lines.
+        # One short write at the end of the file: experiments side by side do not mix their lines. Nor does it continue
+        # a line that was cut short, by a full disk.
+        begin = "" if text.endswith("\n") or not text else "\n"
         with file.open("a", encoding="utf-8") as lines:
-            lines.write(json.dumps(line) + "\n")
+            lines.write(f"{begin}{json.dumps(line)}\n")
     return len(known | {options})
 
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from data_contracts.errors import DataError
 from data_contracts.manifest import ManifestRef, read_manifest
 from tasks.runners import is_passing
 
@@ -69,11 +70,11 @@ def num_retries() -> int:
     """The variable CTLEV_STAGE_RETRIES.
 
     Raises:
-        ValueError: it is no number.
+        DataError: it is no number.
     """
     asked = os.environ.get(RETRIES, "")
     if asked and not asked.isdecimal():
-        raise ValueError(f"{RETRIES} must be a number of further attempts, 0 or more, got {asked!r}")
+        raise DataError(f"{RETRIES} must be a number of further attempts, 0 or more, got {asked!r}")
     return int(asked) if asked else DEFAULT_RETRIES
 
 

@@ -65,7 +65,10 @@ def next_number(folder: Path) -> int:
     path = folder / CLAIM_FILE
     if path.exists():
         try:
-            return int(json.loads(path.read_text())["number"])
+            number = json.loads(path.read_text(encoding="utf-8"))["number"]
+            if type(number) is not int or number < 1:  # else the record of the version fails, after all is made
+                raise TypeError(f"number {number!r}")
+            return number
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(f"{path}: is not a claim; remove it to begin the next version") from error
     numbers = [version.number for version in read_versions(folder)]

@@ -45,7 +45,7 @@ from pydantic import BaseModel
 from ctlev_core import plugins
 from ctlev_core.cpu_precision import computed_in
 from ctlev_core.plugin_contracts import PluginWithFiles
-from ctlev_core.processes import asked_threads, begin_memory_peak, few_threads, memory_peak_mib
+from ctlev_core.processes import asked_threads, begin_memory_peak, few_threads, memory_peak_mib, num_cores
 from ctlev_core.progress import Progress, current_report, reporting_to
 from ctlev_core.provenance.raw_file_digests import digest_raw_files
 from data_contracts.arrays import save_compressed
@@ -56,11 +56,11 @@ from data_contracts.file_lists import files_of
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.table_writer import TableWriter
 from data_contracts.tables import TableSchema
-from tasks.gpus import GpuNeed, gpu_need, gpus_held
-from tasks.prefect_runs import run_as_task
+from tasks.gpus import GpuNeed, gpu_need, gpus_held, stages_per_gpu
+from tasks.prefect_runs import num_retries, run_as_task
 from tasks.runners import Runner, asked_runner
 from tasks.store import Store
-from tasks.workers import current_workers, stage_workers, together
+from tasks.workers import current_workers, num_workers, stage_workers, together
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -122,9 +122,10 @@ def planning() -> Iterator[list[PlannedStage]]:
     """Inside this block stages and flows only note what they would do; nothing is computed or written.
 
     Raises:
-        DataError: there is no such runner as is asked for, so that nothing could be run either.
+        DataError: a variable of the environment that stages read is wrong, so that nothing could be run either.
     """
-    asked_runner()
+    for read in (asked_runner, num_cores, num_workers, num_retries, time_limit_s, stages_per_gpu):
+        read()
     plan = _Plan()
     token = _plan.set(plan)
     try:
@@ -413,11 +414,13 @@ class Stage:
 
 def _prepare_work(work: Path, upstream: dict[str, str]) -> None:
     """Make the folder of resumable state; what a killed run left there of inputs of other content is deleted."""
-    note, content = work / UPSTREAM_FILE, json.dumps(upstream, sort_keys=True)
-    if note.exists() and note.read_text(encoding="utf-8") != content:
+    note, content = work / UPSTREAM_FILE, json.dumps(upstream, sort_keys=True).encode()
+    if note.exists():
+        if note.read_bytes() == content:
+            return  # written again on a full disk it would be lost, and with it what it vouches for
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
-    note.write_text(content, encoding="utf-8")
+    note.write_bytes(content)
 
 
 class StageTimeoutError(RuntimeError):
@@ -430,27 +433,48 @@ def _time_limit(name: str) -> Iterator[None]:
 
     Stages of branches run in processes of their own, and those of scripts in the script's main thread.
     """
-    asked = os.environ.get(TIMEOUT, "")
-    if not asked or threading.current_thread() is not threading.main_thread():
+    seconds = time_limit_s()
+    if seconds is None or threading.current_thread() is not threading.main_thread():
         yield
         return
+    told = f"{name} took longer than {seconds:g} s ({TIMEOUT}); its checkpoints are kept"
+    expired: list[float] = []
+
+    def expire(number: int, frame: object) -> None:
+        expired.append(seconds)
+        raise StageTimeoutError(told)
+
+    before = signal.signal(signal.SIGALRM, expire)
+    signal.setitimer(signal.ITIMER_REAL, min(seconds, threading.TIMEOUT_MAX))
+    try:
+        yield
+    except Exception as error:
+        if not expired or isinstance(error, StageTimeoutError):
+            raise
+        raise StageTimeoutError(told) from error  # what was interrupted may say that a file is damaged
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    if expired:  # and may have taken it for an error that it can do without
+        raise StageTimeoutError(told)
+
+
+def time_limit_s() -> float | None:
+    """The variable CTLEV_STAGE_TIMEOUT_S; None where it is not set.
+
+    Raises:
+        DataError: it is no number of seconds above 0.
+    """
+    asked = os.environ.get(TIMEOUT, "")
+    if not asked:
+        return None
     try:
         seconds = float(asked)
     except ValueError:
         seconds = 0.0
     if not 0 < seconds < math.inf:
         raise DataError(f"{TIMEOUT} must be a number of seconds above 0, got {asked!r}")
-
-    def expire(number: int, frame: object) -> None:
-        raise StageTimeoutError(f"{name} took longer than {seconds:g} s ({TIMEOUT}); its checkpoints are kept")
-
-    before = signal.signal(signal.SIGALRM, expire)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+    return seconds
 
 
 def numbered(label: str, number: int) -> str:

@@ -60,6 +60,8 @@ MAX_FETCHES = 8
 """Artefacts that are fetched at once."""
 MAX_SYNCS = 16
 """Files that are synced at once. Four hundred of 40 kB take 0.12 s on ext4, one after the other 1.8 s."""
+_OURS = re.compile(r"[0-9a-f]{32}(\.fetched)?")
+"""Names of the folders that are made here, of which alone any is removed: a home named by mistake has a `tmp`, too."""
 
 
 def home_folder() -> Path:
@@ -492,7 +494,7 @@ class Store:
         oldest_s = (time.time() if self.bucket is None else self.bucket.clock()) - keep_days * 86_400
         stored = self.artefacts()
         referred = {item.folder: _keys_in(item.folder / RUN_FILE) for item in stored}
-        half_made = [_stored("tmp", folder.name, folder) for folder in _folders(self.home / "tmp")]
+        half_made = [_stored("tmp", folder.name, folder) for folder in _own_folders(self.home / "tmp")]
         if self.bucket is not None:
             stored, begun = self._with_those_of(self.bucket, stored, referred)
             half_made += begun
@@ -504,7 +506,7 @@ class Store:
             new = [item for item in stored if item.folder.name in named and item.folder not in kept]
             kept.update(item.folder for item in new)
             waiting += new
-        work = [_stored("work", folder.name, folder) for folder in _folders(self.home / "work")]
+        work = [_stored("work", folder.name, folder) for folder in _own_folders(self.home / "work")]
         kept.update(item.folder for item in work if item.last_used_s >= oldest_s)
         found = [*stored, *work, *half_made]
         return [item for item in found if item.folder not in kept], [item for item in found if item.folder in kept]
@@ -560,7 +562,7 @@ class Store:
                 if self.bucket is not None and "/" in item.name:
                     self._cache.unmark(item.name)
                     self.bucket.remove(*item.name.split("/"))
-        for folder in _folders(pruned):
+        for folder in _own_folders(pruned):
             shutil.rmtree(folder)
         return leaving
 
@@ -597,9 +599,14 @@ def _folders(folder: Path) -> list[Path]:
         return sorted(Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False))
 
 
+def _own_folders(folder: Path) -> list[Path]:
+    """Those of them that are named as the store names folders."""
+    return [found for found in _folders(folder) if _OURS.fullmatch(found.name)]
+
+
 def _named_folders(folder: Path) -> list[Path]:
     """The folders in the folders in a folder: of artefacts, by stage and key."""
-    return [found for stage in _folders(folder) for found in _folders(stage)]
+    return [found for stage in _folders(folder) for found in _own_folders(stage)]
 
 
 def _stored(kind: str, name: str, folder: Path) -> Stored:

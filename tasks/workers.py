@@ -49,6 +49,10 @@ WAITING = 2
 """Groups a process that may be ahead of the one that is wanted."""
 
 
+class ProcessesClosedError(WorkerError):
+    """Another call failed, or the run was interrupted; says nothing about what went wrong."""
+
+
 class Worker:
     """One process that is handed calls.
 
@@ -63,7 +67,12 @@ class Worker:
             CORES: str(cores),
         }
         command = [sys.executable, "-m", "tasks.workers"]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
+        # Ctrl-C is for us to handle, also while Python starts there.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def call(self, function: Callable[..., R], *arguments: Any) -> R:
         """`function(*arguments)`, there; what it raises is raised here, with the other process's traceback as a note.
@@ -127,9 +136,13 @@ class Workers:
         try:
             with self._lock:
                 if self._closed:
-                    raise WorkerError("the processes that run stages are closed")
+                    raise ProcessesClosedError("the processes that run stages are closed")
                 worker = self._workers[number] = self._workers[number] or Worker(self._cores)
             return worker.call(function, *arguments)
+        except WorkerError as error:
+            if self._closed:  # and the process was asked to end
+                raise ProcessesClosedError("the processes that run stages are closed") from error
+            raise
         finally:
             self._free.put(number)
 
@@ -211,7 +224,9 @@ def together(calls: Sequence[Callable[[], R]]) -> list[R]:
             # arrive: calls within calls hand it on.
             done, _ = wait(futures)
             errors = [error for future in done if (error := future.exception()) is not None]
-            raise min(errors, key=lambda error: isinstance(error, WorkerError))
+            raise min(
+                errors, key=lambda error: (isinstance(error, ProcessesClosedError), isinstance(error, WorkerError))
+            )
         return [future.result() for future in futures]
 
 
@@ -309,7 +324,6 @@ def _serve() -> None:
     """Do what comes in on standard input; results go out on what was standard output, prints to standard error."""
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started us decides
     signal.signal(signal.SIGTERM, _give_up)
     sending = threading.Lock()
 

@@ -8,6 +8,11 @@ import pytest
 from flow_scripts import digests, plan_script, run_script, run_script_here
 
 from data_contracts.events import Events
+from flows.command_line import Asked, Command, run_command
+from flows.local_server import ServerLostError
+from flows.settings import flow
+from tasks.runners import WorkerError
+from tasks.stage import StageTimeoutError
 
 
 def refused(home, *arguments, preset="folder", run=plan_script, **how):
@@ -51,6 +56,8 @@ def refused(home, *arguments, preset="folder", run=plan_script, **how):
         ),
         (("--set", "generator.options.num_steps=many"), "generators 'controlnet': option 'num_steps'"),
         (("--set", "sampling.num_inference_steps=0"), "option 'num_inference_steps': input should be greater"),
+        (("--set", "name=../X"), "string should match pattern '^[A-Za-z0-9_-][A-Za-z0-9._-]*$', got '../X'"),
+        (("--preset", ""), "unknown preset ''; known: ablations, "),
         (("--set", "novalue"), "--set expects key=value, got 'novalue'"),
         (("--set", "generator.options.base_model=/does/not/exist"), "/does/not/exist"),
     ],
@@ -182,3 +189,16 @@ def test_a_dry_run_says_what_an_export_would_write(tmp_path):
     assert f"would write to {folder}: at most 8 images, without those" in plan("synthesize", f"export_folder={folder}")
     told = plan("export_events", "export.one_file=true")
     assert f"would write to {events}: at most 8 event streams, one file, as parquet" in told
+
+
+@pytest.mark.parametrize(
+    "lost", [WorkerError("a process ended"), StageTimeoutError("too long"), ServerLostError("gone")]
+)
+def test_what_a_run_has_lost_is_told_in_one_line(home, capsys, lost):
+    def fail(_):
+        raise lost
+
+    home.mkdir(exist_ok=True)
+    command = Command(flow(name="failing")(fail), lambda *_: "", load=lambda *_: None)
+    assert run_command(command, Asked("", [], dry_run=True)) == 2
+    assert capsys.readouterr().err == f"error: {lost}\n"

@@ -92,6 +92,13 @@ def _seconds(text):
     return sum(int(number) * units[unit] for number, unit in re.findall(r"([0-9]+) (s|min|h)\b", text))
 
 
+def test_a_narrow_terminal_shortens_no_name_of_a_preset(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    status, output, _ = invoke("presets")
+    assert status == 0 and all(name in output for name in preset_names())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -99,6 +106,15 @@ def _seconds(text):
         (("run", "smoke", "--dry-run", "--set", "num_synthetik=3"), "did you mean 'num_synthetic'?"),
         (("plan", "smoke", "--set", "dataset.name=foldr"), "did you mean 'folder'?"),
         (("run", "smoke", "--preset", "pose"), "two presets are named"),
+        (
+            ("plan", "demo", "--set", "experiments.pos.seed=3"),
+            "no experiment 'pos'; did you mean 'pose'?; the preset has",
+        ),
+        (
+            ("plan", "smoke", "--home", "~no.such.user/x"),
+            "'~no.such.user/x': the home folder of that user is not known",
+        ),
+        (("prune", "--apply", "--home", ""), "expected a folder or a URL, got ''"),
         (("runn",), "Did you mean 'run'"),
         (("run", "--dry-rum"), "--dry-run"),
     ],

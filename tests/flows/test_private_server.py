@@ -194,3 +194,58 @@ def test_a_run_that_does_not_mind_an_interrupt_is_ended():
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(STUBBORN)], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and done.stdout == "went on\n"
     assert "error: the local Prefect server ended with code 0" in done.stderr and "LOG" in done.stderr
+
+
+AT_ONCE = """
+    import sys
+    from pathlib import Path
+    from flows import local_server
+    local_server.configure(Path(sys.argv[1]), verbose=False)
+    local_server.start(Path(sys.argv[1]))
+    with local_server.connected():
+        print("answers")
+    sys.stdout.flush()
+    local_server.stop()
+"""
+
+
+@pytest.mark.slow
+def test_servers_that_start_at_once_in_a_new_home_all_answer(tmp_path):
+    """Else both make the tables of the one database, and one ends with `duplicate column name`."""
+    command = [sys.executable, "-c", textwrap.dedent(AT_ONCE), str(tmp_path)]
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PREFECT_")}
+    started = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    assert [process.communicate(timeout=300)[0] for process in started] == ["answers\n"] * 2
+
+
+UNREACHABLE = """
+    import os
+    from flows import local_server
+    try:
+        with local_server.connected():
+            print("went on")
+    except local_server.ServerLostError as error:
+        print(error)
+"""
+
+
+def test_a_server_of_the_user_that_does_not_answer_is_told_of(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        url = f"http://127.0.0.1:{closed.getsockname()[1]}/api"
+    environment = {**os.environ, "PREFECT_API_URL": url, "PREFECT_HOME": str(tmp_path)}
+    command = [sys.executable, "-c", textwrap.dedent(UNREACHABLE)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.stdout.startswith(f"PREFECT_API_URL: Failed to reach API at {url}/ (") and done.returncode == 0
+    assert "start that server, or unset the variable" in done.stdout
+
+
+def test_a_private_server_that_cannot_start_is_told_of_with_its_log(tmp_path, monkeypatch):
+    from flows import local_server
+
+    ended = subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"])
+    ended.wait()
+    monkeypatch.setattr(local_server, "_server", ended)
+    monkeypatch.setattr(local_server, "_log", tmp_path / "log")
+    expected = pytest.raises(local_server.ServerLostError, match=f"ended with code 3; see {tmp_path}/log")
+    with expected, local_server.connected():
+        raise AssertionError

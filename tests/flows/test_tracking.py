@@ -1,5 +1,6 @@
 """A finished run in the trackers that people use; each is asked by its own API what it was told."""
 
+import contextlib
 import os
 import shutil
 import socket
@@ -12,8 +13,11 @@ import numpy as np
 import pytest
 from flow_scripts import run_script
 
+from data_contracts.manifest import ManifestRef
 from data_contracts.run_record import read_run_record
+from flows import command_line, local_server, tracking
 from flows.command_line import load_experiment
+from flows.settings import flow
 from flows.tracking import KINDS, track, tracked_run
 
 
@@ -51,6 +55,26 @@ def test_tensorboard(finished, smoke_home):
         content = content[16 + length :]
     expected = tracked_run(folder, experiment, smoke_home, "smoke").scores
     assert {score: found[score] for score in expected} == pytest.approx(dict(expected), rel=1e-6) and images == 1
+
+
+def test_a_tracker_that_fails_hides_no_verdict(tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise RuntimeError("no route to the tracker")
+
+    monkeypatch.setitem(tracking._TRACKERS, "tensorboard", fail)
+    monkeypatch.setattr(tracking, "tracked_run", lambda *_: None)
+    monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
+    monkeypatch.setattr(local_server, "start", lambda home: None)
+    monkeypatch.setattr(local_server, "connected", contextlib.nullcontext)
+    monkeypatch.setattr(command_line, "with_plan", lambda flow, *_: flow.fn)
+    reports = flow(name="reports")(lambda _: ManifestRef(key="0", path=tmp_path))
+    command = command_line.Command(reports, lambda *_: "verdict: helped", load=load_experiment)
+    assert command_line.run_command(command, command_line.Asked("smoke", [], track="tensorboard")) == 2
+    output, errors = capsys.readouterr()
+    assert output == "verdict: helped\n"
+    assert errors.startswith(
+        "error: --track tensorboard: RuntimeError: no route to the tracker; the report is finished"
+    )
 
 
 @pytest.mark.slow

@@ -39,11 +39,13 @@ def test_a_plan_opens_nothing(home, experiments):
     assert not (home / FOLDER).exists()
 
 
-def test_a_line_cut_short_loses_nothing_else(home, experiments):
+@pytest.mark.parametrize("end", [b"", b"\n"])
+def test_a_line_cut_short_loses_nothing_else(home, experiments, end):
     note_opening(home, "a", experiments())
     file = home / FOLDER / "a.jsonl"
-    file.write_text(file.read_text() + '{"options": "12\n')
+    file.write_bytes(file.read_bytes() + b'{"options": "\xff' + end)
     assert note_opening(home, "a", experiments("seed=5")) == 2
+    assert note_opening(home, "a", experiments("seed=6")) == 3
 
 
 def test_experiments_side_by_side_are_all_counted(home, experiments):

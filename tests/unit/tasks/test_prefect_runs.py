@@ -15,7 +15,7 @@ from data_contracts import tables
 from data_contracts.errors import DataError
 from tasks.prefect_runs import DEFAULT_RETRIES, RETRIES, num_retries
 from tasks.runners import is_passing, reply_with
-from tasks.stage import StageTimeoutError, stage
+from tasks.stage import StageTimeoutError, planning, stage
 from tasks.store import Store
 
 
@@ -53,7 +53,7 @@ def test_the_number_of_attempts_is_an_option(monkeypatch):
     assert num_retries() == 0
     monkeypatch.setenv(RETRIES, "-1")
     with pytest.raises(
-        ValueError, match="CTLEV_STAGE_RETRIES must be a number of further attempts, 0 or more, got '-1'"
+        DataError, match="CTLEV_STAGE_RETRIES must be a number of further attempts, 0 or more, got '-1'"
     ):
         num_retries()
 
@@ -120,6 +120,47 @@ def test_a_stage_that_takes_too_long_is_ended_and_keeps_its_work(home, monkeypat
     assert time.monotonic() - started < 5
     assert (Store().work_folder(key) / "checkpoint").read_text() == "kept"
     assert not Store().temporary_folder(key).exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "CTLEV_RUNNER",
+        "CTLEV_WORKERS",
+        "CTLEV_CORES",
+        "CTLEV_STAGE_RETRIES",
+        "CTLEV_STAGE_TIMEOUT_S",
+        "CTLEV_STAGES_PER_GPU",
+    ],
+)
+def test_a_wrong_variable_is_refused_before_anything_is_planned(home, monkeypatch, name):
+    monkeypatch.setenv(name, "some")
+    with pytest.raises(DataError, match=f"{name} must be .*got 'some'"), planning():
+        raise AssertionError
+
+
+@stage(version=1, schema=tables.TRAINING)
+def hides(out, *, how):
+    """Takes the interruption for something else."""
+    try:
+        time.sleep(20)
+    except Exception as error:
+        if how == "renamed":
+            raise DataError("the file is damaged") from error
+    return pa.table({"curve": ["training"], "step": pa.array([0], pa.int64()), "loss": [0.0]})
+
+
+@pytest.mark.parametrize("how", ["renamed", "passed over"])
+def test_work_that_is_cut_short_is_never_taken_for_finished_or_for_damage(home, monkeypatch, how):
+    monkeypatch.setenv("CTLEV_STAGE_TIMEOUT_S", "0.2")
+    arguments = {"how": how}
+    key = hides.key(arguments, Store())
+    with pytest.raises(StageTimeoutError, match=r"hides took longer than 0.2 s"):
+        hides.run(key, arguments)
+    assert not Store().folder("hides", key).exists()
+    monkeypatch.setenv("CTLEV_STAGE_TIMEOUT_S", "1e300")
+    quick = {"seconds": 0.0}
+    assert slow.run(slow.key(quick, Store()), quick)[0].rows == 1
 
 
 def test_after_a_stage_its_alarm_is_off(home, monkeypatch):

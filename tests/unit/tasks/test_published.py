@@ -170,3 +170,10 @@ def test_kept_are_the_newest_that_passed_and_the_latest(tmp_path, folder, count,
 def test_no_name_leads_out_of_the_home(tmp_path, name):
     with pytest.raises(DataError, match="must be that of a folder"):
         published_folder(tmp_path, name)
+
+
+@pytest.mark.parametrize("number", ["-3", "0", "true", "2.7", '"4"', "1e400"])
+def test_a_claim_of_a_number_that_no_version_can_have_is_refused_before_it_is_made(tmp_path, number):
+    (tmp_path / "claimed.json").write_text(f'{{"number": {number}}}')
+    with pytest.raises(DataError, match=r"claimed\.json: is not a claim; remove it"):
+        next_number(tmp_path)

@@ -313,6 +313,19 @@ def test_links_are_removed_and_never_followed(tmp_path):
     assert not folder.exists() and tree(outside) == before
 
 
+def test_a_folder_that_is_no_home_keeps_what_is_in_it(tmp_path, monkeypatch):
+    """Its own `tmp`, `work`, `pruned` and `artefacts` are somebody's."""
+    for name in ("tmp/thesis", "work/results", "pruned/trees", "artefacts/model/v1"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "file").write_text("precious")
+        for path in (tmp_path / name / "file", tmp_path / name):
+            os.utime(path, (0, 0))
+    before = tree(tmp_path)
+    assert command("prune", monkeypatch, tmp_path, "--keep-days", "0", "--apply") == 0
+    assert command("verify", monkeypatch, tmp_path) == 0
+    assert {name: content for name, content in tree(tmp_path).items() if name in before} == before
+
+
 def test_nothing_is_moved_out_through_a_link(tmp_path):
     (tmp_path / "outside").mkdir()
     store = Store(tmp_path / "home")

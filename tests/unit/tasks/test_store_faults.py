@@ -42,6 +42,29 @@ def plan():
     return [row.cached for row in rows]
 
 
+FULL_DISK = """
+    import resource, signal, sys
+    from pathlib import Path
+    from tasks.stage import _prepare_work
+    work, upstream = Path(sys.argv[1]), {"a" * 32: "b" * 64}
+    _prepare_work(work, upstream)
+    (work / "checkpoint").write_text("half way")
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    none, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for room in (0, none):  # files can be emptied, and nothing written
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, most))
+        try:
+            _prepare_work(work, upstream)
+        except OSError:
+            pass
+"""
+
+
+def test_a_run_on_a_full_disk_keeps_the_checkpoints_of_the_one_before(tmp_path):
+    subprocess.run([sys.executable, "-c", textwrap.dedent(FULL_DISK), str(tmp_path / "work")], check=True)
+    assert (tmp_path / "work" / "checkpoint").read_text() == "half way"
+
+
 def test_without_descriptors_nothing_is_set_aside(home):
     ref, _ = run(first, windows=Windows())
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

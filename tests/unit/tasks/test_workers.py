@@ -12,7 +12,7 @@ import pytest
 
 from ctlev_core.processes import num_cores
 from data_contracts.errors import DataError
-from tasks.workers import WorkerError, Workers, current_workers, together
+from tasks.workers import Worker, WorkerError, Workers, current_workers, together
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -71,19 +71,22 @@ def test_the_first_error_ends_the_other_calls_at_once():
     assert time.monotonic() - started < 50
 
 
-def test_the_error_is_told_that_ended_the_others_also_when_it_takes_longer_to_arrive(monkeypatch):
+@pytest.mark.parametrize(
+    ("ends", "said"), [("raise_data_error", "wrong"), ("kill_self", "signal SIGKILL; if memory ran out")]
+)
+def test_the_error_is_told_that_ended_the_others_also_when_it_takes_longer_to_arrive(monkeypatch, ends, said):
     """As in a flow of flows: the branches beside it have lost their processes by then, and say so sooner."""
 
-    monkeypatch.setenv("CTLEV_WORKERS", "3")
+    monkeypatch.setenv("CTLEV_WORKERS", "4")
 
     def branch():
         try:
-            return together([lambda: elsewhere(raise_data_error), lambda: elsewhere(time.sleep, 60)])
+            return together([lambda: elsewhere(globals()[ends]), lambda: elsewhere(time.sleep, 60)])
         finally:
             time.sleep(3)
 
-    with pytest.raises(DataError, match="wrong"):
-        together([branch, lambda: elsewhere(time.sleep, 60)])
+    with pytest.raises((DataError, WorkerError), match=said):
+        together([branch, *[lambda: elsewhere(time.sleep, 60)] * 2])
 
 
 def test_a_process_that_is_closed_clears_away_what_it_was_writing(tmp_path):
@@ -146,6 +149,19 @@ def test_a_process_that_is_killed_is_an_error_that_says_so():
         pool.close()
     with pytest.raises(WorkerError, match="closed"):
         pool.call(os.getpid)
+
+
+def test_ctrl_c_is_left_to_us_from_the_start_of_a_process(capfd):
+    """Python's own start-up would end with a traceback."""
+    worker = Worker(1)
+    try:
+        for _ in range(40):
+            os.kill(worker._process.pid, signal.SIGINT)
+            time.sleep(0.05)
+        assert worker.call(os.getpid) == worker._process.pid
+    finally:
+        worker.close()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_what_cannot_travel_fails_here_and_the_process_serves_on():
