@@ -1,7 +1,7 @@
 """Every format that is written, and Prophesee's ECF that is read: bytes an event, speed, and whether nothing is lost.
 
-The recording of a person beside the project, taken by a DVXplorer, is repeated to a million events; without it a made-up
-one of 346 x 260 px serves. Files lie in the page cache; medians of rounds, one process, all checks included.
+The recording of a person beside the project, taken by a DVXplorer, is repeated to a million events; without it
+a made-up one of 346 x 260 px serves. Files lie in the page cache; medians of rounds, one process, all checks included.
 
     python benchmarks/formats.py --events 1000000 --rounds 5
 """
