@@ -123,6 +123,13 @@ def test_captions_name_what_is_seen_and_the_tokenizer_knows_their_words():
     assert tokenizer.eos_token_id == len(tokenizer) - 1, "CLIP finds the end token as the largest id"
 
 
+def test_shares_of_styles_may_be_rounded():
+    mixture = DataMixture(styles={"photo": 0.3333333, "lines": 0.3333333, "grey": 0.3333333})
+    scene = picture_styles.Scene(np.zeros((16, 16, 3), np.uint8), None, "cat", "red cat")
+    image, _ = picture_styles.apply_style(scene, np.random.default_rng(0), mixture)
+    assert image.shape == (16, 16, 3)
+
+
 def test_batches_put_steered_rows_first_and_follow_the_number_alone():
     base_model = new_base_model(TINY)
     stream = ImageStream(base_model, TINY)
