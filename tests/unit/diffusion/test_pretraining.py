@@ -195,6 +195,9 @@ def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monk
             "chunk_scenes x chunk_passes must be a batch_size of 8 at least, got 6",
         ),
         ({"training": {"sample_every": 1}}, "sample_every draws samples of a fine-tuning"),
+        ({"widths": (10, 20)}, r"widths must be one or more positive multiples of 16, got \(10, 20\)"),
+        ({"widths": ()}, r"widths must be one or more positive multiples of 16, got \(\)"),
+        ({"widths": (-32, 64)}, r"widths must be one or more positive multiples of 16, got \(-32, 64\)"),
     ],
 )
 def test_what_does_not_go_together_is_refused(changed, message):
