@@ -6,7 +6,8 @@ FOLDER/metadata.parquet                      the same for `imagefolder` of `data
 FOLDER/provenance.json                       the record of every stage behind it (ctlev_core.provenance.records)
 FOLDER/images/000/synthetic_000000.png       RGB, 8 bit; 1,000 rows a sub-folder
 FOLDER/conditions/000/synthetic_000000.png   the condition image, for generators that are asked by one
-FOLDER/events/000/synthetic_000000.parquet   the image as an event stream, where that was asked for
+FOLDER/events/000/synthetic_000000.parquet   the image as an event stream, where that was asked for; a stretch of
+                                             images has the name of its first
 
 A folder that is being written has another name, and no labels.
 """

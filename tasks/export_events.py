@@ -40,7 +40,7 @@ _COUNT_STREAM, _TIME_STREAM = 1, 2
 _ENCODING = "event_histogram"
 
 
-@stage(version=2, schema=tables.EVENT_STREAMS)
+@stage(version=3, schema=tables.EVENT_STREAMS)
 def export_events(
     out: Output,
     generated: Manifest,

@@ -210,14 +210,19 @@ def _rows_of(manifest: Manifest, sample_ids: pa.ChunkedArray) -> np.ndarray:
 
 
 def _write_streams(streams: Manifest, sources: Sequence[str], names: list[str], partial: Path) -> list[str]:
-    """Copy event files; where all streams lie in one file, that. Returns where each row's is."""
-    if len(sources) == 1 or len(set(sources)) == len(sources):
-        _write_shards(partial, names, lambda n, path: shutil.copyfile(streams.path(sources[n]), path))
-        return names
-    (source,) = set(sources)
-    (partial / EVENTS_FOLDER).mkdir(exist_ok=True)
-    shutil.copyfile(streams.path(source), partial / EVENTS_FOLDER / Path(source).name)
-    return [f"{EVENTS_FOLDER}/{Path(source).name}"] * len(sources)
+    """Copy event files, those of several rows under the name of the first; where all streams lie in one file, that.
+    Returns where each row's is.
+    """
+    distinct = list(dict.fromkeys(sources))
+    if len(distinct) == 1 and len(sources) > 1:
+        (partial / EVENTS_FOLDER).mkdir(exist_ok=True)
+        shutil.copyfile(streams.path(distinct[0]), partial / EVENTS_FOLDER / Path(distinct[0]).name)
+        return [f"{EVENTS_FOLDER}/{Path(distinct[0]).name}"] * len(sources)
+    name_of: dict[str, str] = {}
+    for source, name in zip(sources, names, strict=True):
+        name_of.setdefault(source, name)
+    _write_shards(partial, list(name_of.values()), lambda n, path: shutil.copyfile(streams.path(distinct[n]), path))
+    return [name_of[source] for source in sources]
 
 
 def _write_shards(partial: Path, names: Sequence[str], write: WriteFile) -> None:

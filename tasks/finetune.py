@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from ctlev_core import plugins
-from ctlev_core.pictures.labelled_pictures import picture_files
+from ctlev_core.pictures.labelled_pictures import READING, picture_files
 from data_contracts import tables
 from data_contracts.config import GeneratorChoice
 from data_contracts.file_lists import files_of
@@ -22,7 +22,7 @@ def _base_model_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     # A base model is an artefact, and its key is part of ours.
     places = [] if arguments["base_model"] is not None else plugin.module.base_model_folders(plugin.options)
     shown = [] if not getattr(plugin.options, "rehearsal_share", 0) else picture_files(plugin.options.rehearsal)
-    return files_of(places) + [(f"rehearsal/{name}", path) for name, path in files_of(shown)]
+    return files_of(places) + [(f"rehearsal/{READING}/{name}", path) for name, path in files_of(shown)]
 
 
 @stage(version=1, schema=tables.TRAINING, raw_files=_base_model_files, aside=("latents",))

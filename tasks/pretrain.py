@@ -18,11 +18,11 @@ if TYPE_CHECKING:  # torch, which flows that pre-train nothing need not wait for
 
 def _raw_files(arguments: dict[str, Any]) -> list[tuple[str, Path]]:
     from ctlev_core.diffusion.pretraining.pretraining import start_folder
-    from ctlev_core.pictures.labelled_pictures import picture_files
+    from ctlev_core.pictures.labelled_pictures import READING, picture_files
 
     options: PretrainingOptions = arguments["options"]
     start = start_folder(options)
-    pictures = [(f"pictures/{name}", path) for name, path in files_of(picture_files(options.pictures))]
+    pictures = [(f"pictures/{READING}/{name}", path) for name, path in files_of(picture_files(options.pictures))]
     return ([] if start is None else files_of([start])) + pictures
 
 

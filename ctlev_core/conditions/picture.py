@@ -18,7 +18,7 @@ from ctlev_core.pictures.labelled_pictures import LabelledPictures, PictureSourc
 from data_contracts.errors import DataError
 from data_contracts.labels import Conditions, Labels
 
-VERSION = 1
+VERSION = 2
 NEEDS = ""
 WHERE = "condition 'picture'"
 PLACEHOLDER = "{class_name}"

@@ -17,6 +17,7 @@ from torch.utils.data import Dataset
 from ctlev_core.export.event_dataset import EventDataset, Sample
 from ctlev_core.supervised.frame_sequences import frame_interval_us, name_stretches, stretch_lengths
 from data_contracts.errors import DataError
+from data_contracts.image_folder import EVENT_COLUMNS
 
 
 class EventSequences(Dataset[Sample]):
@@ -52,9 +53,12 @@ class EventSequences(Dataset[Sample]):
             raise ValueError(f"length and step must be 1 or more, got {length} and {step}")
         if dataset.transform is not None:
             raise ValueError("give the transform to EventSequences: it takes whole samples, of single images none")
-        rows = np.arange(len(dataset))
-        interval_us = frame_interval_us(dataset.table, rows, dataset.place)
-        lengths = np.array(stretch_lengths(name_stretches(dataset.table, rows, interval_us)))
+        rows, table = np.arange(len(dataset)), dataset.table
+        if EVENT_COLUMNS["file"] in table.column_names:
+            # Of an exported folder, whose times are places in files of events and not windows of a recording.
+            table = table.drop_columns([EVENT_COLUMNS["t_start_us"], EVENT_COLUMNS["t_end_us"]])
+        interval_us = frame_interval_us(table, rows, dataset.place)
+        lengths = np.array(stretch_lengths(name_stretches(table, rows, interval_us)))
         starts = [
             np.arange(end - size, end - length + 1, step) for end, size in zip(np.cumsum(lengths), lengths, strict=True)
         ]

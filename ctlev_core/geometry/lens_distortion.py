@@ -62,7 +62,8 @@ def undistort(points: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
             found[rows], reached = _newton_step(found[rows], targets[rows], error[rows], coefficients, radius)
             moving[rows] = (reached < error[rows]) & (reached > ROUNDING * scale[rows])
             error[rows] = reached
-        solved = error <= TOLERANCE * scale
+        # Where a point is not finite, so are both sides.
+        solved = np.isfinite(scale) & (error <= TOLERANCE * scale)
     return np.where(solved[:, None], found, np.nan).reshape(np.shape(points))
 
 

@@ -52,8 +52,8 @@ def farthest_points(candidates: np.ndarray, covered: np.ndarray, count: int) -> 
         covered: [M, D] points that need no cover; with none the first is the one farthest from the mean.
         count: of candidates, at most N.
     Returns:
-        Numbers [count] int64, and the distance [count] float64 of each when it was chosen, which never grows. Of
-        equally far ones the first.
+        Numbers [count] int64, and the distance [count] float64 of each when it was chosen; that never grows, but after
+        the first where nothing is covered, whose is that from the mean. Of equally far ones the first.
     """
     if len(covered):
         distances = np.full(len(candidates), np.inf)

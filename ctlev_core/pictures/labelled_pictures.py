@@ -7,7 +7,8 @@ Three layouts are read:
     an .npz file                  `images` [N, H, W] or [N, H, W, 3] uint8 and `labels` [N], numbers or names
     MNIST's own files             ROOT/train-images-idx3-ubyte and ROOT/train-labels-idx1-ubyte, plain or .gz
 
-Grey pictures get three equal channels, transparent ones a black background, and 16-bit ones their upper 8 bits.
+Grey pictures get three equal channels, transparent ones a black background, and 16-bit ones their upper 8 bits. JPEGs
+are turned upright, as their EXIF data says: cameras store what they see and how they were held.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ IDX_IMAGES, IDX_LABELS = "train-images-idx3-ubyte", "train-labels-idx1-ubyte"
 MAX_BYTES = 4 * 2**30
 """Of the pictures in one file, which are held in memory; a folder of class folders has no limit."""
 MIN_PICTURES = 20
+READING = 2
+"""Of how files become pixels, in cache keys; 2: JPEGs are turned upright."""
 EXPECTED = f"""expected one of
   ROOT/<class>/<picture>{"|".join(SUFFIXES)}
   FILE.npz with `images` [N, H, W] or [N, H, W, 3] uint8 and `labels` [N]
@@ -171,7 +174,8 @@ def read_picture(path: Path) -> np.ndarray:
     """
     import cv2
 
-    read = read_stored(path, cv2.IMREAD_UNCHANGED)
+    # IMREAD_UNCHANGED keeps transparency, which JPEGs have none of, and ignores EXIF.
+    read = read_stored(path, cv2.IMREAD_COLOR if _is_jpeg(path) else cv2.IMREAD_UNCHANGED)
     if read is None or read.size == 0:
         raise DataError(f"{path}: cannot be read as a picture")
     picture = np.asarray(read)
@@ -185,6 +189,15 @@ def read_picture(path: Path) -> np.ndarray:
         opaque = picture[..., 3:].astype(np.uint16)
         picture = ((picture[..., :3] * opaque + 127) // 255).astype(np.uint8)
     return np.ascontiguousarray(picture[..., ::-1])
+
+
+def _is_jpeg(path: Path) -> bool:
+    """By its content, for names may say otherwise; False where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(2) == b"\xff\xd8"
+    except OSError:
+        return False
 
 
 def _fit(picture: np.ndarray, size: int) -> np.ndarray:

@@ -6,7 +6,8 @@ A histogram says how often a pixel fired, not when. What recorded windows say ab
     starts        where in the window a pixel's events start, between the earliest and the latest possible: 0 .. 1. Of
                   pixels r px apart along an axis they have the rank correlation of a Gaussian field, whose correlation
                   is (1 - scatter) exp(-r^2 / (4 length^2)): an edge passes neighbours at like times, noise does not
-    polarities    how much less often polarity changes within a pixel than if its events came in random order
+    polarities    how much less often polarity changes within a pixel than if its events came in random order; counted
+                  while a pixel has events of both polarities left, for then alone is there a choice
     durations     of windows with about as many events
 
 The three ways to spread the events of a pixel, from the simplest: `uniform`, each on its own anywhere in the window;
@@ -211,8 +212,8 @@ class _Window:
         duration_us: from the first to the last event.
         gaps: of each pixel with two events or more, in windows.
         neighbours: for each lag, starts [2, P] of pairs of pixels that both have events.
-        changes: of polarity, in pixels with both.
-        expected_changes: if the events of a pixel came in random order.
+        changes: of polarity from an event of a pixel to its next, where events of both are left.
+        expected_changes: if what is left came in random order.
     """
 
     num_events: int
@@ -232,20 +233,38 @@ def _measure(window: Events) -> _Window:
     is_positive = window.p[order] > 0
     first = np.flatnonzero(np.concatenate([[True], pixels[1:] != pixels[:-1]]))
     sizes = np.diff(first, append=len(pixels))
-    is_next = np.concatenate([[False], pixels[1:] == pixels[:-1]])
     gaps = np.diff(t, prepend=0.0)
     room = 1 - (t[first + sizes - 1] - t[first])
     starts = np.full(height * width, np.nan)
     starts[pixels[first]] = np.divide(t[first], room, out=np.full(len(first), 0.5), where=room > 0)
-    positive = np.add.reduceat(is_positive.astype(np.int64), first)
+    changes, expected_changes = _count_changes(is_positive, first, sizes)
     return _Window(
         num_events=len(window),
         duration_us=duration_us,
         gaps=[part[1:] for part in np.split(gaps, first[1:]) if len(part) > 1],
         neighbours=[_pairs(starts.reshape(height, width), lag) for lag in LAGS_PX],
-        changes=int(np.count_nonzero(is_next[1:] & (is_positive[1:] != is_positive[:-1]))),
-        expected_changes=float((2 * positive * (sizes - positive) / sizes).sum()),
+        changes=changes,
+        expected_changes=expected_changes,
     )
+
+
+def _count_changes(is_positive: np.ndarray, first: np.ndarray, sizes: np.ndarray) -> tuple[int, float]:
+    """`changes` and `expected_changes` of a window.
+
+    Args:
+        is_positive: [E] bool, pixel after pixel, in order of time.
+        first: [A] where the events of each pixel start.
+        sizes: [A] how many it has.
+    """
+    start = np.repeat(first, sizes)
+    left = start + np.repeat(sizes, sizes) - np.arange(len(is_positive))
+    passed = np.cumsum(is_positive) - is_positive
+    left_positive = np.repeat(np.add.reduceat(is_positive.astype(np.int64), first), sizes) - (passed - passed[start])
+    is_free = (np.arange(len(start)) > start) & (left_positive > 0) & (left_positive < left)
+    was_positive = np.concatenate([[False], is_positive[:-1]])[is_free]
+    left, left_positive = left[is_free], left_positive[is_free]
+    others = np.where(was_positive, left - left_positive, left_positive)
+    return int(np.count_nonzero(is_positive[is_free] != was_positive)), float((others / left).sum())
 
 
 def _pairs(starts: np.ndarray, lag: int) -> np.ndarray:

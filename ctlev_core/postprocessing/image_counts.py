@@ -253,7 +253,8 @@ def _fitting_ranges(frequencies: np.ndarray, model: CountModel) -> list[tuple[fl
     values = np.flatnonzero(frequencies[:255])
     values = values[values > 0]
     if model.options.normalisation != "three_sigma":
-        found = [(scale, scale) for scale in _whole_scales(model) if np.isin(values, _levels(scale)).all()]
+        # From 255 on every value is a level.
+        found = [(k, k) for k in _whole_scales(model) if k >= 255 or np.isin(values, _levels(k)).all()]
     elif len(values) == 0:
         found = [(0.0, 1.0)]
     else:
@@ -302,7 +303,12 @@ def _most_probable_counts(scale: float, shares: np.ndarray, width: float) -> np.
     """The most probable count [256] of each value that a decoder of this width has blurred; -1 = saturated."""
     levels = _levels(scale)
     log_shares = np.log(_shares_of_levels(shares, levels))
-    found = np.argmax(log_shares[:, None] + _log_blur(width)[levels], axis=0)
+    # Of the counts of one level the first most probable is enough: there may be tens of thousands.
+    starts = np.flatnonzero(np.diff(levels, prepend=-1))
+    most = np.maximum.reduceat(log_shares, starts)
+    probable = np.flatnonzero(log_shares == np.repeat(most, np.diff(starts, append=len(levels))))
+    counts = probable[np.searchsorted(probable, starts)]
+    found = counts[np.argmax(most[:, None] + _log_blur(width)[levels[starts]], axis=0)]
     # A level so close to 255 cannot be told from it; that there are saturated pixels at all decides about the scale.
     found[levels[found] >= 255 - width] = -1
     return found

@@ -255,7 +255,7 @@ def _make_folder_and_store(place: Path) -> None:
     """`mine` with event streams, and recorded frames as an artefact called `recorded`."""
     home = place / ".ctlev"
     made = make_generated(home)
-    _, columns = make_streams(made, home, "streams", one_file=False)
+    _, columns = make_streams(made, home, "streams", a_file=1)
     streams = publish(home, "export_events", "streams", columns, tables.EVENT_STREAMS, {"generated": made.synthetic})
     artefacts = made.artefacts | {"event streams": streams}
     write_image_folder(artefacts, place / "mine", name="docs", notice="")

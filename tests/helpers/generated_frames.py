@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -119,8 +119,10 @@ def make_recorded(home: Path) -> tuple[ManifestRef, np.ndarray]:
     return publish(home, "encode", "recorded", columns, tables.FRAMES, {}, frames=frames), frames
 
 
-def make_streams(made: Generated, home: Path, key: str, one_file: bool) -> tuple[list[Events], dict]:
-    """Files of an `export_events` artefact of a few events an image; the streams, and the columns of its table."""
+def make_streams(made: Generated, home: Path, key: str, *, a_file: int) -> tuple[list[Events], dict]:
+    """Files of an `export_events` artefact, `a_file` streams of a few events in each; the streams, and the columns of
+    its table.
+    """
     count, streams, rows = len(made.frames), [], []
     for row in range(count):
         t = np.arange(row + 1, dtype=np.int64) * 10
@@ -128,18 +130,15 @@ def make_streams(made: Generated, home: Path, key: str, one_file: bool) -> tuple
         streams.append(Events(t, x, x, one, SIZE))
     folder = Store(home).temporary_folder(key) / "events"
     folder.mkdir(parents=True)
-    start = start_us = 0
-    for row, events in enumerate(streams):
-        name = "events.parquet" if one_file else f"{row:06d}.parquet"
-        if not one_file:
-            event_files.write_events_parquet(folder / name, events)
-            start = start_us = 0
-        last_us = start_us + int(events.t[-1])
-        rows.append((f"events/{name}", start, len(events), start_us, last_us))
-        start, start_us = start + len(events), last_us + 100
-    if one_file:
-        moved = [Events(e.t + r[3], e.x, e.y, e.p, e.sensor_size) for e, r in zip(streams, rows, strict=True)]
-        event_files.write_event_chunks_parquet(folder / "events.parquet", moved)
+    for first in range(0, count, a_file):
+        name = "events.parquet" if a_file >= count else f"{first // a_file:06d}.parquet"
+        start, start_us, moved = 0, 0, []
+        for events in streams[first : first + a_file]:
+            last_us = start_us + int(events.t[-1])
+            rows.append((f"events/{name}", start, len(events), start_us, last_us))
+            moved.append(replace(events, t=events.t + start_us))
+            start, start_us = start + len(events), last_us + 100
+        event_files.write_event_chunks_parquet(folder / name, moved)
     names = ("file", "event_start", "num_events", "t_start_us", "t_end_us")
     columns = {name: [row[number] for row in rows] for number, name in enumerate(names)}
     columns |= {

@@ -25,6 +25,7 @@ from ctlev_core.diffusion.pretrained.model_kinds import is_transformer
 IMAGE_SIZE = 64
 WIDTHS = (64, 64, 96)
 HEAD_CHANNELS = 32
+NORM_GROUPS = 16
 TEXT_CHANNELS = 64
 MAX_TOKENS = 24
 VOCABULARY = 1536
@@ -143,7 +144,8 @@ def build_base_model(
         corpus: captions the tokenizer is trained on.
         vae: the fitted patch code.
         seed: of the initial weights.
-        widths: channels of the U-Net from the top to the bottom resolution; multiples of 32.
+        widths: channels of the U-Net from the top to the bottom resolution; multiples of `NORM_GROUPS`, better of
+            `HEAD_CHANNELS`.
         image_size: px, a multiple of 16.
         prediction_type: what the U-Net learns to predict: v, or `sample`, the latents themselves.
     """
@@ -182,7 +184,7 @@ def build_base_model(
             cross_attention_dim=TEXT_CHANNELS,
             # diffusers takes this as the number of heads, not as their size.
             attention_head_dim=tuple(max(1, width // HEAD_CHANNELS) for width in widths),  # pyright: ignore
-            norm_num_groups=16,
+            norm_num_groups=NORM_GROUPS,
             resnet_time_scale_shift="scale_shift",  # Dhariwal and Nichol, 2021: adaptive group normalisation
             # The pooled prompt also joins the time embedding: a tiny network learns cross-attention too slowly.
             addition_embed_type="text",

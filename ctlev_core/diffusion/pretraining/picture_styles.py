@@ -85,7 +85,9 @@ def apply_style(
     Returns:
         The picture [S, S, 3] uint8 and its caption.
     """
-    style = str(rng.choice(list(data_mixture.styles), p=list(data_mixture.styles.values())))
+    shares = np.array(list(data_mixture.styles.values()))
+    # They sum to 1 within 1e-6 (thirds are written so), and NumPy asks for more.
+    style = str(rng.choice(list(data_mixture.styles), p=shares / shares.sum()))
     image = scene.image.astype(np.float32)
     if style == "grey" or style == "lines":
         image = np.repeat(image @ np.array([[0.299], [0.587], [0.114]], np.float32), 3, axis=2)

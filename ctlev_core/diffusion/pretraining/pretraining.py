@@ -31,7 +31,13 @@ from ctlev_core.diffusion.pretrained.loading import (
 from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL, find_controlnet, read_parts
 from ctlev_core.diffusion.pretrained.prompts import encode_prompts
 from ctlev_core.diffusion.pretraining import procedural_images
-from ctlev_core.diffusion.pretraining.architecture import IMAGE_SIZE, WIDTHS, PredictionType, build_base_model
+from ctlev_core.diffusion.pretraining.architecture import (
+    IMAGE_SIZE,
+    NORM_GROUPS,
+    WIDTHS,
+    PredictionType,
+    build_base_model,
+)
 from ctlev_core.diffusion.pretraining.picture_scenes import picture_mixture, scene_of
 from ctlev_core.diffusion.pretraining.picture_styles import DEFAULT_MIXTURE, DataMixture, Scene, apply_style
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
@@ -130,6 +136,8 @@ class PretrainingOptions(Frozen):
             raise ValueError("sample_every draws samples of a fine-tuning; pre-training has none, set it to 0")
         if self.pictures.root is not None and self.tune != "unet":
             raise ValueError(f"pictures of one's own have no condition images; set tune=unet, got {self.tune!r}")
+        if not self.widths or any(width < 1 or width % NORM_GROUPS for width in self.widths):
+            raise ValueError(f"widths must be one or more positive multiples of {NORM_GROUPS}, got {self.widths}")
         shown = self.chunk_scenes * self.chunk_passes
         if shown < self.training.batch_size:
             raise ValueError(

@@ -123,6 +123,13 @@ def test_captions_name_what_is_seen_and_the_tokenizer_knows_their_words():
     assert tokenizer.eos_token_id == len(tokenizer) - 1, "CLIP finds the end token as the largest id"
 
 
+def test_shares_of_styles_may_be_rounded():
+    mixture = DataMixture(styles={"photo": 0.3333333, "lines": 0.3333333, "grey": 0.3333333})
+    scene = picture_styles.Scene(np.zeros((16, 16, 3), np.uint8), None, "cat", "red cat")
+    image, _ = picture_styles.apply_style(scene, np.random.default_rng(0), mixture)
+    assert image.shape == (16, 16, 3)
+
+
 def test_batches_put_steered_rows_first_and_follow_the_number_alone():
     base_model = new_base_model(TINY)
     stream = ImageStream(base_model, TINY)
@@ -188,6 +195,9 @@ def test_a_unet_alone_learns_and_two_processes_end_where_one_does(tmp_path, monk
             "chunk_scenes x chunk_passes must be a batch_size of 8 at least, got 6",
         ),
         ({"training": {"sample_every": 1}}, "sample_every draws samples of a fine-tuning"),
+        ({"widths": (10, 20)}, r"widths must be one or more positive multiples of 16, got \(10, 20\)"),
+        ({"widths": ()}, r"widths must be one or more positive multiples of 16, got \(\)"),
+        ({"widths": (-32, 64)}, r"widths must be one or more positive multiples of 16, got \(-32, 64\)"),
     ],
 )
 def test_what_does_not_go_together_is_refused(changed, message):

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas
 import pyarrow as pa
 import pytest
 import torch
-from generated_frames import REJECTED_ROW, make_generated
+from generated_frames import REJECTED_ROW, make_generated, make_streams, publish
 from torch.utils.data import DataLoader
 
 from ctlev_core.export.event_dataset import EventDataset
 from ctlev_core.export.event_sequences import EventSequences
+from data_contracts import tables
 from data_contracts.errors import DataError
+from tasks.export_images import write_image_folder
 
 SOURCES = [f"a:{20 * number}" for number in range(4)] + ["b:0", "b:20", "b:60"]
 """Row 1 is one that the quality filter rejected."""
@@ -57,6 +60,24 @@ def test_an_image_that_is_left_out_ends_a_run(tmp_path, dataset):
     place = kept.table.column_names.index("source_id")
     kept.table = kept.table.set_column(place, "source_id", pa.array([SOURCES[row] for row in rows]))
     names = [sample["sample_id"] for sample in EventSequences(kept, 2)]
+    assert names == [["synthetic/000002", "synthetic/000003"], ["synthetic/000004", "synthetic/000005"]]
+
+
+@pytest.mark.parametrize("with_events", [False, True])
+def test_runs_of_an_exported_folder_are_those_of_its_labels(tmp_path, with_events):
+    home = tmp_path / "home"
+    made = make_generated(home)
+    artefacts = dict(made.artefacts)
+    if with_events:
+        _, columns = make_streams(made, home, "streams", a_file=1)
+        artefacts["event streams"] = publish(
+            home, "export_events", "streams", columns, tables.EVENT_STREAMS, {"generated": made.synthetic}
+        )
+    folder = write_image_folder(artefacts, tmp_path / "mine", name="walks", notice="")
+    labels = pandas.read_parquet(folder / "labels.parquet")
+    labels["source_id"] = [SOURCES[row] for row in range(7) if row != REJECTED_ROW]
+    labels.to_parquet(folder / "labels.parquet")
+    names = [sample["sample_id"] for sample in EventSequences(EventDataset(folder), 2)]
     assert names == [["synthetic/000002", "synthetic/000003"], ["synthetic/000004", "synthetic/000005"]]
 
 

@@ -17,6 +17,7 @@ from ctlev_core.geometry.camera import (
     triangulate,
     undistort_points,
 )
+from ctlev_core.geometry.lens_distortion import undistort
 from data_contracts.errors import DataError
 
 K = np.array([[400.0, 0.3, 170.0], [0.0, 410.0, 125.0], [0.0, 0.0, 1.0]])
@@ -84,6 +85,16 @@ def test_undistorting_any_pixel_is_finite_or_nan(pixel, distorted):
     camera = Camera(K, np.eye(3), np.zeros(3), SIZE, BARREL if distorted else None)
     found = undistort_points(camera, np.array(pixel))
     assert np.isfinite(found).all() or np.isnan(found).all()
+
+
+@pytest.mark.parametrize("pixel", [(np.inf, 1.0), (1.0, -np.inf), (-np.inf, np.inf), (np.nan, 1.0)])
+@pytest.mark.parametrize("skew", [0.0, 0.5])
+def test_undistorting_a_pixel_that_is_not_finite_is_nan(pixel, skew):
+    skewed = K + np.array([[0, skew, 0], [0, 0, 0], [0, 0, 0]])
+    for distortion in (None, BARREL):
+        camera = Camera(skewed, np.eye(3), np.zeros(3), SIZE, distortion)
+        assert np.isnan(undistort_points(camera, np.array(pixel))).all()
+    assert np.isnan(undistort(np.array(pixel), BARREL)).all()
 
 
 def test_a_lens_that_ends_shows_nothing_beyond_its_rim():

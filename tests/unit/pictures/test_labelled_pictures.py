@@ -9,6 +9,7 @@ import zipfile
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 from pydantic import ValidationError
 
 from ctlev_core.dataset_files.event_hpe_files import read_event_images
@@ -82,6 +83,22 @@ def test_other_sizes_and_colour_modes(tmp_path):
     fitted = open_pictures(PictureOptions(root=tmp_path / "w.npz")).read(0, 16)
     assert fitted.shape == (16, 16, 3)
     assert (fitted[:6] == fitted[0, 0]).all() and (fitted[10:] == fitted[0, 0]).all(), "whole, with its border's colour"
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("name", ["photo.jpg", "really_a_jpeg.png"])
+def test_photos_are_turned_upright(tmp_path, orientation, name):
+    corner = np.zeros((32, 48, 3), np.uint8)
+    corner[:16, :24] = 255
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    photo = Image.fromarray(corner)
+    photo.save(tmp_path / name, "JPEG", exif=exif, quality=95)
+    with Image.open(tmp_path / name) as stored:
+        expected = np.asarray(ImageOps.exif_transpose(stored))
+    found = read_picture(tmp_path / name)
+    assert found.shape == expected.shape
+    np.testing.assert_allclose(found, expected, atol=3)
 
 
 def test_moves_are_a_function_of_the_stream():

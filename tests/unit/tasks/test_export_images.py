@@ -238,11 +238,12 @@ def test_nothing_to_export(tmp_path):
 KEY = "streams"
 
 
-@pytest.mark.parametrize("one_file", [False, True])
-def test_event_streams_come_along(tmp_path, one_file):
+@pytest.mark.parametrize("a_file", [1, 2, 7])
+def test_event_streams_come_along(tmp_path, a_file):
+    """Each in a file of its own, stretches of images in one file each, or all in one."""
     home = tmp_path / "home"
     made = make_generated(home)
-    streams, columns = make_streams(made, home, KEY, one_file)
+    streams, columns = make_streams(made, home, KEY, a_file=a_file)
     ref = publish(home, "export_events", KEY, columns, tables.EVENT_STREAMS, {"generated": made.synthetic})
     folder = export(made, tmp_path / "mine", **{"event streams": ref})
     dataset = EventDataset(folder)
@@ -252,10 +253,13 @@ def test_event_streams_come_along(tmp_path, one_file):
         for column in "txyp":
             np.testing.assert_array_equal(getattr(events, column), getattr(streams[row], column))
     labels = pandas.read_parquet(folder / "labels.parquet")
-    if one_file:
-        assert set(labels["events_file"]) == {"events/events.parquet"}
-    else:
-        assert labels["events_file"][1] == "events/000/synthetic_000002.parquet"
+    expected = {
+        1: [f"events/000/synthetic_{row:06d}.parquet" for row in rows],
+        2: [f"events/000/synthetic_{row - row % 2:06d}.parquet" for row in rows],
+        7: ["events/events.parquet"] * 6,
+    }
+    assert labels["events_file"].tolist() == expected[a_file]
+    assert len([path for path in (folder / "events").rglob("*") if path.is_file()]) == len(set(expected[a_file]))
     assert "Events, as columns t, x, y, p" in (folder / "README.md").read_text()
     with pytest.raises(DataError, match="other data"):
         export(made, folder)  # which would be without events
