@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # torch, which most plans do without
     from ctlev_core.realism.chain_frames import Rounding
 
 
-@stage(version=3, schema=tables.CHAIN_FRAMES)
+@stage(version=4, schema=tables.CHAIN_FRAMES)
 def chain_frames(
     out: Output,
     checkpoint: Manifest,

@@ -55,7 +55,7 @@ MAX_FILTER_FRAMES = 2_000
 """Training frames the quality filter is fitted to, evenly spread: the quantiles of more hardly move."""
 
 
-@stage(version=6, schema=tables.SYNTHETIC, optional=("part",), spreads=is_dealt_out)
+@stage(version=7, schema=tables.SYNTHETIC, optional=("part",), spreads=is_dealt_out)
 def sample(
     out: Output,
     checkpoint: Manifest,

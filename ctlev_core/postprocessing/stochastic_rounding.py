@@ -26,7 +26,7 @@ def round_stochastically(
     *,
     polarity: bool,
     seeds: Sequence[int],
-    events_a_level: float | None = None,
+    events_of_level: np.ndarray | None = None,
 ) -> np.ndarray:
     """Counts of each image: floor(expected count + u), u uniform between 0 and 1.
 
@@ -36,7 +36,8 @@ def round_stochastically(
         num_events: [R] events in each of R >= 1 recorded windows.
         polarity: of the event histogram.
         seeds: N seeds; a row depends on its own alone.
-        events_a_level: of a grey level, the same in every image; None = as many as make the number of events drawn.
+        events_of_level: [256] of each grey level, the same in every image; None = in proportion to levels, as many as
+            make the number of events drawn.
     Returns:
         [N, C, H, W] uint16, two channels with polarity. A black image stays without events.
     Raises:
@@ -57,7 +58,10 @@ def round_stochastically(
         total = values.sum(dtype=np.float64)
         if total == 0:
             continue
-        expected = values * (rng.choice(num_events) / total if events_a_level is None else events_a_level)
+        if events_of_level is None:
+            expected = values * (rng.choice(num_events) / total)
+        else:
+            expected = np.interp(values, np.arange(256), events_of_level)
         counts[row] = np.minimum(expected + rng.random(expected.shape), 65535).transpose(2, 0, 1)
     return counts
 
@@ -89,10 +93,23 @@ def round_frames(frames: np.ndarray, num_events: np.ndarray, encoder: Plugin, se
         encoder: an event histogram, that of the recorded windows.
         seeds: N seeds; a row depends on its own alone.
     """
-    options, events_a_level = encoder.options, None
+    options, events_of_level = encoder.options, None
     if options.normalisation == "count":
-        events_a_level = options.full_scale_count / 255
+        events_of_level = _events_of_level(options.full_scale_count)
     counts = round_stochastically(
-        frames, num_events, polarity=options.polarity, seeds=seeds, events_a_level=events_a_level
+        frames, num_events, polarity=options.polarity, seeds=seeds, events_of_level=events_of_level
     )
     return encoder.module.render_image(counts, encoder.options)
+
+
+def _events_of_level(full_scale_count: int) -> np.ndarray:
+    """Counts [256] that grey levels stand for where a count k is drawn as floor(255 k / full scale), and 255 at most.
+
+    In proportion between the levels of two counts, for a decoder that is unsure which it is gives their mean. Where
+    several counts share a level, their mean.
+    """
+    counts = np.arange(min(full_scale_count, 65_535) + 1)
+    levels, place, number = np.unique(255 * counts // full_scale_count, return_inverse=True, return_counts=True)
+    means = np.bincount(place, counts) / number
+    means[0] = 0.0  # black, whatever was lost in it, stays without events
+    return np.interp(np.arange(256), levels, means)

@@ -62,6 +62,22 @@ def test_images_of_one_scale_say_their_number_of_events():
     np.testing.assert_allclose(half / images.sum(axis=(1, 2, 3), dtype=np.int64), 0.5, atol=0.06)
 
 
+@pytest.mark.parametrize("full_scale_count", [1, 3, 8, 64, 100, 128, 200, 255])
+def test_recorded_images_of_normalisation_count_stay_as_they_are(full_scale_count):
+    """Also where levels were rounded down: 128 events to 255 levels make one event level 1, half of 255 / 128."""
+    options = event_histogram.Options(normalisation="count", full_scale_count=full_scale_count)
+    encoder = Plugin("encodings", "event_histogram", event_histogram, options)
+    counts = np.random.default_rng(0).poisson(0.3, (4, 2, 24, 32)).astype(np.uint16)
+    images = event_histogram.render_image(counts, options)
+    assert np.array_equal(round_frames(images, np.array([7]), encoder, seeds=range(4)), images)
+    # What lies between black and one event keeps its events on average.
+    one = 255 // full_scale_count
+    if one >= 2:
+        faint = np.full((40, 24, 32, 3), one // 2, np.uint8)
+        rounded = round_frames(faint, np.array([7]), encoder, seeds=range(40))[..., 0]
+        assert (rounded > 0).mean() == pytest.approx(one // 2 / one, abs=0.01)
+
+
 def test_a_row_depends_on_its_own_seed_alone():
     images = grey(RANDOM.integers(0, 256, (5, 8, 8)))
     together = round_stochastically(images, np.array([50, 60]), polarity=False, seeds=[3, 1, 4, 1, 5])
