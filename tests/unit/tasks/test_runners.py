@@ -19,7 +19,16 @@ import pytest
 from data_contracts import tables
 from data_contracts.errors import DataError
 from tasks import runners
-from tasks.runners import ALIKE, WorkerError, asked_runner, environment_there, is_elsewhere, num_jobs, reply_to
+from tasks.runners import (
+    ALIKE,
+    ProcessesClosedError,
+    WorkerError,
+    asked_runner,
+    environment_there,
+    is_elsewhere,
+    num_jobs,
+    reply_to,
+)
 from tasks.stage import planning, stage
 from tasks.store import Store
 from tasks.workers import MAX_GROUP, Workers, _groups, current_workers, is_spread, map_shards, together
@@ -114,6 +123,21 @@ def test_a_process_that_dies_is_an_error_that_says_so(kind, monkeypatch):
     monkeypatch.setenv("CTLEV_RUNNER", kind)
     with pytest.raises(WorkerError):
         list(map_shards(die, range(2)))
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_of_calls_side_by_side_the_one_that_died_is_told(kind, tmp_path, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    monkeypatch.setenv("CTLEV_WORKERS", "3")
+    # Those that are ended for it would be told as often as not: whichever thread is awake first.
+    calls = [partial(call_there, sleep_a_minute, tmp_path / str(number)) for number in range(2)]
+    with pytest.raises(WorkerError) as found:
+        together([*calls, partial(call_there, die, 0)])
+    assert not isinstance(found.value, ProcessesClosedError)
+
+
+def call_there(function, *arguments):
+    return current_workers().call(function, *arguments)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("threads", "processes")])
