@@ -47,7 +47,8 @@ def record_people(
     Returns:
         Exit status: 0 written, 2 wrong input, 130 interrupted.
     """
-    started, folder = time.perf_counter(), folder.absolute()
+    # `new/..` is not there until `new` is made, and is then the folder around it.
+    started, folder = time.perf_counter(), folder.resolve()
     partial = folder.parent / f".partial-{folder.name}"
     try:
         options = _options(count, overrides, split, rate_hz)
@@ -61,6 +62,7 @@ def record_people(
                     place, recording, options, suffix=suffix, format_name=format_name, table=table
                 )
             table.write(partial / LABELS_FILE)
+            _check_free(folder, overwrite=overwrite)  # of what came meanwhile nobody asked that it goes
             if folder.exists():
                 shutil.rmtree(folder)
             partial.rename(folder)

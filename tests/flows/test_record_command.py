@@ -144,3 +144,21 @@ def test_what_a_killed_process_left_is_not_mixed_in(tmp_path):
     assert record_people(tmp_path / "out", 1, SMALL, rate_hz=20.0) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
     assert not (tmp_path / "out" / "condition_left").exists()
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_others_wrote_stays_however_the_folder_is_named(tmp_path, capsys, monkeypatch, overwrite):
+    (tmp_path / "mine").write_text("mine")
+    assert record_people(tmp_path / "new" / "..", 1, SMALL, overwrite=overwrite) == 2
+    write = record.write_labelled
+
+    def write_late(*arguments, **options):
+        (tmp_path / "out").mkdir(exist_ok=True)
+        (tmp_path / "out" / "mine").write_text("mine")
+        return write(*arguments, **options)
+
+    monkeypatch.setattr(record, "write_labelled", write_late)
+    assert record_people(tmp_path / "out", 1, SMALL, rate_hz=20.0, overwrite=overwrite) == 2
+    assert capsys.readouterr().err.count("--overwrite replaces") == 2
+    assert [path.read_text() for path in (tmp_path / "mine", tmp_path / "out" / "mine")] == ["mine"] * 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out"]
