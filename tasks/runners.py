@@ -132,6 +132,9 @@ def asked_cluster(count: int) -> Runner | None:
 
     Args:
         count: processes of a local one.
+
+    Raises:
+        DataError: it cannot be started or reached, or is of another kind than needed.
     """
     kind, address = asked_runner()
     if kind not in _PACKAGES:
@@ -139,7 +142,15 @@ def asked_cluster(count: int) -> Runner | None:
     with _starting:
         cluster = _running.get((kind, address))
         if cluster is None:
-            cluster = _running[kind, address] = _cluster_class(kind)(address, count)
+            try:
+                cluster = _running[kind, address] = _cluster_class(kind)(address, count)
+            except DataError:
+                raise
+            except (ValueError, RuntimeError, OSError) as error:  # an address that is none, another version, nobody
+                asked = f"{kind}:{address}" if address else kind
+                raise DataError(
+                    f"CTLEV_RUNNER={asked}: there is no such cluster, or it cannot be used: {error}"
+                ) from error
             atexit.register(cluster.close)
         return cluster
 

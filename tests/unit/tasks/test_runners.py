@@ -191,6 +191,16 @@ def die(shard):
     os._exit(3)
 
 
+@pytest.mark.parametrize(
+    ("asked", "package"), [("dask:node", "distributed"), ("dask:foo://node:1", "distributed"), ("ray:node", "ray")]
+)
+def test_an_address_that_is_none_is_refused_with_the_variable(asked, package, monkeypatch):
+    pytest.importorskip(package)
+    monkeypatch.setenv("CTLEV_RUNNER", asked)
+    with pytest.raises(DataError, match=f"CTLEV_RUNNER={asked}: there is no such cluster"):
+        runners.asked_cluster(2)
+
+
 def test_the_rest_is_not_computed_where_nobody_wants_it():
     done = []
     results = map_shards(done.append, range(1000))
