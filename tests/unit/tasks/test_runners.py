@@ -76,6 +76,12 @@ def losses_of_one_process(out, *, seed):
     return pa.table({"curve": ["training"], "step": pa.array([seed], pa.int64()), "loss": draw(seed)[:1]})
 
 
+@stage(version=int(os.environ.get("VERSION_OF_TEST_STAGE", "1")), schema=tables.TRAINING)
+def losses_of_a_version(out, *, seed):
+    """Of a stage whose code differs from machine to machine."""
+    return pa.table({"curve": ["training"], "step": pa.array([seed], pa.int64()), "loss": draw(seed)[:1]})
+
+
 def digests(home):
     """Of every artefact; all of its files were checked against it."""
     found = {}
@@ -99,6 +105,23 @@ def test_artefacts_do_not_depend_on_who_computes_them(kind, tmp_path, monkeypatc
     monkeypatch.setenv("CTLEV_WORKERS", "1")
     monkeypatch.delenv("CTLEV_RUNNER")
     assert found == make(tmp_path / "alone") and len(found) == 5
+
+
+@pytest.mark.parametrize("kind", ["processes", *KINDS[2:3]])
+def test_a_machine_with_another_version_of_a_stage_makes_nothing_under_our_key(kind, home, monkeypatch):
+    def run(seed):
+        return losses_of_a_version.run(losses_of_a_version.key({"seed": seed}, Store()), {"seed": seed})
+
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    assert [cached for _, cached in together([partial(run, 0), partial(run, 1)])] == [False, False]
+    for cluster in list(runners._running.values()):
+        cluster.close()
+    monkeypatch.setenv("VERSION_OF_TEST_STAGE", "2")
+    with pytest.raises(
+        DataError, match=r"losses_of_a_version: .* has another version of ctlev.*'version': 1.*'version': 2"
+    ):
+        together([partial(run, 2), partial(run, 3)])
+    assert len(list(home.glob("artefacts/losses_of_a_version/*"))) == 2
 
 
 def run_stage(seed):
