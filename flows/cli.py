@@ -9,6 +9,7 @@ import importlib
 import math
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -110,8 +111,7 @@ def _ctlev(
 
 def main() -> NoReturn:
     """The console script."""
-    app(prog_name="ctlev")
-    raise SystemExit(0)
+    _call(app, prog_name="ctlev")
 
 
 def script(name: str) -> NoReturn:
@@ -120,7 +120,20 @@ def script(name: str) -> NoReturn:
 
     leave_script_folder()
     command: Any = typer.main.get_command(app)
-    command.commands[name].main(args=sys.argv[1:], prog_name=Path(sys.argv[0]).name)
+    _call(command.commands[name].main, args=sys.argv[1:], prog_name=Path(sys.argv[0]).name)
+
+
+def _call(command: Callable[..., Any], **arguments: Any) -> NoReturn:
+    """Run a command and end the process; where its output cannot be written, with an error that says so."""
+    try:
+        try:
+            command(**arguments)
+        finally:
+            sys.stdout.flush()
+    except OSError as error:  # standard output on a full disk; commands tell of all others themselves
+        print(f"error: {error}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left would fail again as Python ends
+        raise SystemExit(2) from None
     raise SystemExit(0)
 
 

@@ -116,11 +116,11 @@ def connected() -> Iterator[None]:
 
     Raises:
         ServerLostError: it ended, or did not answer in time; the message names its log. Or nobody answers at the
-            address that the user named.
+            address that the user named, or nobody does any more.
     """
     if _server is None:
-        _check_server_of_user()
-        yield
+        with _server_of_user():
+            yield
         return
     _wait(_server)
     from prefect.settings import (
@@ -147,6 +147,22 @@ def connected() -> Iterator[None]:
         raise ServerLostError(_lost(_server)) from error
     finally:
         ended.set()
+
+
+@contextlib.contextmanager
+def _server_of_user() -> Iterator[None]:
+    """As `connected`, with the server in PREFECT_API_URL."""
+    import httpx
+
+    _check_server_of_user()
+    try:
+        yield
+    except httpx.HTTPError as error:  # Prefect asked it again and again; nothing else here asks a server
+        told = (str(error) or type(error).__name__).splitlines()[0]
+        raise ServerLostError(
+            f"PREFECT_API_URL: the server was lost in the middle of the run: {told}; finished stages and checkpoints "
+            "are kept, so start that server and run it again"
+        ) from error
 
 
 def _check_server_of_user() -> None:

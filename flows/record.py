@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,28 +47,29 @@ def record_people(
     Returns:
         Exit status: 0 written, 2 wrong input, 130 interrupted.
     """
-    started, partial = time.perf_counter(), folder.with_name(f".partial-{folder.name}")
+    # `new/..` is not there until `new` is made, and is then the folder around it.
+    started, folder = time.perf_counter(), folder.resolve()
+    partial = folder.parent / f".partial-{folder.name}"
     try:
         options = _options(count, overrides, split, rate_hz)
         format_name = find_writer(Path(f"events{suffix}"))
-        _check_free(folder, overwrite=overwrite)
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        table, num_events = CocoTable(options.joint_set), 0
-        recordings = studio.list_recordings(options)
-        for recording in ProgressBar(recordings, desc="recordings", unit="recording"):
-            place = partial / recording.recording_id.replace("/", "_")
-            num_events += write_labelled(place, recording, options, suffix=suffix, format_name=format_name, table=table)
-        table.write(partial / LABELS_FILE)
-        if folder.exists():
-            shutil.rmtree(folder)
-        partial.rename(folder)
+        recordings, table, num_events = studio.list_recordings(options), CocoTable(options.joint_set), 0
+        with _claimed(partial, folder):
+            _check_free(folder, overwrite=overwrite)
+            for recording in ProgressBar(recordings, desc="recordings", unit="recording"):
+                place = partial / recording.recording_id.replace("/", "_")
+                num_events += write_labelled(
+                    place, recording, options, suffix=suffix, format_name=format_name, table=table
+                )
+            table.write(partial / LABELS_FILE)
+            _check_free(folder, overwrite=overwrite)  # of what came meanwhile nobody asked that it goes
+            if folder.exists():
+                shutil.rmtree(folder)
+            partial.rename(folder)
     except (DataError, PluginError, ValueError, OSError) as error:
-        shutil.rmtree(partial, ignore_errors=True)
         print(f"error: {str(error).replace(str(partial), str(folder))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        shutil.rmtree(partial, ignore_errors=True)
         print("interrupted; nothing was written", file=sys.stderr)
         return 130
     width, height = options.sensor_size
@@ -75,6 +79,27 @@ def record_people(
     )
     print(f"in {duration_text(time.perf_counter() - started)}")
     return 0
+
+
+@contextlib.contextmanager
+def _claimed(partial: Path, folder: Path) -> Iterator[None]:
+    """Inside this block `partial` is this process's alone, empty at first, and removed where the block fails."""
+    partial.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(partial, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(f"{folder}: another process is recording into this folder") from None
+        try:
+            for left in partial.iterdir():  # by a process that was killed
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
+            yield
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def _check_free(folder: Path, *, overwrite: bool) -> None:

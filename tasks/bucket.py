@@ -141,7 +141,7 @@ class Bucket:
         """Is there such an artefact, whether whole or damaged?"""
         return self._try("read", self._files[0].exists, self._path("artefacts", stage, key, RUN_FILE))
 
-    def download(self, stage: str, key: str, digest: str, folder: Path) -> None:
+    def download(self, stage: str, key: str, digest: str, folder: Path) -> bool:
         """Fetch an artefact; what arrives is not checked here.
 
         Args:
@@ -149,6 +149,9 @@ class Bucket:
             key: its cache key.
             digest: of its manifest, as its provenance record says.
             folder: where to; is made.
+
+        Returns:
+            Whether it was there to the end; False where another machine removed it meanwhile.
 
         Raises:
             BucketError: the bucket cannot be read now.
@@ -162,7 +165,11 @@ class Bucket:
                 raise DataError(f"{self.url}/{place}: a file is called {name!r}, which leads out of the artefact")
         folder.mkdir(parents=True)
         names[f"artefacts/{stage}/{key}/{RUN_FILE}"] = RUN_FILE
-        self._side_by_side(lambda item: self.fetch(item[0], folder / item[1]), names.items())
+        try:
+            self._side_by_side(lambda item: self.fetch(item[0], folder / item[1]), names.items())
+        except FileNotFoundError:  # what was missing before is not in the list
+            return False
+        return True
 
     def upload(self, stage: str, key: str, digest: str, folder: Path) -> bool:
         """Send a finished artefact, its provenance record last.

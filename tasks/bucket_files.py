@@ -27,7 +27,7 @@ OWN_FILES = ("lock", "claimed.json")
 STATE_FILE = "shared_files.json"
 State = dict[str, list[Any]]
 """By name: size, time of modification in ns and SHA-256 of the file; and size and version of the object, None while it
-is being sent."""
+is being sent, empty where another machine has removed it since."""
 
 
 def fetch_files(home: Path, bucket: Bucket, folders: tuple[str, ...] = FETCHED) -> int:
@@ -48,7 +48,10 @@ def fetch_files(home: Path, bucket: Bucket, folders: tuple[str, ...] = FETCHED) 
                 if path.exists() and name in state and state[name][-1] in (there, None):  # None: ours is to be sent
                     continue
                 temporary = path.with_name(f".{path.name}.fetched")
-                bucket.fetch(name, temporary)
+                try:
+                    bucket.fetch(name, temporary)
+                except FileNotFoundError:  # removed since it was listed
+                    continue
                 temporary.replace(path)
                 state[name] = [*_file_state(path), there]
                 fetched += 1
@@ -73,7 +76,8 @@ def send_files(home: Path, bucket: Bucket, folders: tuple[str, ...] = SENT) -> i
                 bucket.send(path, name)
             objects = bucket.list(folder) if changed else {}
             for name in changed:
-                state[name][-1] = _object_state(objects[name.partition("/")[2]])
+                sent_as = objects.get(name.partition("/")[2])
+                state[name][-1] = [] if sent_as is None else _object_state(sent_as)
             if folder == EVENTS:
                 # Streams of the export before would lie among those of this one.
                 exports = {PurePosixPath(name).parts[1] for name in changed}

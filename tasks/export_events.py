@@ -1,5 +1,8 @@
 """Generated frames as event streams in files, for users of events rather than images."""
 
+# pyarrow.compute makes its functions when it is imported, where a type checker cannot see them.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import itertools
@@ -11,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from ctlev_core import plugins
 from ctlev_core.events import files as event_files
@@ -137,9 +141,13 @@ def _in_image(events: Events, options: Any) -> Events:
 
 def _windows(rows: list[dict[str, Any]], recordings: Manifest) -> Iterator[Events]:
     """The events of each row; at its ends also those others that have the same time stamp."""
-    wanted = {row["recording_id"] for row in rows}
-    known = {row["recording_id"]: row for row in recordings.table.to_pylist() if row["recording_id"] in wanted}
-    parts = recordings.attached(tables.PARTS).to_pylist()
+    # Rows of Python's are made of these recordings alone: those of a million would take a gigabyte.
+    wanted = pa.array(sorted({row["recording_id"] for row in rows}), pa.string())
+    table, parts = (
+        every.filter(pc.is_in(every["recording_id"], wanted)).to_pylist()
+        for every in (recordings.table, recordings.attached(tables.PARTS))
+    )
+    known = {row["recording_id"]: row for row in table}
     for row in rows:
         stored = stored_events(recordings, known[row["recording_id"]])
         start_us, end_us = row["t_start_us"], row["t_end_us"]

@@ -61,6 +61,10 @@ class WorkerError(RuntimeError):
     """A process that did our work is gone."""
 
 
+class ProcessesClosedError(WorkerError):
+    """Another call failed, or the run was interrupted; says nothing about what went wrong."""
+
+
 class Runner(Protocol):
     """Something that computes for us; `count` calls at once."""
 
@@ -128,6 +132,9 @@ def asked_cluster(count: int) -> Runner | None:
 
     Args:
         count: processes of a local one.
+
+    Raises:
+        DataError: it cannot be started or reached, or is of another kind than needed.
     """
     kind, address = asked_runner()
     if kind not in _PACKAGES:
@@ -135,7 +142,15 @@ def asked_cluster(count: int) -> Runner | None:
     with _starting:
         cluster = _running.get((kind, address))
         if cluster is None:
-            cluster = _running[kind, address] = _cluster_class(kind)(address, count)
+            try:
+                cluster = _running[kind, address] = _cluster_class(kind)(address, count)
+            except DataError:
+                raise
+            except (ValueError, RuntimeError, OSError) as error:  # an address that is none, another version, nobody
+                asked = f"{kind}:{address}" if address else kind
+                raise DataError(
+                    f"CTLEV_RUNNER={asked}: there is no such cluster, or it cannot be used: {error}"
+                ) from error
             atexit.register(cluster.close)
         return cluster
 
@@ -227,12 +242,14 @@ class _Cluster(ABC):
 
     def __init__(self, address: str) -> None:
         self._name = type(self).__name__.lower() + (f":{address}" if address else "")
+        self._closed = False
 
     def call(self, function: Callable[..., R], *arguments: Any) -> R:
         try:
             succeeded, result = pickle.loads(self._reply(function, arguments))
         except Exception as error:
-            raise WorkerError(f"{self._name}: a call was lost: {type(error).__name__}: {error}") from error
+            kind = ProcessesClosedError if self._closed else WorkerError
+            raise kind(f"{self._name}: a call was lost: {type(error).__name__}: {error}") from error
         if not succeeded:
             raise result
         return result
@@ -246,6 +263,7 @@ class _Cluster(ABC):
         return
 
     def close(self) -> None:
+        self._closed = True
         for key in [key for key, cluster in _running.items() if cluster is self]:
             del _running[key]
         atexit.unregister(self.close)
@@ -316,7 +334,6 @@ class Ray(_Cluster):
         ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **own)
         self._compute = ray.remote(num_cpus=1)(compute_there)
         self.count = max(int(ray.cluster_resources().get("CPU", 1)), 1)
-        self._closed = False
         self._waiting = 0
         self._changed = threading.Condition()
 
@@ -341,7 +358,6 @@ class Ray(_Cluster):
         """As Dask's, once the calls that wait have been told."""
         super().close()
         with self._changed:
-            self._closed = True
             self._changed.wait_for(lambda: not self._waiting, timeout=CONNECT_TIMEOUT_S)
         self._ray.shutdown()
 

@@ -30,6 +30,7 @@ import platform
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import threading
 import time
@@ -51,7 +52,7 @@ from ctlev_core.provenance.raw_file_digests import digest_raw_files
 from data_contracts.arrays import save_compressed
 from data_contracts.compressed_arrays import SUFFIX, CompressedArrayWriter
 from data_contracts.config import Choice, cache_material
-from data_contracts.errors import DataError
+from data_contracts.errors import DataError, shortened
 from data_contracts.file_lists import files_of
 from data_contracts.manifest import ManifestRef, read_manifest, write_manifest
 from data_contracts.table_writer import TableWriter
@@ -316,13 +317,25 @@ class Stage:
         return {ref.key: ref.digest for value in values for ref in _references(value)}
 
     def _key(self, arguments: dict[str, Any], materials: dict[str, Any], store: Store) -> str:
-        material: dict[str, Any] = {"stage": self.name, "version": self.version, "table": self.schema.version}
-        material["arguments"] = materials
+        material = self._versions_of(materials)
         if self.raw_files is not None:
             material["raw_files"] = digest_raw_files(self.raw_files(arguments), store.home)
             if material["raw_files"]:
                 material |= {kind: plugins.versions(kind) for kind in self.readers}
         return hashlib.sha256(json.dumps(material, sort_keys=True).encode()).hexdigest()[:32]
+
+    def _versions_of(self, materials: dict[str, Any]) -> dict[str, Any]:
+        """What of the code and the arguments decides the result, beside raw files and what reads them."""
+        return {"stage": self.name, "version": self.version, "table": self.schema.version, "arguments": materials}
+
+    def check_versions(self, arguments: dict[str, Any], asked: dict[str, Any]) -> None:
+        """Raise `DataError` where what `_versions_of` says here is not what was asked for by another machine."""
+        found = self._versions_of(self._materials(arguments))
+        for name in (name for name, value in found.items() if value != asked.get(name)):
+            raise DataError(
+                f"{self.name}: {socket.gethostname()} has another version of ctlev: expected "
+                f"{shortened(repr({name: asked.get(name)}), 300)}, got {shortened(repr({name: found[name]}), 300)}"
+            )
 
     def run(self, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
         """Return the artefact and whether it was already there."""
@@ -345,7 +358,8 @@ class Stage:
                 found = self.find(key, arguments)
                 if found is not None:
                     return found, True
-                ref, cached = workers.call(_run_stage, self.function.__module__, self.name, key, arguments)
+                asked = self._versions_of(self._materials(arguments))
+                ref, cached = workers.call(_run_stage, self.function.__module__, self.name, key, arguments, asked)
                 return Store().here(ref), cached
         store, upstream = Store(), self._upstream(arguments)
         with store.lock(key, f"artefact {self.name}/{key}"):
@@ -521,9 +535,13 @@ def stage(
     return lambda function: Stage(function, version, schema, raw_files, readers, optional, aside, spreads)
 
 
-def _run_stage(module: str, name: str, key: str, arguments: dict[str, Any]) -> tuple[ManifestRef, bool]:
-    """`Stage.run` in another process."""
-    return getattr(importlib.import_module(module), name).run(key, arguments)
+def _run_stage(
+    module: str, name: str, key: str, arguments: dict[str, Any], asked: dict[str, Any]
+) -> tuple[ManifestRef, bool]:
+    """`Stage.run` in another process, perhaps of a machine whose code would make something else of that key."""
+    found: Stage = getattr(importlib.import_module(module), name)
+    found.check_versions(arguments, asked)
+    return found.run(key, arguments)
 
 
 def _references(value: Any) -> list[ManifestRef]:

@@ -335,7 +335,8 @@ class Store:
                 if record is None:
                     return False
                 if upstream is None or record.upstream == upstream:
-                    bucket.download(stage, key, record.digest, temporary)
+                    if not bucket.download(stage, key, record.digest, temporary):
+                        return False
                     self.check(temporary)
                     with self._cache.holding(f"{stage}/{key}"):
                         self._move_in(stage, key, temporary)
@@ -474,8 +475,7 @@ class Store:
         folder = self.home / "tmp" / uuid.uuid4().hex / key
         try:
             record = bucket.record(stage, key)
-            if record is not None:
-                bucket.download(stage, key, record.digest, folder)
+            if record is not None and bucket.download(stage, key, record.digest, folder):
                 self.check(folder)
         finally:
             shutil.rmtree(folder.parent, ignore_errors=True)

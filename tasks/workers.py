@@ -28,6 +28,7 @@ from ctlev_core.progress import Progress, Report, current_report, reporting_to
 from data_contracts.errors import DataError
 from tasks.runners import (
     ALONE,
+    ProcessesClosedError,
     Runner,
     WorkerError,
     asked_cluster,
@@ -47,10 +48,6 @@ MAX_GROUP = 16
 """Shards that travel together; what they return is held until the first of them is wanted."""
 WAITING = 2
 """Groups a process that may be ahead of the one that is wanted."""
-
-
-class ProcessesClosedError(WorkerError):
-    """Another call failed, or the run was interrupted; says nothing about what went wrong."""
 
 
 class Worker:

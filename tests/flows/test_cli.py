@@ -65,6 +65,14 @@ def test_presets_are_told_a_line_each():
         assert line.endswith(")")
 
 
+@pytest.mark.parametrize("arguments", [["presets"], ["--version"]])
+def test_output_that_cannot_be_written_is_an_error(arguments):
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "flows.cli", *arguments]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120, cwd=REPOSITORY)
+    assert (done.returncode, done.stderr) == (2, "error: [Errno 28] No space left on device\n")
+
+
 def test_plan_is_the_dry_run_of_the_script(tmp_path):
     plan = invoke("run", "smoke", "--dry-run", "--home", str(tmp_path))
     assert plan[0] == 0

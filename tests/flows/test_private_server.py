@@ -17,6 +17,7 @@ from pathlib import Path
 
 import deployment_service
 import flow_scripts
+import httpx
 import pytest
 from flow_scripts import digests, script
 
@@ -237,6 +238,19 @@ def test_a_server_of_the_user_that_does_not_answer_is_told_of(tmp_path):
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert done.stdout.startswith(f"PREFECT_API_URL: Failed to reach API at {url}/ (") and done.returncode == 0
     assert "start that server, or unset the variable" in done.stdout
+
+
+@pytest.mark.parametrize("error", ["ConnectError", "ReadTimeout"])
+def test_a_server_of_the_user_that_is_lost_in_the_middle_is_told_of(error, monkeypatch):
+    from flows import local_server
+
+    monkeypatch.setattr(local_server, "_server", None)
+    monkeypatch.setattr(local_server, "_check_server_of_user", lambda: None)
+    lost = pytest.raises(local_server.ServerLostError, match="the server was lost in the middle of the run: gone; fin")
+    with lost, local_server.connected():
+        raise getattr(httpx, error)("gone")
+    with pytest.raises(KeyError), local_server.connected():
+        raise KeyError("ours")
 
 
 def test_a_private_server_that_cannot_start_is_told_of_with_its_log(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from ctlev_core.events import files as event_files
 from ctlev_core.studio.labelled_recordings import BOX
 from ctlev_core.video.coco_masks import read_runs
+from flows import record
 from flows.record import record_people
 
 SMALL = ("sensor_size=[48, 36]", "recording_duration_us=50_000")
@@ -113,3 +115,50 @@ def test_what_is_of_this_command_is_replaced_and_nothing_else(tmp_path, capsys):
         assert record_people(folder, 1, SMALL, overwrite=True) == 2
         assert "folders that `ctlev record` made, and this is none" in capsys.readouterr().err
     assert (other / "labels.json").read_text() == "mine" and sorted(tmp_path.iterdir()) == [other, own]
+
+
+def test_two_at_once_do_not_mix_and_the_folder_we_are_in_is_one_that_is_there(tmp_path, capsys, monkeypatch):
+    folder, seconds = tmp_path / "out", []
+    write = record.write_labelled
+
+    def meet(*arguments, **options):
+        if not seconds:
+            seconds.append(None)
+            seconds[0] = record_people(folder, 1, SMALL, rate_hz=20.0)
+        return write(*arguments, **options)
+
+    monkeypatch.setattr(record, "write_labelled", meet)
+    assert record_people(folder, 2, SMALL, rate_hz=20.0) == 0 and seconds == [2]
+    assert "out: another process is recording into this folder" in capsys.readouterr().err
+    named = json.loads((folder / "labels.json").read_text())["videos"]
+    assert {video["name"] for video in named} == {path.name for path in folder.iterdir() if path.is_dir()}
+    assert len(named) == 2 and list(tmp_path.iterdir()) == [folder]
+    monkeypatch.chdir(folder)
+    assert record_people(Path("."), 1, SMALL) == 2 and "out: is there already" in capsys.readouterr().err
+
+
+def test_what_a_killed_process_left_is_not_mixed_in(tmp_path):
+    left = tmp_path / ".partial-out"
+    (left / "condition_left").mkdir(parents=True)
+    (left / "labels.json").write_text("half")
+    assert record_people(tmp_path / "out", 1, SMALL, rate_hz=20.0) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    assert not (tmp_path / "out" / "condition_left").exists()
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_others_wrote_stays_however_the_folder_is_named(tmp_path, capsys, monkeypatch, overwrite):
+    (tmp_path / "mine").write_text("mine")
+    assert record_people(tmp_path / "new" / "..", 1, SMALL, overwrite=overwrite) == 2
+    write = record.write_labelled
+
+    def write_late(*arguments, **options):
+        (tmp_path / "out").mkdir(exist_ok=True)
+        (tmp_path / "out" / "mine").write_text("mine")
+        return write(*arguments, **options)
+
+    monkeypatch.setattr(record, "write_labelled", write_late)
+    assert record_people(tmp_path / "out", 1, SMALL, rate_hz=20.0, overwrite=overwrite) == 2
+    assert capsys.readouterr().err.count("--overwrite replaces") == 2
+    assert [path.read_text() for path in (tmp_path / "mine", tmp_path / "out" / "mine")] == ["mine"] * 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out"]

@@ -393,3 +393,22 @@ def test_a_home_folder_asks_no_bucket(tmp_path, monkeypatch):
     store.connect(send=True)
     store.send_files()
     assert not {"in_use", "uploaded", "shared_files.json"} & {path.name for path in tmp_path.iterdir()}
+
+
+def test_an_artefact_that_another_machine_removes_while_it_is_fetched_is_not_there(machine, monkeypatch):
+    first, second = machine("a"), machine("b")
+    publish(first, 1)
+    listed = Bucket.list
+
+    def list_and_lose(self, folder):
+        found = listed(self, folder)
+        if folder.startswith("artefacts/encode/"):
+            monkeypatch.setattr(Bucket, "list", listed)
+            first.bucket.remove("encode", key(1))
+        return found
+
+    monkeypatch.setattr(Bucket, "list", list_and_lose)
+    assert second.find("encode", key(1)) is None and not half_made(second)
+    publish(second, 1)
+    monkeypatch.setattr(Bucket, "list", list_and_lose)
+    second.check_in_bucket(second.bucket, "encode", key(1))

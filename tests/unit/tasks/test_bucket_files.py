@@ -98,6 +98,41 @@ def test_an_object_that_leads_out_of_the_home_is_refused(machine, bucket, monkey
         fetch_files(machine("a"), bucket)
 
 
+def test_a_report_that_is_removed_after_it_was_listed_is_passed_over(machine, bucket, monkeypatch):
+    for name in ("one", "two"):
+        write(machine("a"), f"reports/{name}.html", name)
+    send_files(machine("a"), bucket)
+    listed = Bucket.list
+
+    def list_and_lose(self, folder):
+        found = listed(self, folder)
+        bucket.delete("reports/one.html")
+        return found
+
+    monkeypatch.setattr(Bucket, "list", list_and_lose)
+    assert fetch_files(machine("b"), bucket) == 1
+    assert [path.name for path in (machine("b") / "reports").iterdir()] == ["two.html"]
+
+
+def test_machines_that_export_at_once_end_with_the_files_of_the_later_one(machine, bucket, monkeypatch):
+    first, second = machine("a"), machine("b")
+    for number in (0, 1):
+        write(first, f"events/demo/{number}.parquet", "first")
+    write(second, "events/demo/0.parquet", "second")
+    send = Bucket.send
+
+    def send_and_meet(self, path, name):
+        send(self, path, name)
+        if {f"events/demo/{number}.parquet" for number in (0, 1)} <= bucket_server.objects(bucket.url).keys():
+            monkeypatch.setattr(Bucket, "send", send)
+            send_files(second, bucket)
+
+    monkeypatch.setattr(Bucket, "send", send_and_meet)
+    assert send_files(first, bucket) == 2
+    assert bucket_server.objects(bucket.url) == {"events/demo/0.parquet": b"second"}
+    assert send_files(first, bucket) == send_files(second, bucket) == 0
+
+
 def test_events_are_sent_and_those_of_the_export_before_go(machine, bucket):
     home = machine("a")
     for name in ("a/events/1.aedat4", "a/events/2.aedat4", "b/events/1.aedat4"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -210,6 +212,30 @@ def test_windows_are_found_in_their_recording(tmp_path):
         inside = (events.t >= row["t_start_us"]) & (events.t <= row["t_end_us"])
         np.testing.assert_array_equal(window.t, events.t[inside])
         np.testing.assert_array_equal(window.x, events.x[inside])
+
+
+def test_memory_for_windows_does_not_grow_with_the_recordings(tmp_path):
+    recordings, rows = write_recordings(tmp_path / "r"), write_frames(tmp_path / "f", True).table.to_pylist()
+    first, parts = recordings.table.slice(0, 1), recordings.attached(tables.PARTS)
+    index = first.column_names.index("recording_id")
+    names = pa.array([f"other{number:05d}" for number in range(20_000)])
+    others = first.take(np.zeros(len(names), int)).set_column(index, first.schema.field(index), names)
+    other_parts = parts.take(np.zeros(len(names), int)).set_column(0, parts.schema.field(0), names)
+
+    class Many:
+        table = pa.concat_tables([others, recordings.table])
+
+        def attached(self, schema):
+            return pa.concat_tables([other_parts, parts])
+
+        def __getattr__(self, name):
+            return getattr(recordings, name)
+
+    tracemalloc.start()
+    found = sum(len(events) for events in task._windows(rows, Many()))
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found >= len(rows) * NUM_EVENTS and peak_bytes < 2e6, "Python's records of all would be 20 MB"
 
 
 def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):

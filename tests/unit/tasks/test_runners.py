@@ -19,7 +19,16 @@ import pytest
 from data_contracts import tables
 from data_contracts.errors import DataError
 from tasks import runners
-from tasks.runners import ALIKE, WorkerError, asked_runner, environment_there, is_elsewhere, num_jobs, reply_to
+from tasks.runners import (
+    ALIKE,
+    ProcessesClosedError,
+    WorkerError,
+    asked_runner,
+    environment_there,
+    is_elsewhere,
+    num_jobs,
+    reply_to,
+)
 from tasks.stage import planning, stage
 from tasks.store import Store
 from tasks.workers import MAX_GROUP, Workers, _groups, current_workers, is_spread, map_shards, together
@@ -67,6 +76,12 @@ def losses_of_one_process(out, *, seed):
     return pa.table({"curve": ["training"], "step": pa.array([seed], pa.int64()), "loss": draw(seed)[:1]})
 
 
+@stage(version=int(os.environ.get("VERSION_OF_TEST_STAGE", "1")), schema=tables.TRAINING)
+def losses_of_a_version(out, *, seed):
+    """Of a stage whose code differs from machine to machine."""
+    return pa.table({"curve": ["training"], "step": pa.array([seed], pa.int64()), "loss": draw(seed)[:1]})
+
+
 def digests(home):
     """Of every artefact; all of its files were checked against it."""
     found = {}
@@ -92,6 +107,23 @@ def test_artefacts_do_not_depend_on_who_computes_them(kind, tmp_path, monkeypatc
     assert found == make(tmp_path / "alone") and len(found) == 5
 
 
+@pytest.mark.parametrize("kind", ["processes", *KINDS[2:3]])
+def test_a_machine_with_another_version_of_a_stage_makes_nothing_under_our_key(kind, home, monkeypatch):
+    def run(seed):
+        return losses_of_a_version.run(losses_of_a_version.key({"seed": seed}, Store()), {"seed": seed})
+
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    assert [cached for _, cached in together([partial(run, 0), partial(run, 1)])] == [False, False]
+    for cluster in list(runners._running.values()):
+        cluster.close()
+    monkeypatch.setenv("VERSION_OF_TEST_STAGE", "2")
+    with pytest.raises(
+        DataError, match=r"losses_of_a_version: .* has another version of ctlev.*'version': 1.*'version': 2"
+    ):
+        together([partial(run, 2), partial(run, 3)])
+    assert len(list(home.glob("artefacts/losses_of_a_version/*"))) == 2
+
+
 def run_stage(seed):
     return losses_of_one_process.run(losses_of_one_process.key({"seed": seed}, Store()), {"seed": seed})
 
@@ -114,6 +146,21 @@ def test_a_process_that_dies_is_an_error_that_says_so(kind, monkeypatch):
     monkeypatch.setenv("CTLEV_RUNNER", kind)
     with pytest.raises(WorkerError):
         list(map_shards(die, range(2)))
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_of_calls_side_by_side_the_one_that_died_is_told(kind, tmp_path, monkeypatch):
+    monkeypatch.setenv("CTLEV_RUNNER", kind)
+    monkeypatch.setenv("CTLEV_WORKERS", "3")
+    # Those that are ended for it would be told as often as not: whichever thread is awake first.
+    calls = [partial(call_there, sleep_a_minute, tmp_path / str(number)) for number in range(2)]
+    with pytest.raises(WorkerError) as found:
+        together([*calls, partial(call_there, die, 0)])
+    assert not isinstance(found.value, ProcessesClosedError)
+
+
+def call_there(function, *arguments):
+    return current_workers().call(function, *arguments)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("threads", "processes")])
@@ -165,6 +212,16 @@ def environment(name):
 
 def die(shard):
     os._exit(3)
+
+
+@pytest.mark.parametrize(
+    ("asked", "package"), [("dask:node", "distributed"), ("dask:foo://node:1", "distributed"), ("ray:node", "ray")]
+)
+def test_an_address_that_is_none_is_refused_with_the_variable(asked, package, monkeypatch):
+    pytest.importorskip(package)
+    monkeypatch.setenv("CTLEV_RUNNER", asked)
+    with pytest.raises(DataError, match=f"CTLEV_RUNNER={asked}: there is no such cluster"):
+        runners.asked_cluster(2)
 
 
 def test_the_rest_is_not_computed_where_nobody_wants_it():

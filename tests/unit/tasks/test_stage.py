@@ -183,7 +183,7 @@ class OneProcess:
     def __init__(self):
         self.calls, self.begun, self.go_on = [], threading.Event(), threading.Event()
 
-    def call(self, function, module, name, key, arguments):
+    def call(self, function, module, name, key, arguments, asked):
         self.calls.append(name)
         self.begun.set()
         assert self.go_on.wait(30)
