@@ -130,16 +130,18 @@ def load(kind: str, name: str) -> ModuleType:
         PluginError: there is no such plug-in, then the message lists the known ones; or it lacks what its kind has.
     """
     path = _module_of(kind, name)
-    # One that was loaded before is not looked at once more, which plans would do a thousand times.
+    # The names are not listed once more for one that was loaded before, which plans would do a thousand times.
     if not (kind in KINDS and name.isidentifier() and not name.startswith("_") and path in sys.modules):
         known = names(kind)
         if name not in known:
             hint = name_hint(name, known, RENAMED_VALUES)
             raise PluginError(f"unknown plug-in {name!r} in {kind}{hint}; known: {', '.join(known)}")
-        _check_contract(kind, importlib.import_module(path))
-    return importlib.import_module(path)  # which waits where another thread has begun to import it
+    module = importlib.import_module(path)  # which waits where another thread has begun to import it
+    _check_contract(kind, module)
+    return module
 
 
+@cache  # of modules that keep it: one that does not is refused whenever it is loaded
 def _check_contract(kind: str, module: ModuleType) -> None:
     from ctlev_core.plugin_contracts import missing_names
 

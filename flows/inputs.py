@@ -153,10 +153,11 @@ def check_whole_counts(experiment: Experiment, what: str) -> None:
     # A sensor whose size only its files tell may have that of the image; with `events` it comes to the same.
     other = [one for one in recordings if one.has_events and one.sensor_size != image_size]
     if other:
-        width, height = other[0].sensor_size or ("unknown", "unknown")
+        size = other[0].sensor_size
+        sensor = f"sensors of {size[0]} x {size[1]} px" if size else "sensors whose sizes only their files tell"
         raise PluginError(
             f"{what} needs whole counts of image pixels, and images of {image_size[0]} x {image_size[1]} px are "
-            f"averages over areas of sensors of {width} x {height} px: set encoding.options.resampling=events, or no "
+            f"averages over areas of {sensor}: set encoding.options.resampling=events, or no "
             "encoding.options.image_size"
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -160,7 +161,7 @@ def _labels(card: Card) -> str:
     counts.pop("", None)
     parts = []
     if counts:
-        common = [f"{name} ({count:,})" for name, count in sorted(counts.items())[:MAX_CLASSES]]
+        common = [f"{_literal(name)} ({count:,})" for name, count in sorted(counts.items())[:MAX_CLASSES]]
         more = f" and {len(counts) - MAX_CLASSES} more" if len(counts) > MAX_CLASSES else ""
         parts.append(f"{len(counts):,} classes, in the column `class_name`: {', '.join(common)}{more}.")
     joint_set = card.table["joint_set"][0].as_py()
@@ -173,6 +174,11 @@ def _labels(card: Card) -> str:
             "NaN means unknown; reshape lists of joints to J x 2 or J x 3."
         )
     return "\n\n".join(["## Labels", *parts]) if parts else ""
+
+
+def _literal(text: str) -> str:
+    """A name from elsewhere, with every sign escaped that Markdown or HTML would read."""
+    return re.sub(r"([\\`*_\[\]<>|#~&])", r"\\\1", text)
 
 
 def _columns(card: Card) -> str:

@@ -25,6 +25,7 @@ from data_contracts.config import Frozen, Windows
 from data_contracts.errors import DataError
 from data_contracts.events import EVENT_DTYPES, Events, check_events
 from data_contracts.experiment import Experiment
+from data_contracts.image_rows import ImageRows
 from data_contracts.labels import Labels
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -90,6 +91,11 @@ def write_plain16(path: Path, events: Events) -> None:
     for name in EVENT_DTYPES:
         records[name] = getattr(events, name)
     path.write_bytes(b"EV16" + np.array(events.sensor_size, "<u2").tobytes() + records.tobytes())
+
+
+def on_disk(frames: np.ndarray) -> ImageRows:
+    """Frames as stages hand them to `train` and `predict`."""
+    return ImageRows.of([(frames, np.arange(len(frames)))])
 
 
 def load(kind: str, name: str, **options):
@@ -260,7 +266,7 @@ def test_the_generator_gives_training_frames_whatever_the_batch(chain, tmp_path)
     generator, options = load("generators", "nearest")
     frames, _, conditions = chain["train"]
     _, _, asked = chain["test"]
-    generator.train(frames, conditions, options, seed=0, out=tmp_path / "checkpoint", work=tmp_path)
+    generator.train(on_disk(frames), conditions, options, seed=0, out=tmp_path / "checkpoint", work=tmp_path)
     sample_options = generator.SampleOptions(num_nearest=3)
     seeds = list(range(len(asked)))
     made = generator.sample(tmp_path / "checkpoint", asked, sample_options, seeds=seeds, work=tmp_path)
@@ -275,8 +281,8 @@ def test_the_model_learns_where_the_points_are(chain, tmp_path):
     model, options = load("downstream", "linear_pose")
     frames, labels, _ = chain["train"]
     held_out, target, _ = chain["test"]
-    model.train(frames, labels, options, seed=0, out=tmp_path / "model", work=tmp_path)
-    predicted = model.predict(tmp_path / "model", held_out)
+    model.train(on_disk(frames), labels, options, seed=0, out=tmp_path / "model", work=tmp_path)
+    predicted = model.predict(tmp_path / "model", on_disk(held_out))
     metric, none = load("metrics", "worst_joint")
     assert target.joints2d is not None and labels.joints2d is not None
     score = metric.compute(predicted, target, none)["worst_joint_px"]

@@ -179,8 +179,9 @@ def test_what_a_plugin_lacks_is_named(tmp_path, monkeypatch):
 
     (tmp_path / "half_metric.py").write_text("VERSION = 1\nINPUT = 'classes'\nSCORES = ()\nOptions = None\n")
     monkeypatch.setattr(ctlev_core.metrics, "__path__", [*ctlev_core.metrics.__path__, str(tmp_path)])
-    with pytest.raises(PluginError, match=r"half_metric.py: expected the names of Metric in .*, lacks compute$"):
-        plugins.load("metrics", "half_metric")
+    for _ in range(2):  # it is imported by then, and incomplete all the same
+        with pytest.raises(PluginError, match=r"half_metric.py: expected the names of Metric in .*, lacks compute$"):
+            plugins.load("metrics", "half_metric")
     del sys.modules["ctlev_core.metrics.half_metric"]
 
 

@@ -1,16 +1,22 @@
 """What is wrong with a folder of recordings is said before anything runs, or where it is read."""
 
 import logging
+import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ctlev_core.plugins import PluginError
 from data_contracts.config import DatasetChoice
 from data_contracts.errors import DataError
 from flows.command_line import load_experiment
 from flows.inputs import check_num_classes
 from tasks.ingest import ingest
 from tasks.store import Store
+
+REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 def write_blob(path, left, top):
@@ -47,3 +53,13 @@ def test_a_classifier_of_one_class_is_refused_and_a_generator_is_not(tmp_path):
         check_num_classes(experiment)
     write_blob(tmp_path / "one" / "a.csv", 20, 20)
     check_num_classes(experiment)
+
+
+def test_event_streams_of_own_recordings_are_asked_for_as_the_quick_start_says(tmp_path):
+    write_blob(tmp_path / "one" / "a.csv", 20, 20)
+    page = (REPOSITORY / "docs" / "quick_start.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^- `(--set 'export=[^`]*)`", page, re.MULTILINE)
+    root, *options = f"dataset.options.root={tmp_path}", *shlex.split(line.replace("--set ", ""))
+    load_experiment("folder", [root, *options])
+    with pytest.raises(PluginError, match="averages over areas of sensors whose sizes only their files tell: set"):
+        load_experiment("folder", [root, options[0]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from dataclasses import replace
@@ -9,11 +10,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pandas
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
 from generated_frames import REJECTED_ROW, make_generated, make_streams, publish
+from markdown_it import MarkdownIt
 
+from ctlev_core.export.dataset_card import Card, render_card
 from ctlev_core.export.event_dataset import EventDataset
 from ctlev_core.provenance.records import read_provenance
 from data_contracts import image_folder, tables
@@ -74,6 +78,15 @@ def test_a_text_route_has_classes_alone(tmp_path):
     assert not (folder / "conditions").exists()
     text = (folder / "README.md").read_text()
     assert "3 classes, in the column `class_name`: bow (2), jump (1), walk (3)." in text and "Joints" not in text
+
+
+def test_names_of_classes_are_text_in_the_description(tmp_path):
+    table = pq.read_table(export(make_generated(tmp_path / "home"), tmp_path / "mine") / "labels.parquet")
+    names = ["_a_ *b*", "`c` <i>d", "[e](f) ~~g~~ &lt;"] * 2
+    column = table.schema.get_field_index("class_name")
+    card = Card("mine", "", table.set_column(column, "class_name", pa.array(names)), (20, 14), 0, "", [])
+    shown = html.unescape(MarkdownIt().enable("strikethrough").render(render_card(card)))
+    assert "_a_ *b* (2), `c` <i>d (2)" in shown and "[e](f) ~~g~~ &lt; (2)" in shown
 
 
 def test_the_description_says_what_it_is_and_its_code_runs(tmp_path, monkeypatch):
