@@ -14,6 +14,21 @@ import flow_scripts
 import pytest
 from flow_scripts import run_script
 
+FOLDER = Path(__file__).parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put a file whose tests need the finished smoke run first in this folder, and the other such files last.
+
+    A process of tests that needs the run while another makes it does nothing but wait.
+    """
+    positions = [position for position, item in enumerate(items) if FOLDER in item.path.parents]
+    own = [items[position] for position in positions]
+    needing = list(dict.fromkeys(item.path for item in own if "smoke_home" in getattr(item, "fixturenames", ())))
+    own.sort(key=lambda item: (item.path in needing) - 2 * (item.path in needing[:1]))
+    for position, item in zip(positions, own, strict=True):
+        items[position] = item
+
 
 @contextlib.contextmanager
 def server(home: Path) -> Iterator[dict[str, str]]:
@@ -60,6 +75,7 @@ def smoke_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
             finished = run_script("full_experiment", "--preset", "smoke", home=own, own_server=True)
             assert finished.status == 0, finished.errors
             (own / "first_run.txt").write_text(finished.output)
+            (own / "first_run_errors.txt").write_text(finished.errors)
             shutil.copytree(own, run.with_name("unfinished_copy"), symlinks=True)
             run.with_name("unfinished_copy").rename(run)
             return own

@@ -111,6 +111,15 @@ def _not_reached() -> Iterator[None]:
     yield
 
 
+def told_stages(errors: str) -> tuple[int, list[re.Match[str]]]:
+    """How many stages a run said it has, and what it told of each: number, of how many, stage, rows."""
+    first, *lines = [line for line in errors.splitlines() if line.strip()]
+    total = re.match(r"(\d+) stages", first)
+    told = [re.fullmatch(r"\[ *(\d+)/(\d+)\] (\w+).*  ([\d,]+) rows  [\d.]+ s(  about .* left)?", one) for one in lines]
+    assert total and all(told), errors
+    return int(total[1]), [one for one in told if one]
+
+
 def artefacts(home: Path, stage: str, plugin: str = "") -> list[Manifest]:
     """Every artefact of a stage, its files checked; with `plugin` (kind/name) those that were made with it."""
     found = []

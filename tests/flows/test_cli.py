@@ -15,7 +15,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from flow_scripts import REPOSITORY, run_script
+from flow_scripts import REPOSITORY, run_script, run_script_here, told_stages
 from typer.testing import CliRunner
 
 from ctlev_core import __version__
@@ -258,14 +258,9 @@ def test_importing_a_module_changes_nothing(tmp_path):
 
 
 def test_off_a_terminal_a_run_tells_each_stage_and_then_the_answer(tmp_path):
-    finished = run_script("prepare_dataset", "--preset", "smoke", home=tmp_path)
+    finished = run_script_here("prepare_dataset", "--preset", "smoke", home=tmp_path)
     assert finished.status == 0, finished.errors
-    first, *stages = [line for line in finished.errors.splitlines() if line.strip()]
-    total = int(re.match(r"(\d+) stages", first)[1])
-    told = [
-        re.fullmatch(r"\[ *(\d+)/(\d+)\] (\w+).*  ([\d,]+) rows  [\d.]+ s(  about .* left)?", one) for one in stages
-    ]
-    assert all(told), stages
+    total, told = told_stages(finished.errors)
     assert [int(one[1]) for one in told] == list(range(1, total + 1))
     assert {one[3] for one in told} == {"ingest", "encode", "condition_frames", "condition_samples", "contact_sheet"}
     answer = finished.output.splitlines()
@@ -273,5 +268,5 @@ def test_off_a_terminal_a_run_tells_each_stage_and_then_the_answer(tmp_path):
 
 
 def test_a_script_takes_what_it_took(tmp_path):
-    finished = run_script("prune", home=tmp_path)
+    finished = run_script("prune", home=tmp_path, own_server=True)  # which it does not start
     assert finished.status == 0 and "0 of 0 folders" in finished.output

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from flow_scripts import REPOSITORY, artefacts, digests, plan_script, run_script, run_script_here, script
+from flow_scripts import REPOSITORY, artefacts, digests, plan_script, run_script, run_script_here, script, told_stages
 
 from ctlev_core.events.files import read_events_file
 from ctlev_core.labels.body_views import smpl_joints
@@ -47,7 +47,9 @@ def test_smoke_ends_in_a_report(smoke_home):
     output = (smoke_home / "first_run.txt").read_text()
     verdict, where, *_, last = output.splitlines()
     assert "adding synthetic frames to the recorded ones helped" in verdict and f"reports/{report.name}" in where
-    assert re.fullmatch(r"(\d+) stages, 0 of them cached, in .+", last)
+    total, told = told_stages((smoke_home / "first_run_errors.txt").read_text())
+    assert sorted(int(one[1]) for one in told) == list(range(1, total + 1))
+    assert re.fullmatch(rf"{total} stages, 0 of them cached, in .+", last)
 
 
 def test_every_artefact_is_whole_and_says_where_it_came_from(smoke_home):

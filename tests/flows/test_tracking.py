@@ -11,7 +11,7 @@ import urllib.request
 
 import numpy as np
 import pytest
-from flow_scripts import run_script
+from flow_scripts import plan_script, run_script
 
 from data_contracts.manifest import ManifestRef
 from data_contracts.run_record import read_run_record
@@ -137,6 +137,6 @@ def test_trackers_that_are_not_there_are_refused_before_anything_runs(kind, tmp_
         with pytest.raises(tracking.PluginError, match=r"--track mlflow needs the package 'mlflow': pip install"):
             tracking.check_tracker(kind)
         return
-    finished = run_script("full_experiment", "--preset", "smoke", "--track", kind, home=tmp_path)
+    finished = plan_script("full_experiment", "--preset", "smoke", "--track", kind, home=tmp_path)
     assert finished.status == 2 and f"--track: expected {', '.join(KINDS)}, got 'comet'" in finished.errors
     assert not (tmp_path / "artefacts").exists()

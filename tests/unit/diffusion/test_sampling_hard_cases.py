@@ -51,6 +51,13 @@ def raising(error, limit):
     return before
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Frames [6, H, W, 3] as sampled where memory does not run out."""
+    work = tmp_path_factory.mktemp("whole")
+    return sample_frames(shared_base_model(), make_data(6, seed=4)[1], FAST, seeds=SEEDS, work=work)
+
+
 @pytest.mark.parametrize(
     "error",
     [
@@ -60,9 +67,8 @@ def raising(error, limit):
         MemoryError(),
     ],
 )
-def test_batches_are_halved_where_memory_runs_out(tmp_path, caplog, error):
+def test_batches_are_halved_where_memory_runs_out(tmp_path, caplog, whole, error):
     conditions = make_data(6, seed=4)[1]
-    whole = sample_frames(shared_base_model(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
     unet = Network(shared_base_model().unet, raising(error, limit=1))
     failing = dataclasses.replace(shared_base_model(), unet=unet)
     with caplog.at_level(logging.WARNING):
@@ -74,9 +80,8 @@ def test_batches_are_halved_where_memory_runs_out(tmp_path, caplog, error):
     assert unet.batches == [4, 2] + [1] * 18
 
 
-def test_what_was_sampled_is_not_sampled_again_for_a_decoder_that_takes_more_memory(tmp_path, monkeypatch):
+def test_what_was_sampled_is_not_sampled_again_for_a_decoder_that_takes_more_memory(tmp_path, monkeypatch, whole):
     conditions, unet = make_data(6, seed=4)[1], Network(shared_base_model().unet)
-    whole = sample_frames(shared_base_model(), conditions, FAST, seeds=SEEDS, work=tmp_path / "whole")
     decode, asked = sampling.decode_latents, []
 
     def narrow(base_model, latents):

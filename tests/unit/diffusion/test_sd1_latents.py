@@ -79,10 +79,11 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def base_model_of(folder):
-    """A base model of the given scaling factor."""
+    """A base model of the given scaling factor; its networks but the autoencoder are the same ones."""
+    loaded = load_base_model(folder)
 
     def make(scaling_factor=SCALING_FACTOR):
-        base_model = dataclasses.replace(load_base_model(folder), vae=tiny_autoencoder(scaling_factor))
+        base_model = dataclasses.replace(loaded, vae=tiny_autoencoder(scaling_factor))
         assert base_model.image_size == (SIDE, SIDE)
         return base_model
 
@@ -95,6 +96,13 @@ def latents(frames):
     with torch.no_grad():
         encoded = tiny_autoencoder().encode(images_to_tensor(np.stack(list(frames.values())))).latent_dist.mean
     return dict(zip(frames, encoded, strict=True))
+
+
+@pytest.fixture(scope="module")
+def cache(frames, base_model_of):
+    """All frames, encoded by a base model of the right factor."""
+    conditions = Conditions(tuple(f"a {name}" for name in frames))
+    return cache_latents(base_model_of(), np.stack(list(frames.values())), conditions)
 
 
 @pytest.fixture(scope="module")
@@ -142,11 +150,8 @@ def test_another_factor_on_the_way_back_draws_worse(frames, images, latents, bas
         assert psnr(wrong, frames[name]) < psnr(images[name], frames[name]) - loss_db, name
 
 
-def test_cached_latents_are_those_of_a_direct_call(frames, latents, base_model_of):
+def test_cached_latents_are_those_of_a_direct_call(cache, latents, base_model_of):
     base_model = base_model_of()
-    cache = cache_latents(
-        base_model, np.stack(list(frames.values())), Conditions(tuple(f"a {name}" for name in frames))
-    )
     direct = torch.stack(list(latents.values()))
     assert cache.latents.std is None
     torch.testing.assert_close(torch.from_numpy(cache.latents.mean), direct, rtol=0, atol=0)
@@ -158,9 +163,11 @@ def test_cached_latents_are_those_of_a_direct_call(frames, latents, base_model_o
 
 
 @pytest.mark.parametrize("scaling_factor", [SCALING_FACTOR, 1.0, SCALING_FACTOR**2])
-def test_a_wrong_factor_in_a_folder_is_noticed_before_training(frames, base_model_of, caplog, scaling_factor):
+def test_a_wrong_factor_in_a_folder_is_noticed_before_training(frames, cache, base_model_of, caplog, scaling_factor):
     conditions = Conditions(("an event image",) * len(frames))
-    cache = cache_latents(base_model_of(scaling_factor), np.stack(list(frames.values())), conditions)
+    # Of latents that are not scaled, which are those of any factor.
+    images, base_model = np.stack(list(frames.values())), base_model_of(scaling_factor)
+    cache = cache_latents(base_model, images, conditions, latents=cache.latents)
     with caplog.at_level(logging.WARNING):
         check_cache(cache, conditions)
     messages = [record.getMessage() for record in caplog.records]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ctlev_core.downstream import classifier
-from ctlev_core.supervised.binary_tasks import binary_rows
+from ctlev_core.supervised.binary_tasks import BINARY_FILE, binary_rows, predict_each
 from data_contracts.config import cache_material
 from data_contracts.errors import DataError
 from data_contracts.labels import Labels
@@ -52,6 +52,20 @@ def test_balanced_negatives_are_as_many_in_each_set_and_evenly_drawn(seed):
     again, _ = binary_rows(names, "a", "balanced", seed=seed, parts=[29, 3], groups=groups)
     other, _ = binary_rows(names, "a", "balanced", seed=seed + 100, parts=[29, 3], groups=groups)
     assert again.tolist() == rows.tolist() != other.tolist()
+
+
+def test_probabilities_are_shared_among_the_classes_also_where_none_is_seen(tmp_path):
+    said = {"000": [0.6, 0.0], "001": [0.3, 0.0], "002": [0.3, 0.0]}
+    (tmp_path / BINARY_FILE).write_text('{"classes": ["a", "b", "c"]}')
+
+    def predict(model):
+        own = np.array(said[model.name], np.float32)
+        name = "abc"[int(model.name)]
+        return {"probability": np.stack([1 - own, own], axis=1), "classes": np.array([f"not {name}", name])}
+
+    found = predict_each(predict, tmp_path)
+    np.testing.assert_allclose(found["probability"], [[0.5, 0.25, 0.25], [1 / 3] * 3], rtol=1e-6)
+    np.testing.assert_allclose(found["binary_probability"], np.transpose(list(said.values())))
 
 
 def test_each_is_the_classifier_of_its_own_two_classes(tmp_path):

@@ -69,6 +69,7 @@ def test_a_window_is_as_long_as_it_takes_the_pictures_to_change():
         assert abs((start + end) / 2 - 4) <= 1
     assert equally_different_window(images, track, 4000, 9000, 9.0, "here") == (0, 8000)
     assert equally_different_window(images, track, 4000, 2500, 9.0, "here") == (2000, 6000)
+    assert equally_different_window(images, track, 4000, 2000, 9.0, "here") == (2000, 6000), "as far as the reach"
     assert equally_different_window(images, track, 0, 9000, 0.02, "here")[0] == 0
     assert equally_different_window(images, track, 9000, 9000, 1e-9, "here") == (7000, 8000)
 
@@ -96,6 +97,8 @@ def test_key_poses_between_labels_are_those_of_constant_speed():
     track = turning([0, 50_000, 100_000, 150_000])
     t_us, pose, transl = motion_around(track, 70_000, 30_000, "here")
     np.testing.assert_array_equal(t_us, np.arange(40_000, 100_001, 10_000))
+    wider_us = motion_around(track, 70_000, 33_000, "here")[0]
+    assert len(wider_us) == 8 and np.diff(wider_us).max() <= 10_000
     expected = turning(t_us)
     # As matrices: half a turn has two axis-angle vectors.
     found, wanted = (

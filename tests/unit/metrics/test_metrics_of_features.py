@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import t
 
 from ctlev_core.metrics import fd_infinity, frechet, kid, mmd, prdc
 from ctlev_core.scoring.frechet import frechet_distance
@@ -169,6 +170,15 @@ def test_neighbour_scores_where_rows_repeat_and_far_from_the_origin():
         compute_prdc(judged, reference[:5], 5)
 
 
+@pytest.mark.parametrize(("count", "width"), [(7, 64), (7, 301), (33, 301), (7, 2048)])
+def test_rounding_puts_no_copy_out_of_the_ball_of_its_original(count, width):
+    """Where rows repeat, balls have no radius, and distances of 0 come out as differences of rounded numbers."""
+    for seed in range(6):
+        rows = normal(seed, count, width, offset=3)
+        found = compute_prdc(rows, np.repeat(rows, 7, axis=0), 5)
+        assert found["precision"] == found["coverage"] == 1
+
+
 def test_prdc_names_its_neighbours():
     a, b = normal(6, 40), normal(7, 40)
     found = prdc.compute(a, b, prdc.Options(num_neighbours=3))
@@ -259,6 +269,33 @@ def test_floor_and_halves_say_what_small_sets_do():
     assert far.floor == same.floor and far.halved > 5 * far.floor
     assert (same.num_predicted, same.num_target, same.num_features) == (100, 100, 6)
     assert estimate_distances(score, normal(13, 100), normal(14, 100))["fd"] == same
+
+
+@pytest.mark.parametrize(("recordings", "degrees"), [(5, 4), (60, 19)])
+def test_t_has_the_degrees_of_freedom_of_splits_or_recordings_whichever_are_fewer(recordings, degrees):
+    seen = []
+
+    def mean_difference(a, b):
+        seen.append(float(a.mean() - b.mean()))
+        return {"difference": seen[-1]}
+
+    groups = np.arange(60) % recordings
+    found = estimate_distances(mean_difference, normal(1, 60), normal(2, 60), predicted_groups=groups)["difference"]
+    # The whole sets, then for each of 20 splits both pairs of halves and the halves of the second set.
+    halves = np.array(seen[1:]).reshape(20, 3)
+    deviation = np.sqrt(np.mean((halves[:, 0] - halves[:, 1]) ** 2)) / 2
+    assert found.high - found.value == pytest.approx(t.ppf(0.975, degrees) * deviation)
+
+
+def test_either_half_of_an_odd_number_of_recordings_is_the_larger():
+    sizes = []
+
+    def count(a, b):
+        sizes.append(len(a))
+        return {"rows": 0.0}
+
+    estimate_distances(count, normal(1, 7), normal(2, 8))
+    assert set(sizes[1::3]) == set(sizes[2::3]) == {3, 4}
 
 
 def test_intervals_do_without_the_slow_import():

@@ -151,6 +151,9 @@ def test_durations_are_those_of_windows_of_like_size():
     large = {sample_duration_us(50_000, model, rng) for _ in range(400)}
     assert small == set(range(1_000, 1_016)) and large == set(range(9_016, 9_032))
     assert sample_duration_us(0, model, rng) in small
+    # Of windows of one number of events all are alike, and not those that come first.
+    equal = replace(model, num_events=np.full(32, 700))
+    assert {sample_duration_us(700, equal, rng) for _ in range(600)} == set(model.durations_us.tolist())
 
 
 def test_windows_without_times_to_learn_from_are_refused():

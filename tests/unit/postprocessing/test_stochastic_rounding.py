@@ -51,6 +51,13 @@ def test_polarities_keep_their_channels_and_black_stays_black():
     assert not round_stochastically(np.zeros_like(image), np.array([300]), polarity=True, seeds=[1]).any()
 
 
+def test_a_count_is_no_more_than_16_bits_hold():
+    image = np.zeros((1, 2, 2, 3), np.uint8)
+    image[0, 0, 0] = 200
+    counts = round_stochastically(image, np.array([70_000]), polarity=False, seeds=[0])
+    assert counts.tolist() == [[[[65_535, 0], [0, 0]]]]
+
+
 def test_images_of_one_scale_say_their_number_of_events():
     """A count of 1 is 85 in each: an image twice as bright has twice the events, whatever recorded windows had."""
     options = event_histogram.Options(normalisation="count", full_scale_count=3)

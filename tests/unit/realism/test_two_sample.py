@@ -105,6 +105,7 @@ def test_the_floor_of_halves_is_a_half():
     assert (found.num_first, found.num_second, found.note) == (50, 50, "")
 
 
+@pytest.mark.usefixtures("quick_two_sample_tests")
 def test_an_easy_difference_is_told_always():
     found = compare(noise(60, 0.1, 0), bars(60, 1))
     assert found.value > 0.99 and found.low > 0.95 and found.high <= 1

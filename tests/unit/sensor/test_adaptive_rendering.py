@@ -107,6 +107,22 @@ def test_the_times_are_all_that_differs_from_a_plain_simulation():
     assert Sensor((WIDTH, HEIGHT), IDEAL, sensor_seed=0, seed=0).push(frames, times_us).t.min() > 1_000
 
 
+def test_without_a_speed_what_moves_below_the_floor_is_seen_as_the_sensor_does():
+    """Its response is linear there: a pulse of 0.8 floors is one of 0.8 in log intensity."""
+    floor = IDEAL.log_floor
+
+    def pulse(t_s):
+        return np.full((HEIGHT, WIDTH), 0.8 * floor * np.sin(np.pi * np.clip((t_s - 0.1) / 0.05, 0, 1)) ** 2)
+
+    options = RenderingOptions(tolerance=0.02)
+    events, times_us = simulate_rendered(pulse, 0, STOP_US, IDEAL, options, sensor_seed=1, seed=2)
+    dense_us = np.arange(0, STOP_US + 1, 200)
+    dense = simulate_events(np.stack([pulse(1e-6 * t) for t in dense_us]), dense_us, IDEAL, sensor_seed=1, seed=2)
+    assert len(events) == len(dense) > 0 and np.abs(events.t - dense.t).max() < 1_000
+    during = np.diff(times_us[(times_us >= 100_000) & (times_us <= 150_000)])
+    assert during.max() < options.max_interval_us / 2
+
+
 def test_every_picture_is_rendered_once():
     calls = []
 

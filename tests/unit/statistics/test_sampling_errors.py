@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import sqrtm
 
+from ctlev_core.statistics.bootstrap import MIN_RECORDINGS
 from ctlev_core.statistics.sampling_errors import (
     CONVERGED,
     CPU,
@@ -91,9 +92,14 @@ def test_pixel_error_is_a_root_mean_square_over_images():
     assert (found.metric, found.against) == (PIXEL_RMS, CONVERGED)
     assert found.value == pytest.approx(np.sqrt(12.5))
     assert 3 <= found.low < found.value < found.high <= 4
-    assert np.isnan(pixel_error(frames[:2], solution[:2], ["a", "b"]).low)
+    for count in (2, MIN_RECORDINGS - 1, MIN_RECORDINGS):
+        has_interval = np.isfinite(pixel_error(frames[:count], solution[:count], list("abcdef")[:count]).low)
+        assert has_interval == (count == MIN_RECORDINGS)
 
 
 def test_costs_are_medians():
     found = by_name(costs(np.array([1.0, 1.0, 1.0, 9.0]), np.array([2.0, 2.0, 2.0, 2.0]), np.array([5.0] * 4)))
     assert found[WALL, ""].value == 1 and found[CPU, ""].value == 2, "one batch that was disturbed does not count"
+    seconds = np.arange(5.0)
+    found = by_name(costs(seconds, 10 * seconds, seconds))
+    assert [(found[name, ""].low, found[name, ""].high) for name in (WALL, CPU)] == [(1, 3), (10, 30)], "quartiles"

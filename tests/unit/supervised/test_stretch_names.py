@@ -79,6 +79,14 @@ def test_a_gap_among_labels_is_not_crossed():
         choose_stretches(["a"] * 7, times, 5, 5, 20)
 
 
+def test_an_interval_is_kept_to_within_a_tenth():
+    for last_us in (38, 42):
+        assert choose_stretches(["a"] * 3, np.array([0, 20, last_us]), 3, 3, 20).tolist() == [0, 1, 2]
+    for last_us in (37, 43):
+        with pytest.raises(DataError, match="a stretch of 3 frames, one every 20 us"):
+            choose_stretches(["a"] * 3, np.array([0, 20, last_us]), 3, 3, 20)
+
+
 @given(
     st.lists(st.integers(1, 30), min_size=1, max_size=6),
     st.integers(1, 8),

@@ -29,6 +29,8 @@ from tasks.store import Store
 SENSOR = (32, 24)
 ROOT = Path(__file__).resolve().parents[3]
 EVERY_TENTH_IS_LONG = 10
+NUM_GROUPS, COUNT = 16, 40
+"""At least so many groups of so many recordings: groups of two, as 300 are without being told."""
 
 
 def make_events(seed, num_events=50, duration_us=900_000, signal=False):
@@ -86,6 +88,7 @@ def install(monkeypatch, module):
 def make_both(home, monkeypatch, module, workers):
     monkeypatch.setenv("CTLEV_HOME", str(home))
     monkeypatch.setenv("CTLEV_WORKERS", str(workers))
+    monkeypatch.setattr(recording_groups, "MIN_GROUPS", NUM_GROUPS)
     install(monkeypatch, module)
     recordings = run(ingest, dataset=DatasetChoice(name="test"))
     frames = run(
@@ -166,32 +169,32 @@ def test_a_table_does_not_depend_on_how_many_rows_come_at_a_time(tmp_path, monke
 
 
 def test_short_recordings_share_files_and_long_ones_have_their_own(tmp_path, monkeypatch):
-    made, frames = make_both(tmp_path, monkeypatch, make_dataset(300), workers=1)
+    made, frames = make_both(tmp_path, monkeypatch, make_dataset(COUNT), workers=1)
     rows = made.table.to_pylist()
     assert [row["recording_id"] for row in rows if row["events_batch"] is None] == [
-        f"{n:05d}" for n in range(0, 300, 10)
+        f"{n:05d}" for n in range(0, COUNT, EVERY_TENTH_IS_LONG)
     ]
     shared = {row["events_file"] for row in rows if row["events_batch"] is not None}
-    assert len(shared) == 150 and len(set(made.column("events_file"))) == 180, "groups of two"
+    assert len(shared) == 20 and len(set(made.column("events_file"))) == 24, "groups of two"
     for number, row in enumerate(rows):
         stored = stored_events(made, row)
         assert equal(stored.read(0, row["num_events"]), expected_events(number))
-        assert row["duration_us"] == (1_000_000 if number % 10 == 0 else 999_999)
-    assert frames.column("recording_id") == [f"{n:05d}" for n in range(300)]
-    assert frames.column("class_name") == [f"class {n % 3}" for n in range(300)]
+        assert row["duration_us"] == (1_000_000 if number % EVERY_TENTH_IS_LONG == 0 else 999_999)
+    assert frames.column("recording_id") == [f"{n:05d}" for n in range(COUNT)]
+    assert frames.column("class_name") == [f"class {n % 3}" for n in range(COUNT)]
     counts = np.asarray(frames.array("histograms"))
     assert (counts.sum(axis=(1, 2, 3)) == 50).all()
 
 
 def test_one_worker_and_two_make_the_same(tmp_path, monkeypatch):
-    module = make_dataset(300)
+    module = make_dataset(COUNT)
     found = [make_both(tmp_path / str(n), monkeypatch, module, workers=n) for n in (1, 2)]
     for first, second in zip(*found, strict=True):
         assert first.ref.digest == second.ref.digest, "of the manifest, which has the digests of all files"
 
 
 def test_an_interrupted_ingest_goes_on_from_its_finished_groups(tmp_path, monkeypatch):
-    read, fails_at = [], [277]
+    read, fails_at = [], [37]
 
     def note(number):
         if number in fails_at:
@@ -199,24 +202,24 @@ def test_an_interrupted_ingest_goes_on_from_its_finished_groups(tmp_path, monkey
         read.append(number)
 
     with pytest.raises(KeyboardInterrupt):
-        make_both(tmp_path / "killed", monkeypatch, make_dataset(300, note), workers=1)
-    assert read == list(range(277))
+        make_both(tmp_path / "killed", monkeypatch, make_dataset(COUNT, note), workers=1)
+    assert read == list(range(37))
     read.clear()
     fails_at.clear()
-    again = make_both(tmp_path / "killed", monkeypatch, make_dataset(300, note), workers=1)
-    # Groups of two: that of 276 and 277 is not finished.
-    assert read == list(range(276, 300))
-    whole = make_both(tmp_path / "whole", monkeypatch, make_dataset(300), workers=1)
+    again = make_both(tmp_path / "killed", monkeypatch, make_dataset(COUNT, note), workers=1)
+    # Groups of two: that of 36 and 37 is not finished.
+    assert read == list(range(36, COUNT))
+    whole = make_both(tmp_path / "whole", monkeypatch, make_dataset(COUNT), workers=1)
     assert [made.ref.digest for made in again] == [made.ref.digest for made in whole]
 
 
 def test_labels_of_different_kinds_are_refused_across_groups(tmp_path, monkeypatch):
-    module = make_dataset(300)
+    module = make_dataset(COUNT)
     plain = module.read_labels
 
     def read_labels(recording, options):
         labels = plain(recording, options)
-        if recording.recording_id < "00150":
+        if recording.recording_id < "00020":
             return labels
         arrays = {"joints2d": np.ones((1, 13, 2), np.float32), "visible": np.ones((1, 13), bool)}
         return dataclasses.replace(labels, **arrays, joint_set="dhp19")

@@ -233,7 +233,8 @@ def test_damaged_artefact_is_set_aside_and_made_anew(home):
 
 def test_artefact_of_changed_input_is_made_anew():
     source, _ = run(first, windows=Windows(), seed=1)
-    run(second, source)
+    doubled, _ = run(second, source)
+    run(second, doubled)
     # The input is repeated and comes out differently, as a training run may on another machine.
     manifest = source.path / "manifest.parquet"
     manifest.unlink()
