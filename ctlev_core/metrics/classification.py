@@ -36,7 +36,9 @@ INPUT = "classes"
 SCORES = (
     ScoreInfo("accuracy", meaning="share of frames whose class is told right", is_share=True),
     ScoreInfo("macro_", is_share=True),
-    ScoreInfo("chance_accuracy", meaning="accuracy of always naming the commonest class", is_share=True),
+    ScoreInfo(
+        "chance_accuracy", meaning="accuracy of always naming the commonest class", is_share=True, is_reference=True
+    ),
     ScoreInfo("calibration_error", lower_is_better=True, is_share=True),
 )
 

@@ -18,12 +18,14 @@ class ScoreInfo:
         lower_is_better: errors and distances want to be small.
         meaning: what the score is, in words without a verb; empty where its name says it.
         is_share: it lies in 0 to 1.
+        is_reference: what guessing gets, which others are read beside: neither more nor less of it is better.
     """
 
     start: str
     lower_is_better: bool = False
     meaning: str = ""
     is_share: bool = False
+    is_reference: bool = False
 
 
 @lru_cache(maxsize=4096)  # a report of a thousand classes asks once a cell, and each look goes to the disk

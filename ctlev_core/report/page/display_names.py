@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from ctlev_core.scoring.score_info import lower_is_better
+from ctlev_core.scoring.score_info import find_score, lower_is_better
 from data_contracts.training_sets import LABEL_CONSISTENT, ORACLE, RECORDED, SYNTHETIC, LabelAgreement, TrainingSet
 
 SOURCES = {
@@ -158,7 +158,9 @@ def metric_name(code: str) -> Name:
 
 
 def metric_heading(code: str) -> Name:
-    """The same with an arrow in the direction that is better."""
+    """The same with an arrow in the direction that is better, where there is one."""
+    if find_score(code).is_reference:
+        return metric_name(code)
     return Name(f"{metric_name(code)} {'↓' if lower_is_better(code) else '↑'}", code)
 
 

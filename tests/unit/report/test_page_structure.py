@@ -118,6 +118,7 @@ def test_every_declared_score_has_a_name():
         told = metric_name(example)
         assert not CODE_NAME.search(told) and (told.code or told) == example
     assert metric_heading("mpjpe2d_px") == "2D joint error (MPJPE), px ↓" and metric_heading("accuracy").endswith("↑")
+    assert metric_heading("chance_accuracy") == "accuracy by chance", "neither more nor less is better"
 
 
 @pytest.mark.parametrize(
