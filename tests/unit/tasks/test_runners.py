@@ -1,6 +1,7 @@
 """Shards and stages on threads, processes, Dask and Ray: the same results, whoever computes."""
 
 import errno
+import gc
 import importlib.util
 import json
 import os
@@ -222,6 +223,16 @@ def test_an_address_that_is_none_is_refused_with_the_variable(asked, package, mo
     monkeypatch.setenv("CTLEV_RUNNER", asked)
     with pytest.raises(DataError, match=f"CTLEV_RUNNER={asked}: there is no such cluster"):
         runners.asked_cluster(2)
+
+
+@pytest.mark.parametrize("address", ["foo://node:1", "node"])
+def test_no_client_of_dask_is_left_half_made_to_be_collected_while_the_next_one_starts(address):
+    distributed = pytest.importorskip("distributed")
+    before = {id(found) for found in gc.get_objects() if type(found) is distributed.Client}
+    with pytest.raises(ValueError):
+        runners.Dask(address, 1)
+    clients = [found for found in gc.get_objects() if type(found) is distributed.Client and id(found) not in before]
+    assert not [client for client in clients if client.status != "closed"]
 
 
 def test_the_rest_is_not_computed_where_nobody_wants_it():
