@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import os
 import shutil
 import sys
 import time
@@ -20,6 +18,7 @@ from ctlev_core.studio.labelled_recordings import EVENT_LABELS_FILE, LABELS_FILE
 from data_contracts.errors import DataError
 from flows.command_line import apply_override
 from flows.simulate import find_writer
+from tasks.file_locks import folder_claimed
 
 COUNTS = {split: f"num_{split}_recordings" for split in studio.SPLIT_NAMES}
 
@@ -84,13 +83,7 @@ def record_people(
 @contextlib.contextmanager
 def _claimed(partial: Path, folder: Path) -> Iterator[None]:
     """Inside this block `partial` is this process's alone, empty at first, and removed where the block fails."""
-    partial.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(partial, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BlockingIOError(f"{folder}: another process is recording into this folder") from None
+    with folder_claimed(partial, f"{folder}: another process is recording into this folder"):
         try:
             for left in partial.iterdir():  # by a process that was killed
                 shutil.rmtree(left) if left.is_dir() else left.unlink()
@@ -98,8 +91,6 @@ def _claimed(partial: Path, folder: Path) -> Iterator[None]:
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
-    finally:
-        os.close(descriptor)
 
 
 def _check_free(folder: Path, *, overwrite: bool) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,6 +29,7 @@ from data_contracts.image_folder import (
     write_image_table,
 )
 from data_contracts.manifest import Manifest, ManifestRef, read_manifest
+from tasks.file_locks import folder_claimed
 
 Artefacts = Mapping[str, ManifestRef]
 """What is exported, by role: `synthetic` frames, their `conditions`, and `event streams` where they are wanted."""
@@ -141,13 +141,7 @@ def write_image_folder(artefacts: Artefacts, folder: Path, *, name: str, notice:
 def _claimed(artefacts: Artefacts, folder: Path, records: Sequence[Record]) -> Iterator[Path]:
     """The folder beside `folder` to write into: this run's alone, with what an earlier run wrote of the same data."""
     partial = folder.with_name(f".{folder.name}.partial")
-    partial.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(partial, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BlockingIOError(f"{folder}: another run is writing this folder") from None
+    with folder_claimed(partial, f"{folder}: another run is writing this folder"):
         record = partial / PROVENANCE_FILE
         if not record.is_file() or not _holds(artefacts, partial):
             _clear(partial)
@@ -155,8 +149,6 @@ def _claimed(artefacts: Artefacts, folder: Path, records: Sequence[Record]) -> I
             write_provenance(temporary, records)
             temporary.rename(record)
         yield partial
-    finally:
-        os.close(descriptor)
 
 
 def _clear(partial: Path) -> None:
