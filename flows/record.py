@@ -15,10 +15,10 @@ from ctlev_core.duration_text import duration_text
 from ctlev_core.plugins import PluginError, validate_options
 from ctlev_core.progress import ProgressBar
 from ctlev_core.studio.labelled_recordings import EVENT_LABELS_FILE, LABELS_FILE, CocoTable, write_labelled
+from data_contracts.claimed_folders import folder_claimed
 from data_contracts.errors import DataError
 from flows.command_line import apply_override
 from flows.simulate import find_writer
-from tasks.file_locks import folder_claimed
 
 COUNTS = {split: f"num_{split}_recordings" for split in studio.SPLIT_NAMES}
 

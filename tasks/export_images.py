@@ -15,6 +15,7 @@ import pyarrow as pa
 from ctlev_core.export.dataset_card import Card, render_card
 from ctlev_core.progress import ProgressBar
 from ctlev_core.provenance.records import Record, read_provenance, read_records, write_provenance
+from data_contracts.claimed_folders import folder_claimed
 from data_contracts.errors import DataError
 from data_contracts.image_folder import (
     CONDITIONS_FOLDER,
@@ -29,7 +30,6 @@ from data_contracts.image_folder import (
     write_image_table,
 )
 from data_contracts.manifest import Manifest, ManifestRef, read_manifest
-from tasks.file_locks import folder_claimed
 
 Artefacts = Mapping[str, ManifestRef]
 """What is exported, by role: `synthetic` frames, their `conditions`, and `event streams` where they are wanted."""

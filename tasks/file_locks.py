@@ -47,25 +47,6 @@ def locked(path: Path, what: str) -> Iterator[None]:
         yield
 
 
-@contextlib.contextmanager
-def folder_claimed(folder: Path, refusal: str) -> Iterator[None]:
-    """In this block `folder`, which is made where it is not there, is this process's alone.
-
-    Raises:
-        BlockingIOError: another process has it; says `refusal`, and nothing waits.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BlockingIOError(refusal) from None
-        yield
-    finally:
-        os.close(descriptor)
-
-
 def _say(path: Path, what: str, got: threading.Event) -> None:
     wait_s = SAY_AFTER_S
     while not got.wait(wait_s):
