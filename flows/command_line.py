@@ -248,7 +248,8 @@ def run_command(command: Command, asked: Asked) -> int:
         Store(home).fetch_planned((row.stage, row.key) for row in rows if row.cached)
         use_memory(rows, home)
         all_cached = all(row.cached for row in rows)
-        with local_server.connected(), in_one_run() if all_cached else shown(rows, home):
+        # What is to come is said first: in a new home the server needs ten seconds.
+        with in_one_run() if all_cached else shown(rows, home), local_server.connected():
             result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
         print(command.describe(result, options), flush=True)  # what is done is said, whatever becomes of the rest
         Store(home).send_files()
