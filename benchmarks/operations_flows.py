@@ -85,14 +85,14 @@ def time_map(home: Path, work: str, shards: int, seconds: float, workers: int, r
 
     Args:
         home: of the store; not used.
-        work: `sleep`, `encode` or `render`.
+        work: `sleep`, `encode`, `render` or `simulate`.
         shards: how many.
         seconds: of sleep.
         workers: processes or threads.
         runner: as CTLEV_RUNNER.
     """
     os.environ |= {"CTLEV_WORKERS": str(workers), "CTLEV_RUNNER": runner, "PYTHONPATH": str(Path(__file__).parent)}
-    shard = {"sleep": partial(_sleep, seconds), "encode": _encode, "render": _render}[work]
+    shard = {"sleep": partial(_sleep, seconds), "encode": _encode, "render": _render, "simulate": _simulate}[work]
     start = time.monotonic()
     done = np.array(list(map_shards(shard, range(shards))))
     return {"seconds": float(done.max() - start), "start_s": float(done.min() - seconds - start)}
@@ -133,6 +133,21 @@ def _render(number: int) -> float:
     for _ in range(4):
         render_normal_maps(vertices, faces, intrinsics, (256, 256), "controlnet", workers=1)
     return time.monotonic()
+
+
+def _simulate(number: int) -> float:
+    """What a sensor of 346 x 260 px reports of 16 frames that move everywhere: about 100 ms."""
+    from ctlev_core.sensor.dvs_pixel import PRESETS, Sensor
+
+    frames = _moving_frames()
+    Sensor((346, 260), PRESETS["dvs346"], sensor_seed=0, seed=number).push(frames, 4000 * np.arange(len(frames)))
+    return time.monotonic()
+
+
+@cache
+def _moving_frames() -> np.ndarray:
+    texture = np.random.default_rng(0).uniform(0.5, 1, (65, 99)).repeat(4, axis=0).repeat(4, axis=1)
+    return np.stack([texture[:, 2 * step : 2 * step + 346] for step in range(16)])
 
 
 @cache
