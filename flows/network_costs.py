@@ -17,9 +17,7 @@ from typing import Any
 
 from ctlev_core import plugins
 from ctlev_core.cpu_precision import computed_in
-from ctlev_core.diffusion.pretrained.loading import ENCODE_PIXELS
 from ctlev_core.diffusion.sampling.options import SamplingOptions
-from ctlev_core.diffusion.training.latent_files import ENCODE_BATCH
 from ctlev_core.diffusion.training.options import FineTuningOptions, LatentOptions, StudentOptions, TrainingOptions
 from ctlev_core.processes import few_threads, use_cores_for
 from data_contracts.config import Choice
@@ -106,6 +104,10 @@ def _encoding(options: LatentOptions, rows: float, size: tuple[int, int]) -> Net
     networks = read_networks(options.base_model, None, False)
     if networks is None or networks.weights["unet"] < LARGE:
         return None
+    # Here, because they import torch, which plans of small networks need not wait for.
+    from ctlev_core.diffusion.pretrained.loading import ENCODE_PIXELS
+    from ctlev_core.diffusion.training.latent_files import ENCODE_BATCH
+
     pixels, autoencoder = size[0] * size[1], 4 * networks.weights["vae"]
     batch = min(rows, ENCODE_BATCH, max(1, ENCODE_PIXELS // pixels))
     latents = 2 * networks.latent_channels * pixels / LATENT_SCALE**2 * 4

@@ -151,6 +151,25 @@ def test_show_finds_reports(tmp_path):
     assert status == 2 and "did you mean 'demo'?; it has demo, smoke" in errors
 
 
+@pytest.mark.parametrize("preset", ["smoke", "objects", "body"])
+def test_a_plan_imports_neither_torch_nor_prefect(tmp_path, preset):
+    code = (
+        "import sys; from flows import cli\n"
+        "try: cli.app(sys.argv[1:])\n"
+        "except SystemExit as end: assert not end.code\n"
+        "print({'torch', 'prefect', 'diffusers', 'transformers'} & set(sys.modules), file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "plan", preset, "--home", "home"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stderr.strip() == "set()"
+
+
 def test_start_up_is_quick_and_imports_neither_torch_nor_prefect(tmp_path):
     code = (
         "import sys; from flows import cli\n"
