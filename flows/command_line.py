@@ -249,7 +249,8 @@ def run_command(command: Command, asked: Asked) -> int:
         use_memory(rows, home)
         all_cached = all(row.cached for row in rows)
         # What is to come is said first: in a new home the server needs ten seconds.
-        with in_one_run() if all_cached else shown(rows, home), local_server.connected():
+        shows, modules = (in_one_run(), ()) if all_cached else (shown(rows, home), ("torch",))
+        with shows, local_server.connected(*modules):
             result = with_plan(flow, rows, f"preset {asked.preset}, in {home}")(options)
         print(command.describe(result, options), flush=True)  # what is done is said, whatever becomes of the rest
         Store(home).send_files()

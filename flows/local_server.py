@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import importlib
 import os
 import secrets
 import signal
@@ -111,9 +112,11 @@ def start(home: Path) -> None:
 
 
 @contextlib.contextmanager
-def connected() -> Iterator[None]:
+def connected(*modules: str) -> Iterator[None]:
     """Inside this block Prefect talks to the private server, where one was started; waits until it answers.
 
+    Args:
+        modules: what will be imported anyway, and is while the server starts.
     Raises:
         ServerLostError: it ended, or did not answer in time; the message names its log. Or nobody answers at the
             address that the user named, or nobody does any more.
@@ -122,7 +125,9 @@ def connected() -> Iterator[None]:
         with _server_of_user():
             yield
         return
-    _wait(_server)
+    # Before we wait: the server needs seconds to start, and so do these.
+    for name in ("prefect.flow_engine", "prefect.task_engine", *modules):
+        importlib.import_module(name)
     from prefect.settings import (
         PREFECT_API_AUTH_STRING,
         PREFECT_API_URL,
@@ -130,6 +135,7 @@ def connected() -> Iterator[None]:
         temporary_settings,
     )
 
+    _wait(_server)
     # Heartbeats tell a server that outlives its runs that they crashed; this one does not, and each costs 0.7 s.
     ended = threading.Event()
     threading.Thread(target=_watch, args=(_server, ended), daemon=True).start()
