@@ -41,11 +41,8 @@ Generated = dict[str, list[ManifestRef]]
 
 
 class Evaluation(Frozen):
-    """Scores, and the models behind them; `extractor` is the model in whose features frames are compared, `openings`
-    how many experiments were scored on the same test frames.
-    """
+    """Scores, and the models behind them; `openings` is how many experiments were scored on the same test frames."""
 
-    extractor: ManifestRef | None
     scores: list[ManifestRef]
     models: list[ManifestRef]
     model_names: list[str]
@@ -71,27 +68,31 @@ def evaluate(
     generated: Generated = {SYNTHETIC: synthetic}
     generated |= {name: [frames.synthetic for frames in made] for name, made in compared.items()}
     trained = list(itertools.product(experiment.all_training_sets, experiment.downstream_seeds))
-    calls = [
+    calls: list[Callable[[], Any]] = [
         partial(_train_and_score, experiment, dataset, generated, training_set, seed) for training_set, seed in trained
     ]
     if experiment.feature_extractor is not None:
         calls.append(partial(_distances, experiment, experiment.feature_extractor, dataset, generated))
     found = call_together(*calls)
+    distances = [] if experiment.feature_extractor is None else found.pop()
     openings = None
     if experiment.evaluate_on == "test" and not is_planning():
         frames = read_manifest(Store().here(dataset.tested_frames))
         openings = note_opening(home_folder(), test_set_digest(frames), experiment)
     return Evaluation(
-        extractor=found[-1][0] if experiment.feature_extractor is not None else None,
-        scores=[score for _, scores in found for score in scores],
-        models=[model for model, _ in found[: len(trained)]],
+        scores=[score for _, scores in found for score in scores] + distances,
+        models=[model for model, _ in found],
         model_names=[f"{training_set}, seed {seed}" for training_set, seed in trained],
         openings=openings,
     )
 
 
-def train_without_synthetic(experiment: Experiment, dataset: PreparedDataset) -> None:
-    """Train what needs no generator, so that it can begin before those have ended; `evaluate` finds it in the store."""
+def train_without_synthetic(experiment: Experiment, dataset: PreparedDataset) -> ManifestRef | None:
+    """Train what needs no generator, so that it can begin before those have ended; `evaluate` finds it in the store.
+
+    Returns:
+        The feature extractor, if one is asked for.
+    """
     extractor = experiment.feature_extractor
     calls: list[Callable[[], Any]] = [
         partial(_train, experiment, dataset, {}, training_set, seed)
@@ -100,7 +101,8 @@ def train_without_synthetic(experiment: Experiment, dataset: PreparedDataset) ->
     ]
     if extractor is not None:
         calls.append(partial(_train_extractor, experiment, dataset, extractor))
-    call_together(*calls)
+    trained = call_together(*calls)
+    return None if extractor is None else trained[-1]
 
 
 def _train_and_score(
@@ -195,13 +197,13 @@ def _of_seed(experiment: Experiment, sets: list[ManifestRef], seed: int) -> Mani
 
 def _distances(
     experiment: Experiment, feature_extractor: DownstreamChoice, dataset: PreparedDataset, generated: Generated
-) -> tuple[ManifestRef, list[ManifestRef]]:
-    """The feature extractor, and how far held-out and generated frames are from the training frames."""
+) -> list[ManifestRef]:
+    """How far held-out and generated frames are from the training frames, in the features of the extractor."""
     extractor = _train_extractor(experiment, dataset, feature_extractor)
     frames = dataset.tested_frames
     compared = [(frames, experiment.evaluate_on, HELD_OUT, 0)]
     compared += [(made, "train", name, number) for name, sets in generated.items() for number, made in enumerate(sets)]
-    scores = [
+    return [
         score_distance(
             extractor,
             frames,
@@ -215,7 +217,6 @@ def _distances(
         )
         for data, split, row, number in compared
     ]
-    return extractor, scores
 
 
 COMMAND = Command(evaluate, lambda evaluation, _: "\n".join(f"scores: {ref.path}" for ref in evaluation.scores))

@@ -56,7 +56,7 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
             experiment.windows.duration_us,
             experiment.sequence_length,
         )
-    *own, compared, _, recorded_events, floors = call_together(
+    *own, compared, extractor, recorded_events, floors = call_together(
         *(partial(_own_frames, experiment, dataset, number) for number in range(experiment.num_generators)),
         lambda: call_flow(baselines, experiment, dataset),
         lambda: train_without_synthetic(experiment, dataset),
@@ -68,7 +68,7 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
     checkpoint, synthetic = own[0]
     generated = {SYNTHETIC: synthetic} | {name: frames.synthetic for name, frames in first.items()}
     checkpoints = {SYNTHETIC: checkpoint} | {name: made.checkpoint for name, made in first.items() if made.checkpoint}
-    evaluation, in_time, nearest, _, *looks = call_together(
+    evaluation, in_time, nearest, _, *measured = call_together(
         lambda: call_flow(evaluate, experiment, dataset, [synthetic for _, synthetic in own], compared),
         lambda: _sequence_realism(experiment, dataset, generated),
         lambda: _nearest_seen(experiment, dataset, checkpoint),
@@ -77,21 +77,20 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
             partial(realism, dataset.frames, frames, floors, name=name, label=name)
             for name, frames in generated.items()
         ),
-    )
-    copied = call_together(
         *(
             partial(
                 memorisation,
                 dataset.frames,
                 frames,
-                evaluation.extractor,
+                extractor,
                 downstream=experiment.feature_extractor,
                 subject=name,
                 label=name,
             )
             for name, frames in generated.items()
-        )
+        ),
     )
+    looks, copied = measured[: len(generated)], measured[len(generated) :]
     made = ReportInputs(
         title=experiment.name,
         notice=experiment.data_notice,
@@ -101,8 +100,8 @@ def full_experiment(experiment: Experiment | Study) -> ManifestRef:
         frame_conditions=dataset.frame_conditions,
         conditions=dataset.sample_conditions,
         generated=tuple(
-            GeneratedFrames(name, frames, *measured)
-            for (name, frames), *measured in zip(generated.items(), copied, looks, strict=True)
+            GeneratedFrames(name, frames, *found)
+            for (name, frames), *found in zip(generated.items(), copied, looks, strict=True)
         ),
         checkpoints=tuple(Named(name, one) for name, one in checkpoints.items()),
         models=tuple(Named(*pair) for pair in zip(evaluation.model_names, evaluation.models, strict=True)),
