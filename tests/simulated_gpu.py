@@ -163,6 +163,8 @@ def simulated_gpu() -> Iterator[SimulatedGpu]:
         "torch.cuda.synchronize": lambda *_: None,
         "torch.cuda.empty_cache": lambda: None,
         "torch.cuda.is_bf16_supported": lambda *_: True,
+        # Of a torch that was built for GPUs, whose optimizers ask the driver.
+        "torch.accelerator.current_accelerator": lambda **_: None,
         "torch.autocast": _CpuAutocast,
     }
     # A module that moves gets new parameters: other classes of tensors cannot be put into the old ones.

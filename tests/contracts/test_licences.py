@@ -19,6 +19,8 @@ TOLD_ELSEWHERE = {"aedat": "MIT", "pyglet": "BSD License"}
 """By the project's own file, where the package's metadata say nothing."""
 CHOSEN = {"text-unidecode": "Artistic License"}
 """Of several licences of which one may be chosen."""
+OF_NEWER_PYTHONS = {"whenever": "MIT"}
+"""What Prefect needs from Python 3.13 on, in the place of pendulum."""
 OF_GPUS = ("nvidia-", "cuda-", "triton")
 """What torch brings where there is a GPU; the page says so."""
 HEAD = """# Licences
@@ -75,5 +77,6 @@ def test_the_page_lists_them():
 
 
 if __name__ == "__main__":
-    rows = sorted((name, licence_of(name, one)) for name, one in required().items())
+    found = {name: licence_of(name, one) for name, one in required().items()}
+    rows = sorted((OF_NEWER_PYTHONS | found).items())
     print(HEAD + "\n".join(f"| {name} | {licence} |" for name, licence in rows))

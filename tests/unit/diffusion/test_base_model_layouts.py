@@ -257,7 +257,7 @@ def test_pickles_are_refused_and_nothing_runs(folder, tmp_path, file, archive):
         torch.save(state, folder / "unet" / file)
     else:
         (folder / "unet" / file).write_bytes(pickle.dumps(state["attack"]))
-    refused(folder, "refused: it names io.open" if archive else "bare pickle")
+    refused(folder, "refused: it names _?io.open" if archive else "bare pickle")
     assert not (tmp_path / "it_ran").exists()
 
 
