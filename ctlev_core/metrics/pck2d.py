@@ -81,11 +81,11 @@ def _normaliser_px(target: Labels, options: Options) -> np.ndarray:
         raise ValueError("the target labels have no joints2d")
     if options.normaliser == "px":
         return np.ones(len(target))
-    points = target.joints2d.astype(np.float64)
-    points[~target.visible] = np.nan
     if options.normaliser == "bbox":
+        points = target.joints2d.astype(np.float64)
+        points[~target.visible] = np.nan
         size = np.full(len(target), np.nan)
         seen = target.visible.any(axis=1)
         size[seen] = (np.nanmax(points[seen], axis=1) - np.nanmin(points[seen], axis=1)).max(axis=-1)
         return size
-    return _LENGTHS[options.normaliser](points, target.joint_set)
+    return _LENGTHS[options.normaliser](target.joints2d, target.joint_set, target.visible)

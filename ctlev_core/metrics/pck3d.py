@@ -81,7 +81,7 @@ def compute_sums(predicted: Mapping[str, Any], target: Labels, options: Options)
     sums = {f"pck3d_{tag}{limit:g}mm": ((errors_mm <= limit) @ ones, count) for limit in options.thresholds_mm}
     sums[f"auc3d_{tag}{options.auc_max_mm:g}mm"] = (count - total / options.auc_max_mm, count)
     if options.head_threshold and target.joints3d is not None:
-        head_mm = head_length(target.joints3d.astype(np.float64), target.joint_set)[:, None]
+        head_mm = head_length(target.joints3d, target.joint_set)[:, None]
         has_head = (head_mm > 0)[:, 0]
         correct = (errors_mm <= options.head_threshold * head_mm) @ ones
         sums[f"pckh3d_{tag}{options.head_threshold:g}"] = (correct * has_head, count * has_head)
