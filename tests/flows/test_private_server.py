@@ -263,3 +263,19 @@ def test_a_private_server_that_cannot_start_is_told_of_with_its_log(tmp_path, mo
     expected = pytest.raises(local_server.ServerLostError, match=f"ended with code 3; see {tmp_path}/log")
     with expected, local_server.connected():
         raise AssertionError
+
+
+def test_what_is_to_come_is_said_before_the_server_answers(tmp_path, monkeypatch, capfd):
+    from flows import local_server
+    from flows.command_line import Asked, run_command
+    from flows.full_experiment import COMMAND
+
+    def lost(*modules):
+        raise local_server.ServerLostError("none answers")
+
+    monkeypatch.setenv("CTLEV_HOME", str(tmp_path))
+    monkeypatch.setattr(local_server, "start", lambda home: None)
+    monkeypatch.setattr(local_server, "connected", lost)
+    assert run_command(COMMAND, Asked("smoke", [])) == 2
+    told = capfd.readouterr().err.splitlines()
+    assert told[0].startswith("59 stages; about ") and told[-1] == "error: none answers"
