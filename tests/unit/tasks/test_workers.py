@@ -167,7 +167,7 @@ def test_ctrl_c_is_left_to_us_from_the_start_of_a_process(capfd):
 def test_what_cannot_travel_fails_here_and_the_process_serves_on():
     pool = Workers(1)
     try:
-        with pytest.raises((AttributeError, TypeError), match="pickle|local object"):
+        with pytest.raises((AttributeError, TypeError), match=r"pickle|local object"):
             pool.call(lambda: None)
         assert pool.call(int, "7") == 7
     finally:
