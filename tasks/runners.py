@@ -277,6 +277,16 @@ class Dask(_Cluster):
         self._own_cores = {} if address else {CORES: str(max(num_cores() // count, 1))}
         self._workers: dict[str, int] = {}
         distributed = importlib.import_module("distributed")
+        self._own = self._start(address, count)
+        self._client = distributed.Client(self._own or address, timeout=CONNECT_TIMEOUT_S)
+        self.count = self._count_workers()
+
+    def _start(self, address: str, count: int) -> Any:
+        """A cluster of our own, unless there is an address of one that runs elsewhere.
+
+        Raises:
+            ValueError: the address is none.
+        """
         if address:
             # A client with an address that is none is left half made. Collected while the next one starts, in the same
             # thread, it waits for ever for a lock that the thread holds.
@@ -285,13 +295,6 @@ class Dask(_Cluster):
             comm.registry.get_backend(scheme)
             if scheme in ("tcp", "tls"):
                 comm.parse_host_port(place)
-        self._own = self._start(address, count)
-        self._client = distributed.Client(self._own or address, timeout=CONNECT_TIMEOUT_S)
-        self.count = self._count_workers()
-
-    def _start(self, address: str, count: int) -> Any:
-        """A cluster of our own, unless there is an address of one that runs elsewhere."""
-        if address:
             return None
         return importlib.import_module("distributed").LocalCluster(
             n_workers=count,
