@@ -70,11 +70,11 @@ def num_retries() -> int:
     """The variable CTLEV_STAGE_RETRIES.
 
     Raises:
-        DataError: it is no number.
+        DataError: it is no number up to 20, before which an attempt would wait for weeks.
     """
     asked = os.environ.get(RETRIES, "")
-    if asked and not asked.isdecimal():
-        raise DataError(f"{RETRIES} must be a number of further attempts, 0 or more, got {asked!r}")
+    if asked and not re.fullmatch(r"1?\d|20", asked, re.ASCII):
+        raise DataError(f"{RETRIES} must be a number of further attempts, 0 to 20, got {asked!r}")
     return int(asked) if asked else DEFAULT_RETRIES
 
 

@@ -25,7 +25,9 @@ import os
 import pickle
 import re
 import shutil
+import socket
 import threading
+import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -340,6 +342,7 @@ class Ray(_Cluster):
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         # A call that comes too late, from a thread that has not heard of the end, would start a cluster nobody ends.
         os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
+        _wait_for(address)
         ray = self._ray = importlib.import_module("ray")
         own = {} if address else {"num_cpus": count, "include_dashboard": False}
         ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **own)
@@ -371,6 +374,27 @@ class Ray(_Cluster):
         with self._changed:
             self._changed.wait_for(lambda: not self._waiting, timeout=CONNECT_TIMEOUT_S)
         self._ray.shutdown()
+
+
+def _wait_for(address: str) -> None:
+    """Until somebody answers at HOST:PORT, so long as Dask does; Ray would try for minutes, and say nothing.
+
+    Raises:
+        OSError: nobody did, or there is no such host.
+        ValueError: there is no such port.
+    """
+    found = re.fullmatch(r"(?:ray://)?\[?(.+?)]?:(\d+)", address, re.ASCII)
+    end = time.monotonic() + CONNECT_TIMEOUT_S
+    while found:
+        try:
+            socket.create_connection((found[1], int(found[2])), timeout=CONNECT_TIMEOUT_S).close()
+            return
+        except OverflowError as error:
+            raise ValueError(f"no port {found[2]}") from error
+        except (ConnectionRefusedError, TimeoutError):  # not yet, perhaps
+            if time.monotonic() > end:
+                raise
+            time.sleep(LOOK_UP_S)
 
 
 _PACKAGES = {"dask": "distributed", "ray": "ray", "slurm": "dask_jobqueue"}

@@ -51,11 +51,12 @@ def test_the_number_of_attempts_is_an_option(monkeypatch):
     assert num_retries() == DEFAULT_RETRIES
     monkeypatch.setenv(RETRIES, "0")
     assert num_retries() == 0
-    monkeypatch.setenv(RETRIES, "-1")
-    with pytest.raises(
-        DataError, match="CTLEV_STAGE_RETRIES must be a number of further attempts, 0 or more, got '-1'"
-    ):
-        num_retries()
+    for wrong in ("-1", "21", "two", "²"):
+        monkeypatch.setenv(RETRIES, wrong)
+        with pytest.raises(
+            DataError, match=f"CTLEV_STAGE_RETRIES must be a number of further attempts, 0 to 20, got '{wrong}'"
+        ):
+            num_retries()
 
 
 ATTEMPTS = """

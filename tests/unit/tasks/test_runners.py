@@ -7,6 +7,7 @@ import json
 import os
 import pickle
 import shutil
+import socket
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -216,13 +217,29 @@ def die(shard):
 
 
 @pytest.mark.parametrize(
-    ("asked", "package"), [("dask:node", "distributed"), ("dask:foo://node:1", "distributed"), ("ray:node", "ray")]
+    ("asked", "package"),
+    [
+        ("dask:node", "distributed"),
+        ("dask:foo://node:1", "distributed"),
+        ("ray:node", "ray"),
+        ("ray:node:70000", "ray"),
+    ],
 )
 def test_an_address_that_is_none_is_refused_with_the_variable(asked, package, monkeypatch):
     pytest.importorskip(package)
     monkeypatch.setenv("CTLEV_RUNNER", asked)
     with pytest.raises(DataError, match=f"CTLEV_RUNNER={asked}: there is no such cluster"):
         runners.asked_cluster(2)
+
+
+def test_ray_is_not_waited_for_in_silence_where_nobody_answers(monkeypatch):
+    monkeypatch.setattr("tasks.runners.CONNECT_TIMEOUT_S", 0.1)
+    with socket.socket() as taken:  # bound, and nobody listens
+        taken.bind(("127.0.0.1", 0))
+        asked = f"127.0.0.1:{taken.getsockname()[1]}"
+        for address in (asked, f"ray://{asked}"):
+            with pytest.raises(ConnectionRefusedError):
+                runners.Ray(address, 1)
 
 
 @pytest.mark.parametrize("address", ["foo://node:1", "node"])
