@@ -69,7 +69,10 @@ def check_fit(options: Options, image_size: tuple[int, int] | None, condition: C
     """Raise `DataError` where event images or conditions do not fit the base model, before anything is computed."""
     from ctlev_core.diffusion.pretrained import fit
     from ctlev_core.diffusion.pretrained.paths import BUNDLED_BASE_MODEL
+    from ctlev_core.diffusion.training.checks import check_packages, check_text_route
 
+    check_packages(options)
+    check_text_route(options, with_images=True)
     base_model = options.base_model or BUNDLED_BASE_MODEL
     fit.check_fit(base_model, image_size, condition, controlnet=options.controlnet, with_controlnet=True)
 

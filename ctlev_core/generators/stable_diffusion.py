@@ -52,7 +52,9 @@ def check_fit(options: Options, image_size: tuple[int, int] | None, condition: C
     """Raise `DataError` where event images are not of the base model's size, before anything is computed."""
     from ctlev_core.diffusion.pretrained import fit
     from ctlev_core.diffusion.pretrained.paths import BUNDLED_OBJECT_MODEL
+    from ctlev_core.diffusion.training.checks import check_packages
 
+    check_packages(options)
     fit.check_fit(options.base_model or BUNDLED_OBJECT_MODEL, image_size, condition)
 
 

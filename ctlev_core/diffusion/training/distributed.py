@@ -12,6 +12,8 @@ from typing import TypeVar
 
 import torch
 
+from ctlev_core.diffusion.training.checks import check_shares
+
 T = TypeVar("T")
 MESSAGE_VALUES = 8_000_000
 """Gradients sent at a time, at most: 32 MB. A message for each of hundreds of small weights cost a third of a step on
@@ -25,7 +27,7 @@ class DistributedContext:
     Attributes:
         rank: number of the process.
         count: of the processes.
-        sharded: each holds a part of the weights, see `sharding.py`; gradients are then summed on their way.
+        sharded: each holds a part of the weights, see `fsdp.py`; gradients are then summed on their way.
     """
 
     rank: int = 0
@@ -38,11 +40,7 @@ class DistributedContext:
         Raises:
             ValueError: they cannot be shared evenly.
         """
-        if gradient_accumulation % self.count:
-            raise ValueError(
-                f"gradient_accumulation must be a multiple of the {self.count} processes, which share the batches of a "
-                f"step, got {gradient_accumulation}; halve batch_size and double gradient_accumulation, say"
-            )
+        check_shares(gradient_accumulation, self.count)
         return range(self.rank, gradient_accumulation, self.count)
 
     def sum_gradients(self, parameters: Sequence[torch.nn.Parameter], loss: float) -> float:

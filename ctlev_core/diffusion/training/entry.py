@@ -19,12 +19,13 @@ import torch
 
 from ctlev_core.diffusion.pretrained.loading import choose_device, load_base_model, save_base_model
 from ctlev_core.diffusion.sampling.value_table import write_value_table
+from ctlev_core.diffusion.training.checks import check_packages, check_processes, check_sharding, check_together
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.finetuning import Tune, digest_of_start, fine_tune, forget_weights
-from ctlev_core.diffusion.training.fsdp import check_sharding, gather_networks, shard_networks
+from ctlev_core.diffusion.training.fsdp import gather_networks, shard_networks
 from ctlev_core.diffusion.training.latent_files import Latents
 from ctlev_core.diffusion.training.launch import run_rank, train_in_processes
-from ctlev_core.diffusion.training.lora import check_lora, save_lora
+from ctlev_core.diffusion.training.lora import save_lora
 from ctlev_core.diffusion.training.options import FineTuningOptions
 from ctlev_core.diffusion.training.trainer import TrainingHistory
 from data_contracts.config import ConditionChoice
@@ -77,19 +78,14 @@ def train_checkpoint(
     count = options.num_processes or int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     launched_so = os.environ.get("ACCELERATE_USE_FSDP", "false").lower() == "true"
     job["fsdp"] = count > 1 and (launched_so if options.fsdp is None else options.fsdp)
-    check_lora(options)
+    check_together(options)
+    check_packages(options)
+    check_processes(options, count)
     if job["fsdp"]:
-        if options.compile_networks == "auto":
-            options = options.model_copy(update={"compile_networks": False})
         check_sharding(options)
+        options = options.model_copy(update={"compile_networks": False})
     if count == 1:
         return _train(frames, conditions, options, job, SINGLE_PROCESS, choose_device(options.device), latents)
-    DistributedContext(0, count).batches(options.gradient_accumulation)  # raises before processes are started
-    if options.device not in ("auto", "cuda", "cpu"):
-        raise ValueError(
-            f"device must be auto, cuda or cpu with {count} processes, each takes a GPU of its own, got "
-            f"{options.device!r}; choose among GPUs by CUDA_VISIBLE_DEVICES"
-        )
     return _train_in_processes(count, frames, conditions, options, job, latents)
 
 

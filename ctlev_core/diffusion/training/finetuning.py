@@ -26,6 +26,7 @@ from ctlev_core.diffusion.pretraining.picture_scenes import Rehearsal
 from ctlev_core.diffusion.sampling.options import SamplingOptions
 from ctlev_core.diffusion.sampling.sampling import sample_frames
 from ctlev_core.diffusion.sampling.value_table import fit_value_table, max_table_frames
+from ctlev_core.diffusion.training.checks import check_text_route
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.latent_cache import (
     LatentCache,
@@ -110,7 +111,7 @@ def fine_tune(
         raise DataError(
             f"rot90_probability needs square frames, got {frames.shape[2]} x {frames.shape[1]} px; set it to 0"
         )
-    _check_text_route(options, conditions)
+    check_text_route(options, with_images=conditions.images is not None)
     device, start = base_model.unet.device, start or digest_of_start(base_model)
     names = ("unet", "controlnet") if tune == "both" else (tune,)
     networks = {name: getattr(base_model, name) for name in names}
@@ -181,17 +182,6 @@ def _start_to_learn(networks: dict[str, Any], options: FineTuningOptions, seed: 
     if options.lora_rank is not None:
         return add_lora(networks, options, seed)
     return [parameter for network in networks.values() for parameter in network.requires_grad_(True).parameters()]
-
-
-def _check_text_route(options: FineTuningOptions, conditions: Conditions) -> None:
-    """Raise `DataError` where something is asked for that holds for prompts alone."""
-    asked = {"moves": options.moves.moves_anything, "rehearsal_share": options.rehearsal_share > 0}
-    asked["values_at"] = options.values_at > 0
-    for name, is_asked in asked.items():
-        if is_asked and (conditions.images is not None or options.rot90_probability):
-            raise DataError(
-                f"{name} is for the text route, whose prompts hold wherever a thing is, without rot90_probability"
-            )
 
 
 def split_rows(count: int, options: FineTuningOptions, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,23 +17,9 @@ from torch import Tensor
 from torch.distributed.tensor import DTensor, distribute_tensor
 
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel
-from ctlev_core.diffusion.training.options import FineTuningOptions
 
 BLOCKS = ("down_blocks", "mid_block", "up_blocks", "controlnet_cond_embedding", "transformer_blocks")
 """Parts of a network whose weights are put together at a time; what is left is one part more."""
-
-
-def check_sharding(options: FineTuningOptions) -> None:
-    """Raise ValueError where options need whole weights, or were never run with parts of them."""
-    for name, needed in (("optimizer", "adamw"), ("compile_networks", False)):
-        if getattr(options, name) != needed:
-            raise ValueError(
-                f"fsdp needs {name}={needed}, got {getattr(options, name)}: a process holds parts of weights"
-            )
-    if options.lora_rank is not None:
-        raise ValueError("fsdp shares out whole networks; what lora_rank trains is small: set fsdp to false")
-    if options.precision == "float16":
-        raise ValueError("fsdp needs precision float32 or bfloat16, got float16, whose scale of the loss is not shared")
 
 
 def shard_networks(base_model: PretrainedModel) -> None:

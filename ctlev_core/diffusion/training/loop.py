@@ -18,6 +18,7 @@ from ctlev_core.determinism import deterministic
 from ctlev_core.diffusion.denoising import Batch, Denoiser, Emphasis, NoiseSchedule, denoising_loss, generator_for
 from ctlev_core.diffusion.flow_matching import FlowSchedule
 from ctlev_core.diffusion.training.acceleration import accelerated, autocast, check_precision
+from ctlev_core.diffusion.training.checks import check_validated
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.options import TrainingOptions
 from ctlev_core.diffusion.training.tensorboard import TrainingLog, training_log
@@ -41,10 +42,8 @@ def check_run(trainer: Trainer, distributed: DistributedContext, *, validated: b
     they can share evenly.
     """
     check_precision(trainer.options, trainer.parameters[0].device)
-    if not validated and (trainer.keep == "best" or trainer.patience is not None):
-        raise ValueError(
-            "the best weights and early stopping need a validation loss: num_validation of 2 and more, and 20 frames"
-        )
+    if not validated:
+        check_validated(trainer.keep, trainer.patience)
     distributed.batches(trainer.options.gradient_accumulation)
 
 

@@ -6,7 +6,6 @@ alpha is the rank, A is drawn from a normal distribution, and B is zero, so that
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from ctlev_core.diffusion.pretrained.adapters import FOLDERS, WEIGHTS_FILE, pref
 from ctlev_core.diffusion.pretrained.loading import PretrainedModel, training_scheduler
 from ctlev_core.diffusion.pretrained.model_kinds import is_transformer
 from ctlev_core.diffusion.training.options import FineTuningOptions
-from data_contracts.errors import DataError
 
 ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
 OF_PROMPTS = ["add_q_proj", "add_k_proj", "add_v_proj", "to_add_out"]
@@ -24,16 +22,6 @@ OF_PROMPTS = ["add_q_proj", "add_k_proj", "add_v_proj", "to_add_out"]
 LORA_STREAM = 17
 MIN_CHANNELS = 5
 """A layer to or from an image or latents is small itself."""
-
-
-def check_lora(options: FineTuningOptions) -> None:
-    """Raise `DataError` where an adapter is asked for and cannot be trained."""
-    if options.lora_rank is None:
-        return
-    if options.random_init:
-        raise DataError("lora_rank adapts a base model, and random_init forgets it: choose one")
-    if importlib.util.find_spec("peft") is None:
-        raise DataError("lora_rank needs the package peft: pip install -e '.[lora]'")
 
 
 def add_lora(networks: dict[str, Any], options: FineTuningOptions, seed: int) -> list[torch.nn.Parameter]:

@@ -8,6 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from ctlev_core.diffusion.compilation import Compile
+from ctlev_core.diffusion.training.checks import check_together
 from ctlev_core.pictures.image_moves import Moves
 from ctlev_core.pictures.labelled_pictures import PictureOptions
 from data_contracts.config import RUN_SETTING, Frozen
@@ -195,6 +196,11 @@ class FineTuningOptions(TrainingOptions):
     def num_turns(self) -> int:
         """Quarter turns in which frames may be shown, the one as they are among them."""
         return 4 if self.rot90_probability else 1
+
+    @model_validator(mode="after")
+    def _go_together(self) -> Self:
+        check_together(self)
+        return self
 
     @model_validator(mode="after")
     def _rehearsal_needs_pictures(self) -> Self:

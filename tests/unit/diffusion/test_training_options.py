@@ -19,6 +19,7 @@ from ctlev_core.diffusion.training.float32_attention import use_float32_attentio
 from ctlev_core.diffusion.training.latent_cache import LatentCache, cache_latents, turn_conditions
 from ctlev_core.diffusion.training.muon import MATRIX_RATE, is_matrix
 from ctlev_core.diffusion.training.options import FineTuningOptions
+from ctlev_core.generators import controlnet
 from ctlev_core.render.normals import turn_normal_map
 from data_contracts.config import ConditionChoice
 from data_contracts.errors import DataError, TrainingError
@@ -51,6 +52,40 @@ def on_any_device(monkeypatch):
 
 class Killed(Exception):
     pass
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"lora_rank": 4, "random_init": True}, "random_init forgets it"),
+        ({"keep": "best", "num_validation": 1}, "the best weights and early stopping need a validation loss"),
+        ({"patience": 2, "num_validation": 0}, "the best weights and early stopping need a validation loss"),
+        ({"num_processes": 2}, "gradient_accumulation must be a multiple of the 2 processes"),
+        ({"num_processes": 2, "gradient_accumulation": 2, "device": "mps"}, "device must be auto, cuda or cpu"),
+        ({"num_processes": 1, "fsdp": True}, "fsdp shares out weights over processes"),
+        ({"fsdp": True, "optimizer": "muon"}, "fsdp needs optimizer=adamw, got muon"),
+        ({"fsdp": True, "lora_rank": 4}, "set fsdp to false"),
+        ({"rot90_probability": 0.5, "moves": {"shift": 0.1}}, "moves is for the text route"),
+    ],
+)
+def test_options_that_contradict_one_another_are_refused_where_a_preset_is_read(asked, message):
+    with pytest.raises(ValueError, match=message):
+        FineTuningOptions.model_validate(asked)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"moves": {"shift": 0.1}}, "moves is for the text route"),
+        ({"values_at": 0.5}, "values_at is for the text route"),
+        ({"lora_rank": 4}, "lora_rank needs the package peft"),
+    ],
+)
+def test_what_a_generator_cannot_train_is_refused_before_anything_is_computed(asked, message, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    options = controlnet.Options.model_validate(asked)
+    with pytest.raises(DataError, match=message):
+        controlnet.check_fit(options, (64, 64), ConditionChoice(name="skeleton"))
 
 
 KILLED_WITH = {

@@ -230,5 +230,7 @@ def test_children_hear_nothing_of_an_outer_launcher():
 def test_the_number_of_processes_is_no_part_of_a_result():
     from data_contracts.config import cache_material
 
-    plain, shared = (cache_material(controlnet.Options(num_processes=count)) for count in (None, 4))
+    plain, shared = (
+        cache_material(controlnet.Options(num_processes=count, gradient_accumulation=4)) for count in (None, 4)
+    )
     assert json.dumps(plain) == json.dumps(shared)
