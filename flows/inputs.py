@@ -9,7 +9,14 @@ from ctlev_core import plugins
 from ctlev_core.events.files import check_complete
 from ctlev_core.events.image_grid import ImageFit
 from ctlev_core.events.windows import spread
-from ctlev_core.plugin_contracts import ConditionOfClasses, Dataset, Generator, GeneratorFromWeights, PluginWithFiles
+from ctlev_core.plugin_contracts import (
+    ConditionOfClasses,
+    Dataset,
+    Generator,
+    GeneratorFromWeights,
+    MetricOfRows,
+    PluginWithFiles,
+)
 from ctlev_core.plugins import PluginError
 from ctlev_core.scoring.checks import check_dataset
 from data_contracts.config import Choice, ConditionChoice, DatasetChoice
@@ -196,6 +203,49 @@ def _check_displacements(experiment: Experiment) -> None:
                 raise PluginError(f"{name}: {condition.name!r} needs joints2d, and dataset {poses.name!r} has none")
 
 
+def _check_chosen_labels(experiment: Experiment) -> None:
+    """Raise `DataError` where labels are chosen by their poses, and there is nothing to choose from or by."""
+    chosen = [(experiment.labels, experiment.poses)]
+    chosen += [
+        (experiment.labels_of(name), one.poses or experiment.poses) for name, one in experiment.baselines.items()
+    ]
+    for labels, poses in chosen:
+        if labels == "random":
+            continue
+        choice = poses or experiment.dataset
+        plugin = plugins.load_options(choice)
+        recordings = plugin.module.list_recordings(plugin.options)
+        label_only = [one for one in recordings if any(part.split == "condition" for part in one.parts)]
+        where = f"labels {labels!r}: dataset {choice.name!r} with these options has no"
+        if not label_only:
+            raise DataError(f"{where} recordings of split 'condition' to choose from; use 'random'")
+        found = plugin.module.read_labels(label_only[0], plugin.options)
+        if found.joints2d is None and found.joints3d is None and found.smpl_pose is None:
+            raise DataError(f"{where} joints or bodies, by which labels are chosen; use 'random'")
+
+
+def _check_scores_of_frames(experiment: Experiment) -> None:
+    """Raise `PluginError` where frames or labels are chosen by a metric that has no score of a single frame."""
+    by_hard = "hard" in (experiment.labels, *(experiment.labels_of(name) for name in experiment.baselines))
+    metric = plugins.load_options(experiment.metrics[0])
+    for what, asked in (("labels 'hard'", by_hard), ("keep_fraction", experiment.keep_fraction is not None)):
+        if asked and not isinstance(metric.module, MetricOfRows):
+            raise PluginError(f"{what}: metric {metric.name!r} has no score of single frames to choose by")
+
+
+def _check_values(experiment: Experiment) -> None:
+    """Raise `PluginError` where samples take values as training frames have them, which nothing has learnt."""
+    for name, asked in {None: experiment, **experiment.baselines}.items():
+        values = getattr(plugins.load_options(asked.sampling_choice).options, "values", "expected")
+        values_at = getattr(plugins.load_options(asked.generator).options, "values_at", None)
+        if values != "expected" and values_at == 0:
+            before = "" if name is None else f"baselines.{name}."
+            raise PluginError(
+                f"{before}sampling.values={values} needs a generator that learnt its values: set "
+                f"{before}generator.options.values_at above 0"
+            )
+
+
 def _check_classes(experiment: Experiment) -> None:
     """Raise `DataError` where a condition has nothing to show of a class that is to be sampled."""
     for condition, poses in _conditions(experiment).values():
@@ -281,6 +331,9 @@ CHECKS = (
     _check_intensity,
     _check_displacements,
     _check_labels,
+    _check_chosen_labels,
+    _check_scores_of_frames,
+    _check_values,
     _check_counts,
     _check_classes,
     _check_labels_kept,

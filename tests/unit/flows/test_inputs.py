@@ -25,6 +25,19 @@ from tasks.stage import planning
             ],
             "condition: 'moving_skeleton' needs joints2d, and dataset 'text_motion' has none",
         ),
+        (["sampling.values=drawn"], "sampling.values=drawn needs a generator that learnt its values"),
+        (
+            ["baselines={copies: {sampling: {values: nearest}}}"],
+            r"baselines.copies.sampling.values=nearest needs .*set baselines.copies.generator.options.values_at",
+        ),
+        (
+            ["labels=hard", "dataset.options.num_condition_recordings=0", "temporal_order=false"],
+            "labels 'hard': dataset 'studio' with these options has no recordings of split 'condition'",
+        ),
+        (
+            ["baselines={b: {labels: coverage, poses: {name: studio_objects, options: {}}}}", "temporal_order=false"],
+            "labels 'coverage': dataset 'studio_objects' with these options has no joints or bodies",
+        ),
         (
             ["baselines={copies: {condition: {name: text}, generator: {name: augmentation}}}"],
             "baselines.copies: 'augmentation' makes frames of a class, whose joints2d are those of another frame",
