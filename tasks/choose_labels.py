@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
 
@@ -13,6 +11,7 @@ from ctlev_core.labels.pose_choice import farthest_points, hardest, pose_vectors
 from ctlev_core.labels.rows_to_sample import choose_in_turn, inner_moments, label_moments, moments_in_image
 from ctlev_core.labels.sources import image_size_of
 from ctlev_core.plugin_contracts import MetricOfRows
+from ctlev_core.plugin_outputs import predict_frames
 from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, EncodingChoice, MetricChoice
@@ -86,7 +85,7 @@ def find_hard_labels(
     for model, fold in zip(models, folds, strict=True):
         held_out = fold.rows_where(split="validation")
         labels = fold.labels.take(held_out)
-        prediction: Any = plugin.module.predict(model.ref.path / "model", fold.images(held_out))
+        prediction = predict_frames(plugin, model.ref.path / "model", fold.images(held_out))
         scores = scorer.module.compute_rows(prediction, labels, scorer.options)
         first = next(iter(scorer.module.compute(prediction, labels, scorer.options)))
         errors.append(scores if lower_is_better(first) else -scores)

@@ -16,6 +16,7 @@ from ctlev_core.plugin_contracts import (
     DownstreamOfSequences,
     MetricOfRows,
 )
+from ctlev_core.plugin_outputs import features_of_frames, predict_frames
 from ctlev_core.scoring.checks import check_distances, check_frames, check_metrics
 from ctlev_core.scoring.scored_rows import RowScores
 from ctlev_core.scoring.sensor_pixels import SensorSource, is_on_sensor, on_sensor, sensor_sizes
@@ -89,7 +90,7 @@ def score_model(
         raise DataError(f"{data.ref.path}: no rows in split {split!r} to score on")
     _refuse_overlap(data, rows, training_sets, split)
     predict = _predict_of(plugin.module, data, rows)
-    prediction = predict(model.ref.path / "model", data.images(rows))
+    prediction = predict_frames(plugin, model.ref.path / "model", data.images(rows), predict)
     labels = data.labels.take(rows)
     of_labels = LabelAgreement.parse(subject)
     if of_labels is not None and of_labels.shuffled:
@@ -253,7 +254,7 @@ def score_distance(
     for data, rows in (compared, learnt):
         if len(rows) == 0:
             raise DataError(f"{data.ref.path}: no rows in split {split if data is other else 'train'!r} to compare")
-        features.append(plugin.module.features(folder, data.images(rows)))
+        features.append(features_of_frames(plugin, folder, data.images(rows)))
         groups.append(np.array(data.column("recording_id"))[rows])
     named: dict[str, DistanceEstimate] = {}
     for choice in distances:

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.events.windows import spread
+from ctlev_core.plugin_outputs import features_of_frames
 from ctlev_core.scoring.memorisation import CLOSEST_PAIRS, MemorisationCheck, check_memorisation, small_pictures
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice
@@ -61,7 +62,7 @@ def memorisation(
     ways: dict[str, Callable[[Images], np.ndarray]] = {PICTURES: small_pictures}
     if extractor is not None and downstream is not None:
         plugin, folder = plugins.load_options(downstream), extractor.ref.path / "model"
-        ways[f"features of {plugin.name}"] = lambda images: plugin.module.features(folder, images)
+        ways[f"features of {plugin.name}"] = lambda images: features_of_frames(plugin, folder, images)
     if not len(other):
         logger.warning(
             "%s: all frames are of one recording, and no copies are looked for: a frame resembles its neighbours as a "

@@ -21,6 +21,7 @@ from ctlev_core.diffusion.sampling.shards import SHARD, whole_stretches
 from ctlev_core.events.windows import spread, window_around
 from ctlev_core.labels.sources import sensor_size_of
 from ctlev_core.plugin_contracts import CalibratedEventGenerator
+from ctlev_core.plugin_outputs import check_samples
 from ctlev_core.postprocessing.quality_filter import (
     QualityFilter,
     find_causes,
@@ -100,7 +101,8 @@ def sample(
         rows = chunk.rows[members]
         if deal is not None and seeds != chunk.seeds:
             deal([Chunk(rows, seeds)])  # of those that were rejected
-        return plugin.module.sample(folder, asked.take(rows), plugin.options, seeds=seeds, work=out.work)
+        made = plugin.module.sample(folder, asked.take(rows), plugin.options, seeds=seeds, work=out.work)
+        return check_samples(plugin, made, len(rows))
 
     quality_filter, told = quality_filter_of(frames), SampleLog([], [], [])
     with out.open_array("frames") as written:

@@ -6,6 +6,7 @@ import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.events.windows import spread
+from ctlev_core.plugin_outputs import features_of_frames
 from ctlev_core.report.version_gates import HELD_OUT
 from ctlev_core.statistics.feature_distances import name_distance
 from data_contracts import tables
@@ -44,11 +45,11 @@ def score_beside_real(
             f"got {len(learnt)}, {len(held_out)} and {len(made)}"
         )
     compared = ((HELD_OUT, frames, held_out), (SYNTHETIC, generated, made))
-    real = plugin.module.features(folder, frames.images(learnt))
+    real = features_of_frames(plugin, folder, frames.images(learnt))
     rows = []
     for subject, data, members in compared:
         chosen = members[spread(len(members), count)]
-        features = plugin.module.features(folder, data.images(chosen))
+        features = features_of_frames(plugin, folder, data.images(chosen))
         for choice in distances:
             metric = plugins.load_options(choice)
             if metric.module.INPUT != "features":

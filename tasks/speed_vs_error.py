@@ -13,6 +13,7 @@ import pyarrow as pa
 from ctlev_core import plugins
 from ctlev_core.diffusion.sampling.options import STOCHASTIC
 from ctlev_core.events.windows import spread
+from ctlev_core.plugin_outputs import features_of_frames, predict_frames
 from ctlev_core.realism.sampling import realism_of_real, realism_of_samples
 from ctlev_core.seeds import sample_seeds
 from ctlev_core.statistics.sampling_errors import (
@@ -111,7 +112,7 @@ def sampling_errors(
     folder = extractor.ref.path / "model"
 
     def features(pictures: np.ndarray, groups: list[str]) -> FeatureSet:
-        return FeatureSet(feature_plugin.module.features(folder, pictures), np.array(groups))
+        return FeatureSet(features_of_frames(feature_plugin, folder, pictures), np.array(groups))
 
     held_out = frames.rows_where(split=frames.held_out)
     recordings = np.array(frames.column("recording_id"))[held_out].tolist()
@@ -137,7 +138,7 @@ def sampling_errors(
             found += _pixel_errors(pictures, table, solutions)
         if model is not None:
             labels = conditions.labels.take([row_of[name] for name in names])
-            predicted = plugins.load_options(downstream).module.predict(model.ref.path / "model", pictures)
+            predicted = predict_frames(plugins.load_options(downstream), model.ref.path / "model", pictures)
             found.append(label_error(plugins.load_options(metric), predicted, labels))
         seconds = (table[name].to_numpy() for name in ("wall_seconds", "cpu_seconds", "controlnet_evaluations"))
         found += costs(*seconds)

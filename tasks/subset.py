@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
 
 from ctlev_core import plugins
 from ctlev_core.labels.label_sampling import spread_choice
 from ctlev_core.plugin_contracts import MetricOfRows
+from ctlev_core.plugin_outputs import predict_frames
 from ctlev_core.scoring.score_info import lower_is_better
 from data_contracts import tables
 from data_contracts.config import DownstreamChoice, MetricChoice
@@ -90,7 +89,7 @@ def take_label_consistent(
     plugin, scorer = plugins.load_options(downstream), plugins.load_options(metric)
     if not isinstance(scorer.module, MetricOfRows):
         raise DataError(f"keep_fraction: metric {metric.name!r} has no score of single frames to choose by")
-    prediction: Any = plugin.module.predict(model.ref.path / "model", synthetic.images(np.arange(len(synthetic))))
+    prediction = predict_frames(plugin, model.ref.path / "model", synthetic.images(np.arange(len(synthetic))))
     scores = scorer.module.compute_rows(prediction, synthetic.labels, scorer.options)
     # As elsewhere the name of the score decides, which need not be that of the plug-in.
     first = next(iter(scorer.module.compute(prediction, synthetic.labels, scorer.options)))

@@ -37,7 +37,10 @@ def four(monkeypatch, tmp_path):
     [
         ({"downstream": DownstreamChoice(name="pose2d")}, GpuNeed(1)),
         ({"downstream": DownstreamChoice(name="pose2d", options={"device": "cpu"})}, GpuNeed()),
-        ({"generator": GeneratorChoice(name="controlnet", options={"num_processes": 4})}, GpuNeed(4)),
+        (
+            {"generator": GeneratorChoice(name="controlnet", options={"num_processes": 4, "gradient_accumulation": 4})},
+            GpuNeed(4),
+        ),
         ({"sampling": SamplingChoice(name="controlnet", options={"device": "all"})}, GpuNeed(-1)),
         ({"sampling": SamplingChoice(name="controlnet", options={"device": "cuda:2,cuda:3"})}, GpuNeed(named=(2, 3))),
         ({"encoding": EncodingChoice(name="event_histogram"), "seed": 3}, GpuNeed()),

@@ -209,7 +209,7 @@ def test_more_recorded_frames_than_there_are_is_refused(tmp_path):
 
 def test_label_consistent_rows_are_the_best_of_each_class(monkeypatch, tmp_path):
     errors = np.array([3, 9, 1, 1, 8, 2, 2, 7, 3, np.nan, 6, 4.0])
-    model = SimpleNamespace(predict=lambda folder, frames: {})
+    model = SimpleNamespace(PREDICTS=(), predict=lambda folder, frames: {})
 
     def metric(score):
         return SimpleNamespace(
