@@ -220,7 +220,9 @@ def test_label_consistent_rows_are_the_best_of_each_class(monkeypatch, tmp_path)
     scores = {"mpjpe2d": "mpjpe2d_px", "pck2d": "pck2d", "pve": "pve_mm"}
     fakes = {"pose2d": model, **{name: metric(score) for name, score in scores.items()}}
     monkeypatch.setattr(
-        plugins, "load_options", lambda choice: SimpleNamespace(module=fakes[choice.name], options=None)
+        plugins,
+        "load_options",
+        lambda choice: SimpleNamespace(name=choice.name, module=fakes[choice.name], options=None),
     )
 
     def kept(name):
