@@ -235,6 +235,8 @@ def _check_scores_of_frames(experiment: Experiment) -> None:
 
 def _check_values(experiment: Experiment) -> None:
     """Raise `PluginError` where samples take values as training frames have them, which nothing has learnt."""
+    if experiment.pixel_decoder is not None:  # draws them itself, which `flows.sampling` says
+        return
     for name, asked in {None: experiment, **experiment.baselines}.items():
         values = getattr(plugins.load_options(asked.sampling_choice).options, "values", "expected")
         values_at = getattr(plugins.load_options(asked.generator).options, "values_at", None)
