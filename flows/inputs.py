@@ -243,7 +243,7 @@ def _check_values(experiment: Experiment) -> None:
         if values != "expected" and values_at == 0:
             before = "" if name is None else f"baselines.{name}."
             raise PluginError(
-                f"{before}sampling.values={values} needs a generator that learnt its values: set "
+                f"{before}sampling.values={values} needs a generator of the text route that learnt its values: set "
                 f"{before}generator.options.values_at above 0"
             )
 

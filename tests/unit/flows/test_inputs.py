@@ -25,7 +25,7 @@ from tasks.stage import planning
             ],
             "condition: 'moving_skeleton' needs joints2d, and dataset 'text_motion' has none",
         ),
-        (["sampling.values=drawn"], "sampling.values=drawn needs a generator that learnt its values"),
+        (["sampling.values=drawn"], "sampling.values=drawn needs a generator of the text route that learnt its values"),
         (
             ["baselines={copies: {sampling: {values: nearest}}}"],
             r"baselines.copies.sampling.values=nearest needs .*set baselines.copies.generator.options.values_at",
