@@ -44,7 +44,8 @@ def predict_frames(
         wanted = [len(frames) if side == "N" else side for side in shape]
         if len(got) != len(wanted) or any(side not in (one, "J", "K") for one, side in zip(got, wanted, strict=True)):
             raise PluginError(
-                f"{name}: predictions of {len(frames)} frames must have {array} {_text(shape)}, got {list(got)}"
+                f"{name}: predictions of {len(frames)} frames must have {array} [{', '.join(map(str, shape))}], got "
+                f"{list(got)}"
             )
     if "classes" in plugin.module.PREDICTS and np.shape(found["probability"])[1] != len(found["classes"]):
         raise PluginError(
@@ -82,7 +83,3 @@ def check_samples(plugin: Plugin, made: Any, count: int) -> np.ndarray:
             f"{list(shape)} {kind}"
         )
     return made
-
-
-def _text(shape: tuple[str | int, ...]) -> str:
-    return f"[{', '.join(map(str, shape))}]"

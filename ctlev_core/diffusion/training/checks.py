@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def check_together(options: FineTuningOptions) -> None:
     """Raise ValueError where options contradict one another, on whatever machine and with whatever frames."""
     if options.lora_rank is not None and options.random_init:
-        raise ValueError("lora_rank adapts a base model, and random_init forgets it: choose one")
+        raise DataError("lora_rank adapts a base model, and random_init forgets it: choose one")
     check_text_route(options, with_images=False)
     if options.num_validation < 2:
         check_validated(options.keep, options.patience)

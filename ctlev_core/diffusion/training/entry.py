@@ -19,7 +19,7 @@ import torch
 
 from ctlev_core.diffusion.pretrained.loading import choose_device, load_base_model, save_base_model
 from ctlev_core.diffusion.sampling.value_table import write_value_table
-from ctlev_core.diffusion.training.checks import check_packages, check_processes, check_sharding, check_together
+from ctlev_core.diffusion.training.checks import check_packages, check_together
 from ctlev_core.diffusion.training.distributed import SINGLE_PROCESS, DistributedContext
 from ctlev_core.diffusion.training.finetuning import Tune, digest_of_start, fine_tune, forget_weights
 from ctlev_core.diffusion.training.fsdp import gather_networks, shard_networks
@@ -77,12 +77,10 @@ def train_checkpoint(
     }
     count = options.num_processes or int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     launched_so = os.environ.get("ACCELERATE_USE_FSDP", "false").lower() == "true"
-    job["fsdp"] = count > 1 and (launched_so if options.fsdp is None else options.fsdp)
-    check_together(options)
+    job["fsdp"] = (count > 1 and launched_so) if options.fsdp is None else options.fsdp
+    check_together(options.model_copy(update={"num_processes": count, "fsdp": job["fsdp"]}))
     check_packages(options)
-    check_processes(options, count)
     if job["fsdp"]:
-        check_sharding(options)
         options = options.model_copy(update={"compile_networks": False})
     if count == 1:
         return _train(frames, conditions, options, job, SINGLE_PROCESS, choose_device(options.device), latents)

@@ -266,7 +266,7 @@ def test_an_adapter_is_as_large_as_its_base_model_to_processes(base_folder, adap
 
 
 def test_what_cannot_be_is_refused_before_training(base_folder, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="random_init forgets it"):
+    with pytest.raises(DataError, match="random_init forgets it"):
         trained(base_folder, tmp_path, random_init=True)
     with pytest.raises(ValueError, match="set fsdp to false"):
         trained(base_folder, tmp_path, num_processes=2, fsdp=True)
